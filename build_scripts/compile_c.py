@@ -1,0 +1,59 @@
+"""Compile every C file of an exported model as strict C99, with warnings as errors.
+
+The sources are those an FMU carries: the files of `fmu_src/` and the code generated for a model.
+Each is compiled on its own with zig's C compiler, at two levels of optimisation, because some
+warnings need the optimiser's analysis.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import fmpy
+
+from build_scripts.measured_data import ROOT
+from psa_casadi.components import BASE
+from psa_casadi.export.fmu import write_sources
+from psa_casadi.model.compose import compose
+
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+OPTIMISATION = ("-O0", "-O2")
+
+
+def compile_strictly(source: Path, include: Sequence[Path], output: Path) -> list[str]:
+    """Compile one file at every level of optimisation; return the complaints."""
+    complaints = []
+    for level in OPTIMISATION:
+        includes = [f"-I{directory}" for directory in include]
+        command = [sys.executable, "-m", "ziglang", "cc", *FLAGS, level, *includes]
+        command += ["-c", str(source), "-o", str(output / f"{source.stem}.o")]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            complaints.append(f"{source.name} {level}:\n{done.stdout}{done.stderr}")
+    return complaints
+
+
+def main() -> int:
+    """Compile the sources of the base model; return 1 if the compiler complained or saw no file."""
+    headers = Path(fmpy.__file__).parent / "c-code"
+    with tempfile.TemporaryDirectory() as scratch:
+        sources, objects = Path(scratch, "sources"), Path(scratch, "objects")
+        sources.mkdir()
+        objects.mkdir()
+        os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str(Path(tempfile.gettempdir()) / "zig"))
+        write_sources(compose(BASE), sources)
+        files = sorted(sources.rglob("*.c"))
+        missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")} - {f.name for f in files}
+        complaints = [f"{name}: not among the written sources." for name in sorted(missing)]
+        for source in files:
+            print(f"{source.relative_to(sources)}", flush=True)
+            complaints += compile_strictly(source, (source.parent, sources, headers), objects)
+    print("\n".join(complaints) or f"{len(files)} C files compile without a warning.")
+    return 1 if complaints or not files else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+/* Adapter between the plain face in model.h and the functions CasADi generates in model.c. */
+#include "model.h"
+
+#include <stddef.h>
+
+#ifndef casadi_real
+#define casadi_real double
+#endif
+#ifndef casadi_int
+#define casadi_int long long int
+#endif
+
+typedef int casadi_function(const casadi_real **, casadi_real **, casadi_int *, casadi_real *, int);
+
+casadi_function psa_ode, psa_jacobian, psa_outputs;
+
+static int call(casadi_function *function, double t, const double *x, const double *u,
+                const double *p, double *first, double *second) {
+    const casadi_real *arg[PSA_SZ_ARG] = {NULL};
+    casadi_real *res[PSA_SZ_RES] = {NULL};
+    casadi_int iw[PSA_SZ_IW];
+    casadi_real w[PSA_SZ_W];
+    arg[0] = &t;
+    arg[1] = x;
+    arg[2] = u;
+    arg[3] = p;
+    res[0] = first;
+    res[1] = second;
+    return function(arg, res, iw, w, 0);
+}
+
+int psa_model_ode(double t, const double *x, const double *u, const double *p, double *xdot) {
+    return call(psa_ode, t, x, u, p, xdot, NULL);
+}
+
+int psa_model_jacobian(double t, const double *x, const double *u, const double *p, double *jac) {
+    return call(psa_jacobian, t, x, u, p, jac, NULL);
+}
+
+int psa_model_outputs(double t, const double *x, const double *u, const double *p, double *y) {
+    return call(psa_outputs, t, x, u, p, y, NULL);
+}
+
+#ifdef PSA_WITH_SENSITIVITIES
+casadi_function psa_sensitivity, psa_output_sensitivity;
+
+int psa_model_sensitivity(double t, const double *x, const double *u, const double *p, double *jac,
+                          double *param) {
+    return call(psa_sensitivity, t, x, u, p, jac, param);
+}
+
+int psa_model_output_sensitivity(double t, const double *x, const double *u, const double *p,
+                                 double *jac, double *param) {
+    return call(psa_output_sensitivity, t, x, u, p, jac, param);
+}
+#endif

@@ -1,0 +1,261 @@
+#include "solver.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "linear.h"
+
+#define GAMMA 0.25
+#define NEWTON_LIMIT 8
+#define NEWTON_TOLERANCE 0.02 /* share of the step's error tolerance */
+#define SAFETY 0.9
+
+static const double C[PSA_STAGES] = {0.0, 1.0 / 2.0, 83.0 / 250.0, 31.0 / 50.0, 17.0 / 20.0, 1.0};
+static const double A[PSA_STAGES][PSA_STAGES] = {
+    {0.0},
+    {1.0 / 4.0, GAMMA},
+    {8611.0 / 62500.0, -1743.0 / 31250.0, GAMMA},
+    {5012029.0 / 34652500.0, -654441.0 / 2922500.0, 174375.0 / 388108.0, GAMMA},
+    {15267082809.0 / 155376265600.0, -71443401.0 / 120774400.0, 730878875.0 / 902184768.0,
+     2285395.0 / 8070912.0, GAMMA},
+    {82889.0 / 524892.0, 0.0, 15625.0 / 83664.0, 69875.0 / 102672.0, -2260.0 / 8211.0, GAMMA}};
+/* b minus the weights of the embedded third-order formula */
+static const double E[PSA_STAGES] = {82889.0 / 524892.0 - 4586570599.0 / 29645900160.0,
+                                     0.0,
+                                     15625.0 / 83664.0 - 178811875.0 / 945068544.0,
+                                     69875.0 / 102672.0 - 814220225.0 / 1159782912.0,
+                                     -2260.0 / 8211.0 + 3700637.0 / 11593932.0,
+                                     1.0 / 4.0 - 61727.0 / 225920.0};
+
+void psa_input_at(const psa_input *input, double t, double *u) {
+    for (int i = 0; i < PSA_NU; ++i) u[i] = input->value[i] + input->rate[i] * (t - input->origin);
+}
+
+void psa_solver_start(psa_solver *solver, double t, const double *x, const double *nominal,
+                      double rtol) {
+    memset(solver, 0, sizeof *solver);
+    solver->t = t;
+    solver->rtol = rtol;
+    memcpy(solver->x, x, sizeof solver->x);
+    memcpy(solver->nominal, nominal, sizeof solver->nominal);
+}
+
+void psa_solver_invalidate(psa_solver *solver) {
+    solver->slope_valid = 0;
+    solver->lu_factor_h = 0.0;
+}
+
+static double scaled_norm(const psa_solver *solver, const double *v, int *worst) {
+    double sum = 0.0, largest = -1.0;
+    for (int i = 0; i < PSA_NX; ++i) {
+        const double e = v[i] / solver->weight[i];
+        if (!(fabs(e) <= largest)) {
+            largest = fabs(e);
+            if (worst) *worst = i;
+        }
+        sum += e * e;
+    }
+    return sqrt(sum / PSA_NX);
+}
+
+static void set_weights(psa_solver *solver) {
+    for (int i = 0; i < PSA_NX; ++i)
+        solver->weight[i] = solver->rtol * (fabs(solver->x[i]) + solver->nominal[i]);
+}
+
+/* lu = factors of I - h_gamma * df/dx */
+static int factorise(psa_solver *solver, const double *jac, double h_gamma) {
+    for (int i = 0; i < PSA_NX * PSA_NX; ++i) solver->lu[i] = -h_gamma * jac[i];
+    for (int i = 0; i < PSA_NX; ++i) solver->lu[i + i * PSA_NX] += 1.0;
+    return psa_lu_factor(PSA_NX, solver->lu, solver->pivot);
+}
+
+/* Solve k = f(t, base + h gamma k) by simplified Newton iteration; 0 when converged. */
+static int solve_stage(psa_solver *solver, int stage, const double *base, double h_gamma,
+                       const double *u, const double *p) {
+    double *x = solver->stage_x[stage], *k = solver->stage_k[stage];
+    double f[PSA_NX], previous = 0.0;
+    for (int iteration = 0; iteration < NEWTON_LIMIT; ++iteration) {
+        for (int i = 0; i < PSA_NX; ++i) x[i] = base[i] + h_gamma * k[i];
+        if (psa_model_ode(solver->stage_t[stage], x, u, p, f)) return 1;
+        solver->evaluations++;
+        for (int i = 0; i < PSA_NX; ++i) f[i] -= k[i];
+        psa_lu_solve(PSA_NX, solver->lu, solver->pivot, f);
+        for (int i = 0; i < PSA_NX; ++i) {
+            k[i] += f[i];
+            f[i] *= h_gamma;
+        }
+        const double change = scaled_norm(solver, f, &solver->culprit);
+        if (!(change < 1e12)) return 1;
+        if (iteration > 0 && change > 2.0 * previous) return 1;
+        const double rate = iteration > 0 ? change / previous : 1.0;
+        if (change <= 1e-12 ||
+            (iteration > 0 && rate < 1.0 && change * rate / (1.0 - rate) < NEWTON_TOLERANCE)) {
+            for (int i = 0; i < PSA_NX; ++i) x[i] = base[i] + h_gamma * k[i];
+            return 0;
+        }
+        previous = change;
+    }
+    return 1;
+}
+
+/* Try one step of size h; returns the scaled error (<= 1 accepts), or a negative number on failure. */
+static double try_step(psa_solver *solver, double h, const psa_input *input, const double *p) {
+    const double h_gamma = h * GAMMA;
+    double base[PSA_NX], u[PSA_NU + 1], error[PSA_NX];
+    if (solver->lu_factor_h != h_gamma) {
+        if (factorise(solver, solver->jac, h_gamma)) return -1.0;
+        solver->lu_factor_h = h_gamma;
+    }
+    memcpy(solver->stage_x[0], solver->x, sizeof solver->x);
+    memcpy(solver->stage_k[0], solver->slope, sizeof solver->slope);
+    solver->stage_t[0] = solver->t;
+    for (int stage = 1; stage < PSA_STAGES; ++stage) {
+        solver->stage_t[stage] = solver->t + C[stage] * h;
+        psa_input_at(input, solver->stage_t[stage], u);
+        for (int i = 0; i < PSA_NX; ++i) {
+            double sum = 0.0;
+            for (int j = 0; j < stage; ++j) sum += A[stage][j] * solver->stage_k[j][i];
+            base[i] = solver->x[i] + h * sum;
+        }
+        memcpy(solver->stage_k[stage], solver->stage_k[stage > 1 ? stage - 1 : 0], sizeof base);
+        if (solve_stage(solver, stage, base, h_gamma, u, p)) return -1.0;
+    }
+    for (int i = 0; i < PSA_NX; ++i) {
+        error[i] = 0.0;
+        for (int j = 0; j < PSA_STAGES; ++j) error[i] += h * E[j] * solver->stage_k[j][i];
+    }
+    psa_lu_solve(PSA_NX, solver->lu, solver->pivot, error);
+    return scaled_norm(solver, error, &solver->culprit);
+}
+
+static int prepare_slope(psa_solver *solver, const psa_input *input, const double *p) {
+    double u[PSA_NU + 1];
+    int same = solver->slope_valid;
+    psa_input_at(input, solver->t, u);
+    for (int i = 0; i < PSA_NU; ++i)
+        if (fabs(u[i] - solver->last_input[i]) > 1e-12 * (fabs(u[i]) + fabs(solver->last_input[i])))
+            same = 0;
+    if (same) return 0;
+    if (psa_model_ode(solver->t, solver->x, u, p, solver->slope)) return 1;
+    solver->evaluations++;
+    for (int i = 0; i < PSA_NX; ++i)
+        if (!isfinite(solver->slope[i])) {
+            solver->culprit = i;
+            return 1;
+        }
+    solver->slope_valid = 1;
+    return 2;
+}
+
+static double first_step(const psa_solver *solver) {
+    const double slope = scaled_norm(solver, solver->slope, NULL);
+    return slope > 0.0 ? 0.5 / slope : INFINITY;
+}
+
+#ifdef PSA_WITH_SENSITIVITIES
+/* slopes = J base + df/dtheta, all [PSA_NX][count] */
+static void sensitivity_slopes(const psa_sensitivities *sens, const double *jac, const double *param,
+                               const double *base, double *slopes) {
+    const int count = sens->count;
+    for (int i = 0; i < PSA_NX; ++i) {
+        double *const row = slopes + i * count;
+        for (int c = 0; c < count; ++c)
+            row[c] = sens->which[c] >= 0 ? param[i + sens->which[c] * PSA_NX] : 0.0;
+        for (int j = 0; j < PSA_NX; ++j)
+            if (jac[i + j * PSA_NX] != 0.0)
+                psa_axpy(count, jac[i + j * PSA_NX], base + j * count, row);
+    }
+}
+
+/* dX_i/dtheta of all stages of the accepted step: differentiates the discrete equations exactly. */
+static int step_sensitivities(psa_solver *solver, double h, const psa_input *input,
+                              const double *p, psa_sensitivities *sens) {
+    const int size = PSA_NX * sens->count;
+    const size_t bytes = sizeof(double) * (size_t)size;
+    double jac[PSA_NX * PSA_NX], param[PSA_NX * PSA_NP], u[PSA_NU + 1];
+    solver->lu_factor_h = 0.0;
+    for (int stage = sens->slope_valid ? 1 : 0; stage < PSA_STAGES; ++stage) {
+        double *const slopes = stage > 0 ? sens->stage + (long)stage * size : sens->slope;
+        psa_input_at(input, solver->stage_t[stage], u);
+        if (psa_model_sensitivity(solver->stage_t[stage], solver->stage_x[stage], u, p, jac, param))
+            return 1;
+        memcpy(sens->base, sens->s, bytes);
+        for (int j = 0; j < stage; ++j)
+            if (A[stage][j] != 0.0)
+                psa_axpy(size, h * A[stage][j], j > 0 ? sens->stage + (long)j * size : sens->slope,
+                         sens->base);
+        sensitivity_slopes(sens, jac, param, sens->base, slopes);
+        if (stage == 0) continue;
+        if (factorise(solver, jac, h * GAMMA)) return 1;
+        psa_lu_solve_many(PSA_NX, solver->lu, solver->pivot, sens->count, slopes);
+    }
+    memcpy(sens->slope, sens->stage + (long)(PSA_STAGES - 1) * size, bytes);
+    memcpy(sens->s, sens->base, bytes);
+    psa_axpy(size, h * GAMMA, sens->slope, sens->s);
+    sens->slope_valid = 1;
+    return 0;
+}
+#else
+static int step_sensitivities(psa_solver *solver, double h, const psa_input *input,
+                              const double *p, psa_sensitivities *sens) {
+    (void)solver, (void)h, (void)input, (void)p, (void)sens;
+    return 1;
+}
+#endif
+
+static psa_status accept(psa_solver *solver, double t_new, double h, const psa_input *input,
+                         const double *p, psa_sensitivities *sens) {
+    if (sens && step_sensitivities(solver, h, input, p, sens)) return PSA_NOT_FINITE;
+    memcpy(solver->x, solver->stage_x[PSA_STAGES - 1], sizeof solver->x);
+    memcpy(solver->slope, solver->stage_k[PSA_STAGES - 1], sizeof solver->slope);
+    solver->t = t_new;
+    psa_input_at(input, t_new, solver->last_input);
+    solver->steps++;
+    return PSA_OK;
+}
+
+psa_status psa_solver_advance(psa_solver *solver, double t_end, const psa_input *input,
+                              const double *p, psa_sensitivities *sens) {
+    const long limit = solver->steps_limit > 0 ? solver->steps_limit : 10000000L;
+    const double smallest = 8.0 * 2.220446049250313e-16 * (fabs(t_end) + fabs(solver->t));
+    long taken = 0;
+    set_weights(solver);
+    switch (prepare_slope(solver, input, p)) {
+    case 1: return PSA_NOT_FINITE;
+    case 2:
+        if (sens) sens->slope_valid = 0;
+        break;
+    default: break;
+    }
+    if (!(solver->step > 0.0)) solver->step = first_step(solver);
+    while (solver->t < t_end) {
+        double u[PSA_NU + 1];
+        psa_input_at(input, solver->t, u);
+        set_weights(solver);
+        if (psa_model_jacobian(solver->t, solver->x, u, p, solver->jac)) return PSA_NOT_FINITE;
+        solver->lu_factor_h = 0.0;
+        for (int accepted = 0; !accepted;) {
+            double h = solver->max_step > 0.0 ? fmin(solver->step, solver->max_step) : solver->step;
+            const double left = t_end - solver->t;
+            const int last = h * 1.01 >= left;
+            if (last) h = left;
+            else if (2.0 * h > left) h = 0.5 * left;
+            if (!(h > smallest) && !last) return PSA_STEP_TOO_SMALL;
+            if (++taken > limit) return PSA_TOO_MANY_STEPS;
+            const double error = try_step(solver, h, input, p);
+            if (error >= 0.0 && error <= 1.0) {
+                const double factor = fmin(5.0, fmax(0.2, SAFETY * pow(fmax(error, 1e-10), -0.25)));
+                const psa_status status = accept(solver, last ? t_end : solver->t + h, h, input, p, sens);
+                if (status != PSA_OK) return status;
+                solver->step = h < solver->step ? fmax(solver->step, h * factor) : h * factor;
+                accepted = 1;
+            } else {
+                solver->rejected++;
+                if (!(h > smallest)) return PSA_STEP_TOO_SMALL;
+                solver->step = error > 0.0 ? h * fmax(0.1, SAFETY * pow(error, -0.25)) : 0.25 * h;
+            }
+        }
+    }
+    return PSA_OK;
+}

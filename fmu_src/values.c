@@ -1,0 +1,236 @@
+#include <math.h>
+#include <string.h>
+
+#include "instance.h"
+
+/* Evaluate derivatives and outputs at the present time, states, inputs and parameters. */
+static psa_result refresh(psa_instance *instance) {
+    const psa_state *const state = &instance->state;
+    double u[PSA_NU + 1];
+    if (instance->fresh) return PSA_FINE;
+    psa_input_at(&state->input, state->solver.t, u);
+    if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
+        psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y))
+        return psa_say(instance, PSA_DISCARD, "The model cannot be evaluated at t = %.9g s.",
+                       state->solver.t);
+    instance->fresh = 1;
+    return PSA_FINE;
+}
+
+static const psa_variable *variable(psa_instance *instance, unsigned vr) {
+    if (vr < PSA_VARIABLES) return &psa_variables[vr];
+    psa_say(instance, PSA_ERROR, "There is no variable of value reference %u; the last is %u.", vr,
+            (unsigned)(PSA_VARIABLES - 1));
+    return NULL;
+}
+
+static double value_of(const psa_instance *instance, const psa_variable *v) {
+    switch (v->kind) {
+    case PSA_TIME: return instance->state.solver.t;
+    case PSA_STATE: return instance->state.solver.x[v->index];
+    case PSA_DERIVATIVE: return instance->xdot[v->index];
+    case PSA_INPUT: return instance->state.input.value[v->index];
+    case PSA_OUTPUT: return instance->y[v->index];
+    default: return instance->state.p[v->index];
+    }
+}
+
+psa_result psa_get(psa_instance *instance, const unsigned *vr, size_t count, double *value) {
+    psa_result result = PSA_FINE;
+    if (psa_lacks(instance, count, vr, value)) return PSA_ERROR;
+    for (size_t i = 0; i < count; ++i) {
+        const psa_variable *const v = variable(instance, vr[i]);
+        if (!v) return PSA_ERROR;
+        if (v->kind == PSA_DERIVATIVE || v->kind == PSA_OUTPUT) {
+            result = refresh(instance);
+            if (result != PSA_FINE) return result;
+        }
+        value[i] = value_of(instance, v);
+        if (!isfinite(value[i]))
+            result = psa_say(instance, PSA_DISCARD, "'%s' is not finite at t = %.9g s.", v->name,
+                             instance->state.solver.t);
+    }
+    return result;
+}
+
+/* A variable may be set if it is an input, a parameter, or a state that no solver in here is using: in
+   model exchange always (CasADi's importer does so), in co-simulation before the first step. */
+static psa_result settable(psa_instance *instance, unsigned vr, double value) {
+    const psa_variable *const v = variable(instance, vr);
+    if (!v) return PSA_ERROR;
+    if (!isfinite(value))
+        return psa_say(instance, PSA_ERROR, "'%s' cannot be set to a value that is not finite.", v->name);
+    if (v->kind == PSA_STATE && instance->state.phase == PSA_STEP_COMPLETE)
+        return psa_say(instance, PSA_ERROR,
+                       "State '%s' can be set only before the first step.", v->name);
+    if (v->kind != PSA_STATE && v->kind != PSA_INPUT && v->kind != PSA_PARAMETER)
+        return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be set.", v->name);
+    if (value < v->low || value > v->high)
+        return psa_say(instance, PSA_WARNING, "'%s' is set to %g, outside its interval [%g, %g].",
+                       v->name, value, v->low, v->high);
+    return PSA_FINE;
+}
+
+static void set_one(psa_state *state, const psa_variable *v, double value) {
+    if (v->kind == PSA_INPUT) {
+        state->input.value[v->index] = value;
+        if (!state->rate_given[v->index]) state->input.rate[v->index] = 0.0;
+        return;
+    }
+    if (v->kind == PSA_STATE) state->solver.x[v->index] = value;
+    else state->p[v->index] = value;
+    psa_solver_invalidate(&state->solver);
+}
+
+/* All values are taken, or none if one of them cannot be. */
+psa_result psa_set(psa_instance *instance, const unsigned *vr, size_t count, const double *value) {
+    psa_result worst = PSA_FINE;
+    if (psa_lacks(instance, count, vr, value)) return PSA_ERROR;
+    for (size_t i = 0; i < count; ++i) {
+        const psa_result result = settable(instance, vr[i], value[i]);
+        if (result > worst) worst = result;
+    }
+    if (worst > PSA_WARNING) return worst;
+    for (size_t i = 0; i < count; ++i) set_one(&instance->state, &psa_variables[vr[i]], value[i]);
+    instance->fresh = 0;
+    return worst;
+}
+
+static int mismatch(psa_instance *instance, const void *vector, size_t count) {
+    if (count == PSA_NX && vector) return 0;
+    psa_say(instance, PSA_ERROR, "The model has %d continuous states; a vector of %lu was passed.", PSA_NX,
+            vector ? (unsigned long)count : 0UL);
+    return 1;
+}
+
+psa_result psa_set_time(psa_instance *instance, double time) {
+    if (!isfinite(time)) return psa_say(instance, PSA_ERROR, "The time is not finite.");
+    instance->state.solver.t = time;
+    instance->state.input.origin = time;
+    instance->fresh = 0;
+    return PSA_FINE;
+}
+
+psa_result psa_set_states(psa_instance *instance, const double *x, size_t count) {
+    if (mismatch(instance, x, count)) return PSA_ERROR;
+    for (int i = 0; i < PSA_NX; ++i)
+        if (!isfinite(x[i]))
+            return psa_say(instance, PSA_DISCARD, "State '%s' was set to a value that is not finite.",
+                           psa_variables[PSA_FIRST_STATE + i].name);
+    memcpy(instance->state.solver.x, x, sizeof instance->state.solver.x);
+    instance->fresh = 0;
+    return PSA_FINE;
+}
+
+psa_result psa_get_states(psa_instance *instance, double *x, size_t count) {
+    if (mismatch(instance, x, count)) return PSA_ERROR;
+    memcpy(x, instance->state.solver.x, sizeof instance->state.solver.x);
+    return PSA_FINE;
+}
+
+psa_result psa_get_derivatives(psa_instance *instance, double *xdot, size_t count) {
+    if (mismatch(instance, xdot, count)) return PSA_ERROR;
+    const psa_result result = refresh(instance);
+    if (result != PSA_FINE) return result;
+    for (int i = 0; i < PSA_NX; ++i) {
+        xdot[i] = instance->xdot[i];
+        if (!isfinite(xdot[i]))
+            return psa_say(instance, PSA_DISCARD, "The derivative of '%s' is not finite at t = %.9g s.",
+                           psa_variables[PSA_FIRST_STATE + i].name, instance->state.solver.t);
+    }
+    return PSA_FINE;
+}
+
+psa_result psa_get_nominals(psa_instance *instance, double *nominal, size_t count) {
+    if (mismatch(instance, nominal, count)) return PSA_ERROR;
+    memcpy(nominal, psa_state_nominals, sizeof(double) * PSA_NX);
+    return PSA_FINE;
+}
+
+/* First-order rates only: in the coming step an input is value + rate (t - start of the step). */
+psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_t count,
+                               const int *order, const double *rate) {
+    psa_state *const state = &instance->state;
+    if (psa_lacks(instance, count, vr, rate) || psa_lacks(instance, count, order, order))
+        return PSA_ERROR;
+    for (size_t i = 0; i < count; ++i) {
+        const psa_variable *const v = variable(instance, vr[i]);
+        if (!v) return PSA_ERROR;
+        if (v->kind != PSA_INPUT || order[i] != 1 || !isfinite(rate[i]))
+            return psa_say(instance, PSA_ERROR,
+                           "The derivative of order %d of '%s' cannot be set to %g; inputs take finite"
+                           " derivatives of order 1.",
+                           order[i], v->name, rate[i]);
+    }
+    for (size_t i = 0; i < count; ++i) {
+        const int index = psa_variables[vr[i]].index;
+        state->input.rate[index] = rate[i];
+        state->rate_given[index] = 1;
+    }
+    return PSA_FINE;
+}
+
+/* dy/dt along the trajectory that ends here, with the input's rate of the last step. */
+psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size_t count,
+                                const int *order, double *rate) {
+    const psa_state *const state = &instance->state;
+    const double none[PSA_NP + 1] = {0.0};
+    double dxdot[PSA_NX + 1], dy[PSA_NY + 1], u[PSA_NU + 1];
+    if (psa_lacks(instance, count, vr, rate) || psa_lacks(instance, count, order, order))
+        return PSA_ERROR;
+    const psa_result result = refresh(instance);
+    if (result != PSA_FINE) return result;
+    psa_input_at(&state->input, state->solver.t, u);
+    if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, 1.0, instance->xdot,
+                              state->input.rate, none, dxdot, dy))
+        return psa_say(instance, PSA_DISCARD, "The outputs cannot be differentiated here.");
+    for (size_t i = 0; i < count; ++i) {
+        const psa_variable *const v = variable(instance, vr[i]);
+        if (!v) return PSA_ERROR;
+        if (v->kind != PSA_OUTPUT || order[i] != 1)
+            return psa_say(instance, PSA_ERROR,
+                           "The derivative of order %d of '%s' is not known; outputs have derivatives of"
+                           " order 1.",
+                           order[i], v->name);
+        rate[i] = dy[v->index];
+    }
+    return PSA_FINE;
+}
+
+/* Seed of a known: time, state, input or parameter. */
+static int seed_one(const psa_variable *v, double seed, double *dt, double *dx, double *du, double *dp) {
+    switch (v->kind) {
+    case PSA_TIME: *dt += seed; return 1;
+    case PSA_STATE: dx[v->index] += seed; return 1;
+    case PSA_INPUT: du[v->index] += seed; return 1;
+    case PSA_PARAMETER: dp[v->index] += seed; return 1;
+    default: return 0;
+    }
+}
+
+psa_result psa_directional_derivative(psa_instance *instance, const unsigned *unknown,
+                                      size_t unknowns, const unsigned *known, size_t knowns,
+                                      const double *seed, double *sensitivity) {
+    const psa_state *const state = &instance->state;
+    double dt = 0.0, dx[PSA_NX + 1] = {0.0}, du[PSA_NU + 1] = {0.0}, dp[PSA_NP + 1] = {0.0};
+    double dxdot[PSA_NX + 1], dy[PSA_NY + 1], u[PSA_NU + 1];
+    if (psa_lacks(instance, unknowns, unknown, sensitivity) || psa_lacks(instance, knowns, known, seed))
+        return PSA_ERROR;
+    for (size_t i = 0; i < knowns; ++i) {
+        const psa_variable *const v = variable(instance, known[i]);
+        if (!v) return PSA_ERROR;
+        if (!seed_one(v, seed[i], &dt, dx, du, dp))
+            return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be varied.", v->name);
+    }
+    psa_input_at(&state->input, state->solver.t, u);
+    if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, dt, dx, du, dp, dxdot, dy))
+        return psa_say(instance, PSA_DISCARD, "The model cannot be differentiated here.");
+    for (size_t i = 0; i < unknowns; ++i) {
+        const psa_variable *const v = variable(instance, unknown[i]);
+        if (!v) return PSA_ERROR;
+        if (v->kind != PSA_DERIVATIVE && v->kind != PSA_OUTPUT)
+            return psa_say(instance, PSA_ERROR, "'%s' is not calculated and has no derivative.", v->name);
+        sensitivity[i] = v->kind == PSA_OUTPUT ? dy[v->index] : dxdot[v->index];
+    }
+    return PSA_FINE;
+}

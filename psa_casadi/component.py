@@ -1,0 +1,100 @@
+"""What a piece of physics must declare, and the balances it may add to.
+
+A component never edits another one: it adds terms to balances, named sums with a unit and a meaning.
+`psa_casadi.model.compose` adds the terms up, puts the sums in the order of their dependence and
+refuses a loop.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from psa_casadi.variables import Input, Output, Parameter, State
+
+# casadi ships no type information; a symbolic expression is Any to the type checker.
+Expression = Any
+
+#: Probe value that stands for "the frequencies where the residual's spectrum peaks", in Hz.
+SPECTRAL_PEAKS = "spectral_peaks"
+#: Probe value that stands for the duration of the longest record, in s.
+RECORD_DURATION = "record_duration"
+
+
+@dataclass(frozen=True)
+class Balance:
+    """A named sum: its unit and what the sum means."""
+
+    name: str
+    unit: str
+    description: str
+
+
+BALANCES: dict[str, Balance] = {
+    b.name: b
+    for b in (
+        Balance("drive_voltage", "V", "open-circuit voltage of the amplifier"),
+        Balance("drive_current", "A", "current through the amplifier's output resistance"),
+        Balance("stack_current", "A", "current into the stack's capacitance"),
+        Balance("voltage_rate", "V/s", "rate of the voltage at the stack's electrodes"),
+        Balance("hysteresis_rate", "N/s", "rate of the hysteresis force"),
+        Balance("free_force", "N", "force the wafers generate before the creep lag"),
+        Balance("wafer_force", "N", "force that accelerates and strains the wafers"),
+        Balance("tip_force", "N", "force on the output mass from outside the stack"),
+        Balance("tip_displacement", "m", "displacement of the output mass"),
+        Balance("displacement", "m", "output displacement, with creep and further modes"),
+        Balance("blocked_force", "N", "force that would hold the output at zero displacement"),
+        Balance("measured_displacement", "m", "what the displacement sensor shows"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Equations:
+    """What a component contributes: state derivatives, terms of balances, outputs."""
+
+    der: Mapping[str, Expression] = field(default_factory=dict)
+    add: Mapping[str, Expression] = field(default_factory=dict)
+    out: Mapping[str, Expression] = field(default_factory=dict)
+
+
+class Symbols:
+    """Read access to every symbol of a model by attribute: `s.k_L`, `s.f_H`, `s.displacement`.
+
+    Parameters, states, inputs, `time` and balances share one name space.
+    """
+
+    def __init__(self, table: Mapping[str, Expression]) -> None:
+        self._table = dict(table)
+
+    def __getattr__(self, name: str) -> Expression:
+        try:
+            return self._table[name]
+        except KeyError:
+            raise AttributeError(f"no symbol named '{name}' in this model") from None
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """One piece of physics, declared once and symbolically.
+
+    `gain` names the parameter that removes the component exactly at 0 (None for base physics).
+    `probe` holds trial values of parameters that have no influence while the gain is 0;
+    `finite_step` is the size of the gain, as a share of its scale, at which the effect is looked
+    for when its derivative vanishes at 0. `looks_like` is the signature an engineer sees.
+    `belongs_to` is plant, drive, sensor or environment; the last two stay out of exported plants.
+    """
+
+    name: str
+    description: str
+    source: str
+    equations: Callable[[Symbols], Equations]
+    parameters: tuple[Parameter, ...] = ()
+    states: tuple[State, ...] = ()
+    inputs: tuple[Input, ...] = ()
+    outputs: tuple[Output, ...] = ()
+    gain: str | None = None
+    probe: Mapping[str, tuple[float, ...] | str] = field(default_factory=dict)
+    finite_step: tuple[float, ...] = ()
+    looks_like: str = ""
+    equation_text: str = ""
+    belongs_to: str = "plant"

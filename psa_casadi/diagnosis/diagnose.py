@@ -1,0 +1,144 @@
+"""Diagnose: fit the base, screen the effects, fit the leading ones, choose, repeat, judge."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.errors_of import held_out_residuals, rms
+from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
+from psa_casadi.diagnosis.probes import directions
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.screening import Screening, screen
+from psa_casadi.diagnosis.selection import Extension, choose, extend, leading
+from psa_casadi.diagnosis.verdict import conclude
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import Experiment, split, whole
+from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.identify import Progress, fit_base, refit
+from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
+from psa_casadi.identification.starting import starting_model
+from psa_casadi.model.compose import Model
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Most causes that are named for one set of records.
+MOST_CAUSES = 3
+
+
+@dataclass(eq=False)
+class Round:
+    """One step of the search: the model so far, its screening, the rest test, the extensions tried."""
+
+    fit: Fit
+    predicted: tuple[FloatArray, ...]
+    screening: Screening
+    test: Omnibus
+    extensions: list[Extension] = field(default_factory=list)
+    chosen: Extension | None = None
+    rivals: list[Extension] = field(default_factory=list)
+
+
+def diagnose(
+    records: Sequence[Record],
+    *,
+    holdout: Sequence[Record] = (),
+    model: Model | None = None,
+    stiffness: float | None = None,
+    effects: Sequence[Component] | None = None,
+    progress: Progress = lambda _: None,
+) -> Diagnosis:
+    """Find what the base model gets wrong on the records, name the cause, measure the gain.
+
+    Held-out data are the records `holdout`, else the last quarter of every record; they choose
+    nothing but whether an extension may stay. `model` is where the base fit starts; `stiffness`
+    [N/m] fixes the force scale; `effects` is the table to search. Raises InputError.
+    """
+    table = list(effects if effects is not None else EFFECTS.values())
+    experiments = _experiments(records, holdout)
+    start = (model or starting_model(records, stiffness)).without(
+        c.name for c in table if c.gain is not None
+    )
+    base = fit_base(start, experiments, progress=progress)
+    rounds = _search(base, experiments, table, progress)
+    retried = _retry_base(rounds, experiments, progress)
+    if retried is not None:
+        rounds = _search(retried, experiments, table, progress)
+    progress("judging")
+    return conclude(rounds, experiments, table, stiffness is not None)
+
+
+def _experiments(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Experiment, ...]:
+    if not holdout:
+        return tuple(split(r) for r in records)
+    held = []
+    for record in holdout:
+        # the first tenth of a held-out record only serves to find its offset and memory
+        lead = np.arange(record.n) < max(8, record.n // 10)
+        held.append(Experiment(record, record.mask & lead, record.mask & ~lead))
+    return (*(whole(r) for r in records), *held)
+
+
+def _search(
+    base: Fit, experiments: Sequence[Experiment], table: Sequence[Component], progress: Progress
+) -> list[Round]:
+    """Forward selection: add the best effect until the rest is noise or nothing helps."""
+    rounds = [_examine(base, tuple(base.predicted(experiments)), experiments, table, progress)]
+    while len(rounds) <= MOST_CAUSES:
+        current = rounds[-1]
+        best = max((s.decrease for s in current.screening.scores), default=0.0)
+        if best < current.screening.threshold:
+            break
+        inflation = correlation_inflation(current.fit.residuals) if len(rounds) > 1 else 1.0
+        for name, scores in leading(current.screening):
+            progress(f"cause {len(rounds)}: fitting {name}")
+            extension = extend(current.fit, experiments, scores, inflation)
+            if extension is not None:
+                current.extensions.append(extension)
+        before = rms(np.concatenate(held_out_residuals(experiments, current.predicted)))
+        ranked = choose(current.extensions, before)
+        if not ranked:
+            break
+        current.chosen, current.rivals = ranked[0], ranked[1:]
+        left = [c for c in table if c not in current.chosen.fit.model.components]
+        rounds.append(
+            _examine(
+                current.chosen.fit, current.chosen.predicted, experiments, left, progress
+            )
+        )
+    return rounds
+
+
+def _examine(
+    fit: Fit,
+    predicted: tuple[FloatArray, ...],
+    experiments: Sequence[Experiment],
+    table: Sequence[Component],
+    progress: Progress,
+) -> Round:
+    progress("screening effects")
+    lengths = [int(e.used.sum()) for e in experiments]
+    screening = screen(fit, directions(fit, experiments, table), lengths)
+    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    time = np.concatenate([e.record.time[e.used] for e in experiments])
+    floor = high_frequency_noise(fit.residuals)
+    test = omnibus(fit.residuals, voltage, time, screening.colour, floor)
+    return Round(fit, predicted, screening, test)
+
+
+def _retry_base(
+    rounds: Sequence[Round], experiments: Sequence[Experiment], progress: Progress
+) -> Fit | None:
+    """Fit the base once more from the best extension's parameters; return it if clearly better."""
+    first = rounds[0]
+    if first.chosen is None:
+        return None
+    progress("base fit, from the extension's parameters")
+    names = first.fit.unknowns.names
+    values = {n: first.chosen.fit.model.values[n] for n in names}
+    moved = replace(first.fit, model=first.fit.model.with_values(values))
+    again = refit(moved, experiments, names)
+    return again if again.rms < 0.98 * first.fit.rms else None

@@ -1,0 +1,148 @@
+"""Trial directions: what each effect would add to the prediction, to first order, at trial values."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import find_peaks
+
+from psa_casadi.component import RECORD_DURATION, SPECTRAL_PEAKS, Component
+from psa_casadi.errors import PsaError
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.fit import FIT_RTOL, Fit
+from psa_casadi.identification.prediction import measured, predict_record
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.start import memory_names
+
+FloatArray = npt.NDArray[np.float64]
+
+_PEAKS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """One effect at one set of trial values.
+
+    `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
+    times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
+    history. `one_sided` says that only positive multiples make sense.
+    """
+
+    effect: Component
+    values: dict[str, float]
+    memory: tuple[dict[str, float], ...]
+    unit_gain: float
+    column: FloatArray
+    one_sided: bool
+    finite: bool
+
+
+def directions(
+    fit: Fit, experiments: Sequence[Experiment], effects: Sequence[Component]
+) -> list[Direction]:
+    """Return the directions of all effects over their probe values, at the fitted model."""
+    found = []
+    peaks = residual_peaks(fit, experiments)
+    for effect in effects:
+        for values in _probe_values(effect, experiments, peaks):
+            found += list(_directions_at(fit, experiments, effect, values))
+    return found
+
+
+def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Frequencies [Hz] of the highest peaks in the spectrum of the first record's residual."""
+    experiment = experiments[0]
+    count = int(experiment.used.sum())
+    residual = fit.residuals[:count] - np.mean(fit.residuals[:count])
+    power = np.abs(np.fft.rfft(residual * np.hanning(count))) ** 2
+    frequency = np.fft.rfftfreq(count, experiment.record.sample_time)
+    lowest = max(8, count // 200)
+    where, _ = find_peaks(power[lowest:], distance=max(3, count // 200))
+    strongest = where[np.argsort(power[lowest:][where])[::-1][:_PEAKS]] + lowest
+    return tuple(float(f) for f in np.sort(frequency[strongest])) or (
+        0.1 / experiment.record.sample_time,
+    )
+
+
+def _probe_values(
+    effect: Component, experiments: Sequence[Experiment], peaks: tuple[float, ...]
+) -> Iterator[dict[str, float]]:
+    longest = max(e.record.duration for e in experiments)
+    grids: list[tuple[float, ...]] = []
+    for grid in effect.probe.values():
+        if grid == SPECTRAL_PEAKS:
+            grids.append(peaks)
+        elif grid == RECORD_DURATION:
+            grids.append((longest,))
+        elif isinstance(grid, tuple):
+            grids.append(grid)
+    for point in product(*grids):
+        yield dict(zip(effect.probe, point, strict=True))
+
+
+def _directions_at(
+    fit: Fit, experiments: Sequence[Experiment], effect: Component, values: dict[str, float]
+) -> Iterator[Direction]:
+    model = fit.model.with_effect(effect, values)
+    gain = effect.gain or ""
+    parameter = model.parameter(gain)
+    scale = parameter.typical({**model.values, gain: 0.0})
+    one_sided = parameter.bounds[0] >= 0
+    for memory in _histories(fit, experiments, effect, model):
+        steps = [s * scale for s in effect.finite_step] or [0.0]
+        for step in steps:
+            try:
+                column = _column(fit, experiments, model, gain, memory, step, scale)
+            except PsaError:
+                continue
+            if np.all(np.isfinite(column)) and np.any(column):
+                yield Direction(
+                    effect, values, memory, step or scale, column, one_sided, bool(step)
+                )
+
+
+def _histories(
+    fit: Fit, experiments: Sequence[Experiment], effect: Component, model: Model
+) -> list[tuple[dict[str, float], ...]]:
+    """The effect's memories at rest, and for settling ones also as after long cycling."""
+    known = [fit.memory(r) for r in range(len(experiments))]
+    settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
+    variants = [tuple(known)]
+    if settling:
+        cycled = []
+        for memory, e in zip(known, experiments, strict=True):
+            y = measured(e.record)[e.used]
+            cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
+        variants.append(tuple(cycled))
+    return variants
+
+
+def _column(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    model: Model,
+    gain: str,
+    memory: tuple[dict[str, float], ...],
+    step: float,
+    scale: float,
+) -> FloatArray:
+    changed = model.with_values({gain: step}) if step else model
+    names = memory_names(model.structure)
+    parts, first = [], 0
+    for e, start in zip(experiments, memory, strict=True):
+        deviation = np.array([start.get(n, 0.0) for n in names])
+        y, by_gain, _ = predict_record(
+            changed, e.record, deviation, [gain], stop=e.stop, rtol=FIT_RTOL
+        )
+        used = e.used[: e.stop]
+        count = int(used.sum())
+        if step:
+            index = len(parts)
+            prediction = measured(e.record)[: e.stop][used] - fit.residuals[first : first + count]
+            parts.append(y[used] + fit.offset(index) - prediction)
+        else:
+            parts.append(by_gain[used, 0] * scale)
+        first += count
+    return np.concatenate(parts)

@@ -1,0 +1,148 @@
+"""What a diagnosis says, as frozen records, and DIAGNOSIS.json."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.fit import Fit
+from psa_casadi.model.compose import Model
+
+FloatArray = npt.NDArray[np.float64]
+Verdict = Literal["adequate", "cause_named", "partly_explained", "ambiguous", "unexplained"]
+
+FORMAT = "psa_casadi.diagnosis/1"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter of a cause: value and 95 % interval in its unit."""
+
+    value: float
+    unit: str
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A named cause: where it sits, how sure, how large, and what it cannot be told from."""
+
+    effect: str
+    belongs_to: str
+    confidence: float
+    parameters: Mapping[str, Estimate]
+    cannot_be_told_from: tuple[str, ...]
+    explained_share: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that was tried: share of the excess it explains, and its evidence over the base."""
+
+    effect: str
+    explained_share: float
+    evidence: float
+    fitted: bool
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one model [m], in training and held-out samples; percent of the measured range."""
+
+    train_rms_m: float
+    holdout_rms_m: float
+    holdout_max_m: float
+    holdout_nrmse_percent: float
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Reduction of the held-out rms by the extended model [%], with a 95 % interval."""
+
+    holdout_rms_reduction_percent: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class BlindSpot:
+    """An effect of practical size that the records could not have shown."""
+
+    effect: str
+    smallest_detectable_gain: float
+    unit: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """What is left: whether it is noise, and where it is not."""
+
+    white: bool
+    p_value: float
+    where: str
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """The experiment that would tell the rivals apart."""
+
+    voltage_csv: str | None
+    separates: tuple[str, ...]
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """A diagnosis: verdict, causes, the base and the extended model, errors, and what remains.
+
+    `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` are the
+    predictions [m] of every record in full, in the order of `experiments`.
+    """
+
+    verdict: Verdict
+    causes: tuple[Cause, ...]
+    candidates: tuple[Candidate, ...]
+    noise_floor_rms_m: float
+    base_errors: Errors
+    extended_errors: Errors
+    gain: Gain
+    blind_to: tuple[BlindSpot, ...]
+    remaining: Remaining
+    next_experiment: NextExperiment
+    notes: tuple[str, ...]
+    experiments: tuple[Experiment, ...]
+    base_fit: Fit
+    extended_fit: Fit
+    base: tuple[FloatArray, ...]
+    extended: tuple[FloatArray, ...]
+    model: Model
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of DIAGNOSIS.json."""
+        return {
+            "format": FORMAT,
+            "verdict": self.verdict,
+            "causes": [asdict(c) for c in self.causes],
+            "candidates": [asdict(c) for c in self.candidates],
+            "errors": {
+                "noise_floor_rms_m": self.noise_floor_rms_m,
+                "base": asdict(self.base_errors),
+                "extended": asdict(self.extended_errors),
+            },
+            "gain": asdict(self.gain),
+            "blind_to": [asdict(b) for b in self.blind_to],
+            "remaining": asdict(self.remaining),
+            "next_experiment": asdict(self.next_experiment),
+            "notes": list(self.notes),
+            "records": [
+                {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments
+            ],
+        }
+
+    def to_json(self) -> str:
+        """Return the text of DIAGNOSIS.json."""
+        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"

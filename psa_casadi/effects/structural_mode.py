@@ -1,0 +1,43 @@
+"""Structural mode: a resonance of the mount or the guide that the two-mass model lacks."""
+
+from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Symbols
+from psa_casadi.scales import stroke_scale
+from psa_casadi.variables import Parameter, State, Values
+
+_TWO_PI = 6.283185307179586
+
+
+def _equations(s: Symbols) -> Equations:
+    omega = _TWO_PI * s.mode_frequency
+    return Equations(
+        der={
+            "q": s.r_q,
+            "r_q": omega**2 * (s.tip_displacement - s.q) - 2 * s.mode_damping * omega * s.r_q,
+        },
+        add={"displacement": s.mode_gain * s.q},
+    )
+
+
+def _rate_scale(p: Values) -> float:
+    return stroke_scale(p) * _TWO_PI * p["mode_frequency"]
+
+
+STRUCTURAL_MODE = Component(
+    name="structural_mode",
+    description="a further resonance, of the mount or the guide",
+    source="modal superposition, one second-order mode driven by the output mass",
+    gain="mode_gain",
+    equation_text="q'' + 2 zeta w q' + w^2 q = w^2 x_tip,  x gains mode_gain q,  w = 2 pi mode_frequency",
+    parameters=(
+        Parameter("mode_gain", 0.0, "1", (-2.0, 2.0), "static share of the mode", scale=0.01),
+        Parameter("mode_frequency", 1e3, "Hz", (0.1, 1e6), "natural frequency", log=True),
+        Parameter("mode_damping", 0.02, "1", (1e-4, 0.7), "damping ratio", log=True),
+    ),
+    states=(
+        State("q", "m", "modal displacement", stroke_scale, display_unit="um"),
+        State("r_q", "m/s", "modal velocity", _rate_scale, display_unit="um/s"),
+    ),
+    equations=_equations,
+    probe={"mode_frequency": SPECTRAL_PEAKS, "mode_damping": (0.01, 0.05)},
+    looks_like="the residual rings at a tone that is neither pole of the stack",
+)

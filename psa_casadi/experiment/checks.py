@@ -1,0 +1,99 @@
+"""What must hold for the numbers of a record before anything is computed from them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.errors import Problems
+from psa_casadi.units import FloatArray
+
+#: Fewer samples than this describe no experiment.
+MIN_SAMPLES = 16
+
+#: Of mistakes of one kind in one column, this many are described, the others counted.
+LISTED = 20
+
+
+@dataclass(frozen=True)
+class Located:
+    """One column's values, the lines they stand in, and which of them were reported already."""
+
+    path: str
+    name: str
+    values: FloatArray
+    lines: NDArray[np.int64]
+    reported: NDArray[np.bool_]
+
+    def complain(self, at: NDArray[np.bool_], sentence: str, problems: Problems) -> None:
+        """Add `sentence`, in which {value} is the value found, for every sample that `at` marks."""
+        rows = np.flatnonzero(at & ~self.reported)
+        for row in rows[:LISTED]:
+            found = sentence.format(value=f"{self.values[row]:.6g}")
+            problems.add(f"{self.path}: line {self.lines[row]}, column '{self.name}': {found}")
+        problems.add_uncounted(max(0, rows.size - LISTED))
+
+
+def check_length(path: str, samples: int, problems: Problems) -> None:
+    """Demand at least `MIN_SAMPLES` samples."""
+    if samples < MIN_SAMPLES:
+        problems.add(
+            f"{path}: found {samples} samples, expected at least {MIN_SAMPLES}; record for longer "
+            f"or name the right file."
+        )
+
+
+def check_time(time: Located, problems: Problems) -> None:
+    """Demand finite instants, each later than the one before it."""
+    check_complete(time, problems)
+    known = np.flatnonzero(np.isfinite(time.values))
+    wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
+    problems.add_uncounted(max(0, wrong.size - LISTED))
+    for row, before in zip(known[wrong + 1][:LISTED], known[wrong][:LISTED], strict=True):
+        now, last = time.values[row], time.values[before]
+        what = "stands still" if now == last else "goes back"
+        problems.add(
+            f"{time.path}: line {time.lines[row]}, column 'time': time {what} (from {last:.9g} in "
+            f"line {time.lines[before]} to {now:.9g}), expected a later instant in every line; "
+            f"remove repeated lines or split the file where a new record begins."
+        )
+
+
+def check_complete(column: Located, problems: Problems) -> None:
+    """Demand a finite number in every row."""
+    column.complain(
+        np.isnan(column.values),
+        "found no value, expected a number; fill the cell or remove the line.",
+        problems,
+    )
+    _check_finite(column, problems)
+
+
+def check_displacement(column: Located, problems: Problems) -> None:
+    """Demand finite numbers, of which enough are there; missing ones are allowed."""
+    _check_finite(column, problems)
+    valid = int(np.isfinite(column.values).sum())
+    if column.values.size >= MIN_SAMPLES > valid:
+        problems.add(
+            f"{column.path}: column 'displacement': found {valid or 'no'} valid values in "
+            f"{column.values.size} rows, expected at least {MIN_SAMPLES}; check that the sensor "
+            f"was recorded."
+        )
+
+
+def check_excitation(column: Located, problems: Problems) -> None:
+    """Demand a voltage that changes."""
+    finite = column.values[np.isfinite(column.values)]
+    if finite.size and np.ptp(finite) <= 1e-12 * np.max(np.abs(finite)):
+        problems.add(
+            f"{column.path}: column 'voltage': found {finite[0]:.6g} in every row, expected a "
+            f"voltage that changes; a fit needs a record in which the stack is driven."
+        )
+
+
+def _check_finite(column: Located, problems: Problems) -> None:
+    column.complain(
+        np.isinf(column.values),
+        "found {value}, expected a finite number; correct the cell or remove the line.",
+        problems,
+    )

@@ -1,0 +1,125 @@
+"""One experiment: what was applied to the stack and what was measured."""
+
+import hashlib
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from psa_casadi.errors import InputError
+from psa_casadi.units import FloatArray
+
+_OPTIONAL = ("displacement", "load_force", "current", "temperature")
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Samples of one experiment in SI units; the arrays have shape (n,) and cannot be changed.
+
+    `time` [s] increases strictly and need not be uniform; between samples `voltage` [V] is linear.
+    `displacement` is in metres, or in `displacement_unit` "counts" where the sensor's scale is
+    unknown; nan marks a missing sample. `load_force` [N], `current` [A] and `temperature` [K] are
+    None where they were not recorded. `sha256` is that of the file at `source`, or of the arrays
+    where there is no file.
+
+    Raises:
+        InputError: an array is not one-dimensional or its length differs from that of `time`.
+    """
+
+    name: str
+    time: FloatArray
+    voltage: FloatArray
+    displacement: FloatArray | None = None
+    load_force: FloatArray | None = None
+    current: FloatArray | None = None
+    temperature: FloatArray | None = None
+    sha256: str = ""
+    source: str = ""
+    displacement_unit: Literal["m", "counts"] = "m"
+
+    def __post_init__(self) -> None:
+        problems = []
+        for column in ("time", "voltage", *_OPTIONAL):
+            given = getattr(self, column)
+            if given is None and column in _OPTIONAL:
+                continue
+            array = _frozen(given)
+            object.__setattr__(self, column, array)
+            if array.ndim != 1 or array.size != self.time.size:
+                problems.append(
+                    f"record '{self.name}': '{column}' has shape {array.shape}, but time has "
+                    f"{self.time.size} samples; give one value for each instant."
+                )
+        if problems:
+            raise InputError(problems)
+        if not self.sha256:
+            object.__setattr__(self, "sha256", self._hash())
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.time.size
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """True where a displacement was measured, shape (n,); all False without displacement."""
+        if self.displacement is None:
+            return np.zeros(self.n, dtype=np.bool_)
+        return np.isfinite(self.displacement)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def sample_time(self) -> float:
+        """Median distance between samples [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    @property
+    def range_m(self) -> float:
+        """Largest minus smallest displacement [m], or in counts where the record is in counts.
+
+        Raises:
+            InputError: no displacement was measured.
+        """
+        if self.displacement is None or not self.mask.any():
+            raise InputError(
+                f"record '{self.name}' has no displacement, so it has no range; use a record with "
+                f"a displacement column."
+            )
+        return float(np.nanmax(self.displacement) - np.nanmin(self.displacement))
+
+    def slice(self, start: int, stop: int) -> "Record":
+        """Return the samples `start <= k < stop`, counted as Python counts; `sha256` is kept.
+
+        Raises:
+            InputError: fewer than two samples remain.
+        """
+        part = slice(start, stop)
+        first, last, _ = part.indices(self.n)
+        if last - first < 2:
+            raise InputError(
+                f"record '{self.name}': samples {start} to {stop} of {self.n} leave fewer than "
+                f"two; choose a longer part."
+            )
+        arrays = {c: a[part] for c in _OPTIONAL if (a := getattr(self, c)) is not None}
+        name = f"{self.name}[{first}:{last}]"
+        return replace(self, name=name, time=self.time[part], voltage=self.voltage[part], **arrays)
+
+    def _hash(self) -> str:
+        digest = hashlib.sha256()
+        for column in ("time", "voltage", *_OPTIONAL):
+            array = getattr(self, column)
+            digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
+        return digest.hexdigest()
+
+
+def _frozen(values: ArrayLike) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.flags.writeable or not array.flags.c_contiguous:
+        array = array.copy()
+        array.flags.writeable = False
+    return array

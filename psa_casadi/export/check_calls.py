@@ -1,0 +1,196 @@
+"""Calling sequences of an FMI 2.0 FMU that must succeed, and what must come of them."""
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.export.check_illegal import illegal_calls
+from psa_casadi.export.fmu_instance import (
+    CO_SIMULATION,
+    ERROR,
+    MODEL_EXCHANGE,
+    OK,
+    Callbacks,
+    Fmu,
+    FmuError,
+    Instance,
+)
+
+FloatArray = npt.NDArray[np.float64]
+Problems = Iterator[str]
+
+
+def _inputs(fmu: Fmu, share: float) -> dict[str, float]:
+    return {name: share * fmu.nominals[name] for name in fmu.names("input")}
+
+
+def _run(
+    instance: Instance, size: float, shares: tuple[float, ...], begin: float = 0.0
+) -> FloatArray:
+    """Step with inputs of some shares of their nominals; return outputs and states of each step."""
+    fmu = instance.fmu
+    rows = []
+    for k, share in enumerate(shares):
+        instance.set(_inputs(fmu, share))
+        instance.step(begin + k * size, size)
+        rows.append(instance.get([*fmu.names("output"), *fmu.states()]))
+    return np.array(rows)
+
+
+def _differ(a: FloatArray, b: FloatArray) -> bool:
+    return a.tobytes() != b.tobytes()
+
+
+def life_cycle(fmu: Fmu) -> Problems:
+    """Both interfaces: initialise, step or evaluate, terminate, reset, and the same again."""
+    size = fmu.step_size
+    results = []
+    with fmu.start(CO_SIMULATION) as slave:
+        for _ in range(2):
+            results.append(_run(slave, size, (0.5, 1.0)))
+            slave.require("Terminate")
+            slave.require("Reset")
+            slave.require("SetupExperiment", 0, 0.0, 0.0, 0, 0.0)
+            slave.require("EnterInitializationMode")
+            slave.require("ExitInitializationMode")
+    if _differ(*results):
+        yield "after fmi2Reset a co-simulation instance gives other results"
+    with fmu.start(MODEL_EXCHANGE) as model:
+        names = fmu.states()
+        x = np.array([0.1 * fmu.nominals[n] for n in names])
+        slope = model.derivatives(0.5, x, _inputs(fmu, 1.0))
+        if not np.all(np.isfinite(slope)):
+            yield "the derivatives are not finite"
+        if _differ(model.get([f"der({n})" for n in names]), slope):
+            yield "fmi2GetReal of der(x) differs from fmi2GetDerivatives"
+        model.require("EnterEventMode")
+        model.require("EnterContinuousTimeMode")
+        model.require("Terminate")
+
+
+def refused_instances(fmu: Fmu) -> Problems:
+    """A wrong GUID and an empty name give no instance."""
+    wrong = (({"guid": "{no such token}"}, "a wrong GUID"), ({"name": ""}, "an empty name"))
+    for changes, what in wrong:
+        instance = fmu.instantiate(CO_SIMULATION, **changes)
+        if instance is not None:
+            instance.free()
+            yield f"fmi2Instantiate accepts {what}"
+
+
+def null_callbacks(fmu: Fmu) -> Problems:
+    """No callbacks, and callbacks that are all NULL, are tolerated, errors included."""
+    for callbacks in (None, Callbacks()):
+        instance = fmu.instantiate(CO_SIMULATION, callbacks=callbacks)
+        if instance is None:
+            yield "fmi2Instantiate refuses NULL callbacks"
+            continue
+        with instance:
+            if instance.call("DoStep", 0.0, 1.0, 1) != ERROR:
+                yield "fmi2DoStep before initialization is not refused"
+            instance.require("SetupExperiment", 0, 0.0, 0.0, 0, 0.0)
+            instance.require("EnterInitializationMode")
+            instance.require("ExitInitializationMode")
+            instance.step(0.0, fmu.step_size)
+
+
+def communication_points(fmu: Fmu) -> Problems:
+    """A step of zero size changes nothing; a point that differs by rounding is accepted."""
+    size = fmu.step_size
+    with fmu.start(CO_SIMULATION, start_time=0.1) as slave:
+        before = _run(slave, size, (1.0, 0.5), 0.1)
+        now = 0.1 + 2 * size
+        slave.step(now, 0.0)
+        if _differ(before[-1], slave.get([*fmu.names("output"), *fmu.states()])):
+            yield "a step of zero size changes the result"
+        for point in (math.nextafter(now, 1.0), math.nextafter(now + size, 0.0)):
+            if slave.call("DoStep", float(point), size, 1) != OK:
+                yield "a communication point that differs by rounding is refused"
+
+
+def independent_instances(fmu: Fmu) -> Problems:
+    """Two instances stepped in turn give what each gives alone."""
+    size, shares = fmu.step_size, ((0.2, 0.9, 0.4), (1.0, 0.1, 0.6))
+    alone = []
+    for own in shares:
+        with fmu.start(CO_SIMULATION) as slave:
+            alone.append(_run(slave, size, own))
+    with fmu.start(CO_SIMULATION) as first, fmu.start(CO_SIMULATION) as second:
+        for k in range(3):
+            for slave, own, expected in zip((first, second), shares, alone, strict=True):
+                row = _run(slave, size, own[k : k + 1], k * size)
+                if _differ(row[0], expected[k]):
+                    yield f"two instances disturb each other in step {k + 1}"
+
+
+def parameter_changes(fmu: Fmu) -> Problems:
+    """Parameters set before initialization, in it, and between steps count from then on."""
+    size = fmu.step_size
+    with fmu.start(CO_SIMULATION) as slave:
+        plain = _run(slave, size, (0.5, 1.0, 0.3))
+        names = fmu.names("parameter")
+        changed = {n: 1.03 * v for n, v in zip(names, slave.get(names), strict=True)}
+    with fmu.start(CO_SIMULATION, values=changed) as slave:
+        before = _run(slave, size, (0.5, 1.0, 0.3))
+    with fmu.start(CO_SIMULATION) as slave:
+        slave.set(changed)
+        if _differ(before, _run(slave, size, (0.5, 1.0, 0.3))):
+            yield "parameters set before and after initialization give different results"
+    with fmu.start(CO_SIMULATION) as slave:
+        during = _run(slave, size, (0.5, 1.0))
+        slave.set(changed)
+        after = _run(slave, size, (0.3,), 2 * size)
+        if _differ(during, plain[:2]) or not _differ(after[0], plain[2]):
+            yield "parameters set between steps have no effect, or one on the past"
+    x, inputs = np.array([0.1 * fmu.nominals[n] for n in fmu.states()]), _inputs(fmu, 0.7)
+    with fmu.start(MODEL_EXCHANGE) as model, fmu.start(MODEL_EXCHANGE, values=changed) as other:
+        unchanged = model.derivatives(0.0, x, inputs)
+        model.set(changed)
+        slope = model.derivatives(0.0, x, inputs)
+        if _differ(slope, other.derivatives(0.0, x, inputs)) or not _differ(slope, unchanged):
+            yield "parameters set in continuous-time mode do not reach the derivatives"
+
+
+def snapshots(fmu: Fmu) -> Problems:
+    """A state taken, serialised, read back or restored replays the same bits; damage is noticed."""
+    size, shares = fmu.step_size, (0.9, 0.1, 0.7)
+    with fmu.start(CO_SIMULATION) as slave:
+        _run(slave, size, (0.5, 1.0))
+        snapshot = slave.save()
+        data = slave.serialize(snapshot)
+        first = _run(slave, size, shares, 2 * size)
+        slave.restore(snapshot)
+        if _differ(first, _run(slave, size, shares, 2 * size)):
+            yield "a restored state does not replay the same bits"
+        slave.drop(snapshot)
+        with fmu.open(CO_SIMULATION) as other:
+            copy = other.deserialize(data)
+            if other.serialize(copy) != data:
+                yield "a state read back from bytes is serialised to other bytes"
+            other.restore(copy)
+            other.drop(copy)
+            if _differ(first, _run(other, size, shares, 2 * size)):
+                yield "a state moved to another instance does not replay the same bits"
+        middle = len(data) // 2
+        damaged = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+        for wrong, what in ((damaged, "damaged"), (data[:-1], "truncated")):
+            try:
+                slave.deserialize(wrong)
+            except FmuError:
+                continue
+            yield f"a {what} serialised state is accepted"
+
+
+#: The checks by the name of their row.
+CALLS: dict[str, Callable[[Fmu], Problems]] = {
+    "life cycle": life_cycle,
+    "refused instances": refused_instances,
+    "NULL callbacks": null_callbacks,
+    "illegal calls": illegal_calls,
+    "communication points": communication_points,
+    "independent instances": independent_instances,
+    "parameter changes": parameter_changes,
+    "snapshots": snapshots,
+}

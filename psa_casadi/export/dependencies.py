@@ -1,0 +1,40 @@
+"""What each output and derivative depends on, read off the symbolic Jacobian."""
+
+from functools import cache
+
+import casadi as ca
+
+from psa_casadi.component import Expression
+from psa_casadi.model.compose import Structure
+
+Key = tuple[str, int]
+
+
+@cache
+def dependencies(structure: Structure) -> dict[Key, dict[Key, str]]:
+    """Return for each output and derivative what it depends on, and how.
+
+    Keys are (kind, index). The dependence is "constant" where the partial derivative is a number,
+    "tunable" where it holds parameters only, else "dependent". Taken from the sparsity of the
+    Jacobian with respect to time, states, inputs and parameters.
+    """
+    s = structure
+    sizes = (("time", 1), ("state", len(s.states)), ("input", len(s.inputs)))
+    groups = (*sizes, ("parameter", len(s.parameters)))
+    knowns: list[Key] = [(kind, i) for kind, size in groups for i in range(size)]
+    unknowns: list[Key] = [("derivative", i) for i in range(len(s.states))]
+    unknowns += [("output", i) for i in range(len(s.outputs))]
+    jacobian = ca.jacobian(ca.vertcat(s.xdot, s.y), ca.vertcat(s.time, s.x, s.u, s.p))
+    tunable = {p.name for p in s.parameters}
+    result: dict[Key, dict[Key, str]] = {u: {} for u in unknowns}
+    rows, columns = jacobian.sparsity().get_triplet()
+    for row, column, entry in zip(rows, columns, jacobian.nonzeros(), strict=True):
+        result[unknowns[row]][knowns[column]] = _kind(entry, tunable)
+    return result
+
+
+def _kind(entry: Expression, tunable: set[str]) -> str:
+    names = {str(symbol) for symbol in ca.symvar(entry)}
+    if not names:
+        return "constant"
+    return "tunable" if names <= tunable else "dependent"

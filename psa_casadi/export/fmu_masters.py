@@ -1,0 +1,114 @@
+"""Two small importers of one FMU: stepping it (co-simulation), integrating it (model exchange)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from scipy.integrate import solve_ivp
+
+from psa_casadi.export.fmu_instance import (
+    CO_SIMULATION,
+    MODEL_EXCHANGE,
+    Fmu,
+    FmuError,
+    Instance,
+)
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Inputs that are linear between knots: `times` (k,), `values` (k, nu), columns as `names`."""
+
+    names: tuple[str, ...]
+    times: FloatArray
+    values: FloatArray
+
+    def at(self, times: FloatArray | float) -> FloatArray:
+        """Return the inputs at times (n,), shape (n, nu)."""
+        wanted = np.atleast_1d(np.asarray(times, dtype=float))
+        columns = [np.interp(wanted, self.times, column) for column in self.values.T]
+        return np.array(columns).reshape(len(self.names), len(wanted)).T
+
+    def on(self, times: FloatArray) -> "Signals":
+        """Return the signals sampled at times: what an importer that samples them passes on."""
+        return Signals(self.names, times, self.at(times))
+
+
+def communicate(
+    instance: Instance,
+    times: FloatArray,
+    inputs: Signals,
+    outputs: Sequence[str],
+    *,
+    rates: bool = True,
+) -> FloatArray:
+    """Step an initialised instance over communication points (n,); return outputs (n, ny).
+
+    Inputs are set at the start of each step; with `rates` their slope over the step is set too,
+    else they are held. Outputs are read at the end of each step, and at the start.
+    """
+    samples = inputs.at(times)
+    names = inputs.names
+    result = np.empty((len(times), len(outputs)))
+    instance.set(dict(zip(names, samples[0], strict=True)))
+    result[0] = instance.get(outputs)
+    for k, (begin, end) in enumerate(pairwise(times)):
+        size = float(end - begin)
+        instance.set(dict(zip(names, samples[k], strict=True)))
+        if rates:
+            slope = (samples[k + 1] - samples[k]) / size
+            instance.set_rates(dict(zip(names, slope, strict=True)))
+        instance.step(float(begin), size)
+        result[k + 1] = instance.get(outputs)
+    return result
+
+
+def co_simulate(
+    fmu: Fmu, times: FloatArray, inputs: Signals, outputs: Sequence[str], *,
+    tolerance: float | None = None, rates: bool = True, values: dict[str, float] | None = None,
+) -> FloatArray:  # fmt: skip
+    """Run a new co-simulation instance over communication points; return outputs (n, ny)."""
+    start = float(times[0])
+    with fmu.start(CO_SIMULATION, tolerance=tolerance, values=values, start_time=start) as instance:
+        return communicate(instance, times, inputs, outputs, rates=rates)
+
+
+def integrate(
+    fmu: Fmu, times: FloatArray, inputs: Signals, outputs: Sequence[str], *, tolerance: float,
+    values: dict[str, float] | None = None,
+) -> FloatArray:  # fmt: skip
+    """Integrate a new model exchange instance with LSODA, restarted at every knot of the inputs.
+
+    Returns the outputs (n, ny) at `times`. The error of a step is held below tolerance
+    (|state| + nominal / 100).
+    """
+    with fmu.start(MODEL_EXCHANGE, values=values, start_time=float(times[0])) as instance:
+        states = fmu.states()
+        x = instance.get(states)
+        atol = 1e-2 * tolerance * np.array([fmu.nominals[s] for s in states])
+
+        def rates(t: float, x: FloatArray) -> FloatArray:
+            return instance.derivatives(t, x, dict(zip(inputs.names, inputs.at(t)[0], strict=True)))
+
+        def read(t: float, x: FloatArray) -> FloatArray:
+            rates(t, x)
+            return instance.get(outputs)
+
+        rows = [read(float(times[0]), x)]
+        inside = inputs.times[(inputs.times > times[0]) & (inputs.times < times[-1])]
+        for begin, end in pairwise([float(times[0]), *inside, float(times[-1])]):
+            wanted = times[(times > begin) & (times <= end)]
+            solution = solve_ivp(
+                rates, (begin, end), x, method="LSODA", rtol=tolerance, atol=atol,
+                t_eval=np.union1d(wanted, [end]),
+            )  # fmt: skip
+            if not solution.success:
+                raise FmuError(f"model exchange stopped after {begin:g} s: {solution.message}")
+            points = zip(solution.t, solution.y.T, strict=True)
+            rows += [read(float(t), s) for t, s in points if t in wanted]
+            x = solution.y[:, -1]
+        return np.array(rows)

@@ -1,0 +1,90 @@
+"""The platforms an FMU can carry a binary for, and how each is compiled."""
+
+import platform
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.sources import compiled_files
+from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler, zig_command
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A platform: target of the `ziglang` compiler, FMI folder, suffix and flags of the library.
+
+    An old C library is asked for on Linux (2.17, of 2012) so that the binary loads everywhere.
+    """
+
+    name: str
+    target: str | None
+    folder: str
+    suffix: str
+    flags: tuple[str, ...] = ()
+
+
+_PIC = ("-fPIC", "-Wl,-s")
+
+PLATFORMS: dict[str, Platform] = {
+    p.name: p
+    for p in (
+        Platform("x86_64-linux", "x86_64-linux-gnu.2.17", "linux64", ".so", _PIC),
+        Platform("aarch64-linux", "aarch64-linux-gnu.2.17", "aarch64-linux", ".so", _PIC),
+        Platform("x86_64-windows", "x86_64-windows-gnu", "win64", ".dll", ("-Wl,-s",)),
+        Platform("x86-windows", "x86-windows-gnu", "win32", ".dll", ("-Wl,-s",)),
+        Platform("x86_64-darwin", "x86_64-macos", "darwin64", ".dylib", ("-fPIC",)),
+        Platform("aarch64-darwin", "aarch64-macos", "aarch64-darwin", ".dylib", ("-fPIC",)),
+    )
+}
+
+
+def host_platform() -> Platform:
+    """Return this machine's platform; one that is not in the table uses the machine's compiler."""
+    machine = {"amd64": "x86_64", "arm64": "aarch64", "i686": "x86"}.get(
+        platform.machine().lower(), platform.machine().lower()
+    )
+    system = platform.system().lower()
+    name = f"{machine}-{system}"
+    return PLATFORMS.get(name, Platform(name, None, name, ".so", ("-fPIC",)))
+
+
+def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
+    """Return the platforms named: names of `PLATFORMS`, "host" or "all"; each once, in order.
+
+    Raises InputError for a name that is not known.
+    """
+    unknown = [n for n in names if n not in (*PLATFORMS, "host", "all")]
+    if unknown or not names:
+        wanted = ", ".join(repr(n) for n in unknown) or "(none)"
+        raise InputError(
+            f"The platform {wanted} is not known; choose host, all, or some of"
+            f" {', '.join(PLATFORMS)}."
+        )
+    chosen: dict[str, Platform] = {}
+    for name in names:
+        found = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
+        chosen.update({p.name: p for p in found})
+    return tuple(chosen.values())
+
+
+def compile_library(texts: Mapping[str, str], identifier: str, target: Platform) -> bytes:
+    """Compile sources to a shared library that exports only FMI functions; return its bytes.
+
+    Raises PsaError with the compiler's messages if it fails.
+    """
+    compiler = compiler_command() if target.target is None else zig_command()
+    where = () if target.target is None else ("-target", target.target)
+    output = identifier + target.suffix
+    own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
+    libraries = ("-lm",) if target.suffix == ".so" else ()
+    with tempfile.TemporaryDirectory() as directory:
+        for name, text in texts.items():
+            (Path(directory) / name).write_text(text, encoding="utf-8", newline="\n")
+        command = [
+            *compiler, *where, *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
+            "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
+        ]  # fmt: skip
+        run_compiler(command, Path(directory))
+        return (Path(directory) / output).read_bytes()

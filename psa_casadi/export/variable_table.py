@@ -1,0 +1,94 @@
+"""The variables of an exported model in the order of their value references."""
+
+import re
+from dataclasses import dataclass
+
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Model
+from psa_casadi.variables import nominal_value
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable as FMI describes it, in SI units.
+
+    `kind` is time, state, derivative, input, output or parameter; `index` its place in the vector
+    of its kind; the value reference is the place in the table. Only a state, an input and a
+    parameter have a `start`; a derivative has no nominal.
+    """
+
+    name: str
+    kind: str
+    index: int
+    unit: str
+    description: str
+    display_unit: str | None = None
+    start: float | None = None
+    nominal: float | None = None
+    bounds: tuple[float, float] | None = None
+
+
+def variable_table(model: Model) -> tuple[Variable, ...]:
+    """Return time, states, derivatives, inputs, outputs, parameters: the layout of `fmi_data.h`.
+
+    Raises InputError if two variables share a name or the model has no state.
+    """
+    s, values = model.structure, model.values
+    table = [
+        Variable("time", "time", 0, "s", "simulation time"),
+        *(
+            Variable(q.name, "state", i, q.unit, q.description, q.display_unit, q.start,
+                     nominal_value(q.nominal, values))
+            for i, q in enumerate(s.states)
+        ),
+        *(
+            Variable(f"der({q.name})", "derivative", i, rate_unit(q.unit),
+                     f"rate of {q.description}")
+            for i, q in enumerate(s.states)
+        ),
+        *(
+            Variable(q.name, "input", i, q.unit, q.description, q.display_unit, q.start,
+                     nominal_value(q.nominal, values))
+            for i, q in enumerate(s.inputs)
+        ),
+        *(
+            Variable(q.name, "output", i, q.unit, q.description, q.display_unit, None,
+                     nominal_value(q.nominal, values))
+            for i, q in enumerate(s.outputs)
+        ),
+        *(
+            Variable(q.name, "parameter", i, q.unit, q.description, q.display_unit, values[q.name],
+                     q.typical(values), q.bounds)
+            for i, q in enumerate(s.parameters)
+        ),
+    ]  # fmt: skip
+    _refuse(model, table)
+    return tuple(table)
+
+
+def rate_unit(unit: str) -> str:
+    """Return the unit of a quantity's time derivative: m/s for m, m/s2 for m/s, N/(V.s) for N/V."""
+    above, _, below = unit.partition("/")
+    if not below:
+        return f"{above}/s"
+    factors = below.strip("()").split(".")
+    for i, factor in enumerate(factors):
+        match = re.fullmatch(r"s(\d*)", factor)
+        if match:
+            factors[i] = f"s{int(match[1] or 1) + 1}"
+            break
+    else:
+        factors.append("s")
+    return f"{above}/{factors[0]}" if len(factors) == 1 else f"{above}/({'.'.join(factors)})"
+
+
+def _refuse(model: Model, table: list[Variable]) -> None:
+    names = [v.name for v in table]
+    problems = [
+        f"Two variables of '{model.name}' are named '{name}', which FMI does not allow; rename one."
+        for name in sorted({n for n in names if names.count(n) > 1})
+    ]
+    if not model.structure.states:
+        problems.append(f"The model '{model.name}' has no state; add a component that has one.")
+    if problems:
+        raise InputError(problems)

@@ -1,0 +1,211 @@
+"""Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.prediction import measured, predict
+from psa_casadi.identification.unknowns import Unknowns, unknowns_of
+from psa_casadi.model.compose import Model
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Relative tolerance of the stepper in fits: integration errors far below any sensor's noise.
+FIT_RTOL = 1e-6
+_FAILED = 1e4  # weighted residual of a trial point that cannot be simulated
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of a prediction-error fit.
+
+    `model` carries the estimates; `residuals` (used samples of every record, stacked) [m] are
+    measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
+    `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
+    the priors. `converged` is False when the iteration was cut off.
+    """
+
+    model: Model
+    unknowns: Unknowns
+    theta: FloatArray
+    residuals: FloatArray
+    jacobian: FloatArray
+    sigma: tuple[float, ...]
+    cost: float
+    converged: bool
+    evaluations: int
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals [m]."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    def memory(self, record: int) -> dict[str, float]:
+        """Memory deviations at the start of one record."""
+        values = self.unknowns.memory(self.theta, record)
+        return dict(zip(self.unknowns.memories, values.tolist(), strict=True))
+
+    def offset(self, record: int) -> float:
+        """Sensor offset of one record [m]."""
+        return self.unknowns.offset(self.theta, record)
+
+    def predicted(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+        """Predict whole records [m], held-out samples included."""
+        full = predict(
+            self.model, experiments, self.unknowns, self.theta, rtol=FIT_RTOL, everything=True
+        )
+        return [p.displacement for p in full]
+
+
+def fit(
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    *,
+    sigma: Sequence[float],
+    start: Mapping[str, float] | None = None,
+    start_memory: Sequence[Mapping[str, float]] | None = None,
+    evaluations: int = 40,
+    tolerance: float = 1e-5,
+    rtol: float = FIT_RTOL,
+) -> Fit:
+    """Fit the free parameters, every record's memory and offset to the used samples.
+
+    Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by a trust-region
+    Gauss-Newton method (scipy's `trf`) within the parameters' bounds; the coordinates and their
+    weak priors are those of `unknowns_of(model, ...)`, the search begins at `start`. Raises
+    InputError when no sample can be used, SimulationError when the start cannot be simulated.
+    """
+    if not any(e.used.any() for e in experiments):
+        raise InputError(["No sample with a displacement is left to fit; give more data."])
+    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
+    unknowns = unknowns_of(model, free, len(experiments), max(scale, 1e-12))
+    theta = _starting_point(model, experiments, unknowns, start or {}, start_memory)
+    problem = _Problem(model, experiments, unknowns, tuple(sigma), rtol)
+    problem.evaluate(theta, strict=True)
+    low, high = unknowns.bounds()
+    inside = np.clip(theta, low + 1e-9, high - 1e-9)
+    solution = least_squares(
+        problem.residual,
+        inside,
+        problem.derivative,
+        bounds=(low, high),
+        method="dogbox",
+        ftol=tolerance,
+        xtol=1e-8,
+        gtol=None,
+        max_nfev=evaluations,
+    )
+    final = problem.evaluate(solution.x, strict=True)
+    count = len(final.residual) - unknowns.size
+    weights = problem.weights
+    return Fit(
+        model=model.with_values(unknowns.values(solution.x)),
+        unknowns=unknowns,
+        theta=solution.x,
+        residuals=-final.residual[:count] * weights,
+        jacobian=final.jacobian[:count] * weights[:, None],
+        sigma=tuple(sigma),
+        cost=float(final.residual @ final.residual),
+        converged=solution.status > 0,
+        evaluations=problem.count,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    theta: FloatArray
+    residual: FloatArray
+    jacobian: FloatArray
+
+
+class _Problem:
+    """Weighted residuals (predicted - measured, then priors) and their Jacobian, computed once."""
+
+    def __init__(
+        self,
+        model: Model,
+        experiments: Sequence[Experiment],
+        unknowns: Unknowns,
+        sigma: tuple[float, ...],
+        rtol: float,
+    ) -> None:
+        self._predict: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+        self.weights = np.concatenate(
+            [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
+        )
+        self.count = 0
+        self._last: _Evaluation | None = None
+        self._unknowns = unknowns
+        target = np.concatenate([measured(e.record)[e.used] for e in experiments])
+
+        def compute(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+            parts = predict(model, experiments, unknowns, theta, rtol=rtol)
+            used = [e.used[: e.stop] for e in experiments]
+            y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
+            j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
+            return (y - target) / self.weights, j / self.weights[:, None]
+
+        self._predict = compute
+
+    def evaluate(self, theta: FloatArray, *, strict: bool = False) -> _Evaluation:
+        if self._last is not None and np.array_equal(self._last.theta, theta):
+            return self._last
+        self.count += 1
+        try:
+            residual, jacobian = self._predict(theta)
+        except PsaError:
+            if strict:
+                raise
+            residual = np.full(len(self.weights), _FAILED)
+            jacobian = np.zeros((len(self.weights), self._unknowns.size))
+        prior = 1.0 / self._unknowns.prior
+        self._last = _Evaluation(
+            theta.copy(),
+            np.concatenate([residual, theta * prior]),
+            np.vstack([jacobian, np.diag(prior)]),
+        )
+        return self._last
+
+    def residual(self, theta: FloatArray) -> FloatArray:
+        return self.evaluate(theta).residual
+
+    def derivative(self, theta: FloatArray) -> FloatArray:
+        return self.evaluate(theta).jacobian
+
+
+def _starting_point(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    start: Mapping[str, float],
+    start_memory: Sequence[Mapping[str, float]] | None,
+) -> FloatArray:
+    theta = np.zeros(unknowns.size)
+    theta[: len(unknowns.names)] = unknowns.coordinates({**model.values, **start})
+    for r, experiment in enumerate(experiments):
+        first = len(unknowns.names) + r * unknowns.per_record
+        for m, name in enumerate(unknowns.memories):
+            given = start_memory[r].get(name, 0.0) if start_memory else 0.0
+            theta[first + m] = given / unknowns.memory_scale[m]
+        record = experiment.record
+        y = measured(record)[experiment.used]
+        slope = _static_slope(model, {**model.values, **start})
+        mean = float(np.mean(y)) - slope * float(np.mean(record.voltage[experiment.used]))
+        theta[first + unknowns.per_record - 1] = mean / unknowns.offset_scale
+    return theta
+
+
+def _static_slope(model: Model, values: Mapping[str, float]) -> float:
+    """Displacement per volt of the linear force at rest [m/V], hysteresis aside."""
+    stiffness = (
+        values["k_P"] * values["k_B"] / (values["k_P"] + values["k_B"])
+        if "k_B" in values
+        else values["k"]
+    )
+    return values["G"] * values["k_L"] / stiffness

@@ -1,0 +1,34 @@
+"""The noise floor of a measured displacement, and how a residual compares with it."""
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def high_frequency_noise(signal: FloatArray) -> float:
+    """Standard deviation of the white part of a signal, from its third differences.
+
+    White noise of variance s^2 has third differences of variance 20 s^2, while anything smooth
+    over four samples has almost none. The median absolute value makes it robust against steps;
+    a smaller figure than the root mean square of the signal itself is returned in any case.
+    """
+    if len(signal) < 8:
+        return float(np.std(signal))
+    differences = np.diff(signal, 3)
+    robust = float(np.median(np.abs(differences))) / 0.6744897501960817 / np.sqrt(20.0)
+    return min(robust, float(np.std(signal))) if robust > 0 else float(np.std(signal))
+
+
+def correlation_inflation(residual: FloatArray) -> float:
+    """Factor by which correlation of neighbours inflates the variance of an estimate (at least 1).
+
+    (1 + r)/(1 - r) with the residual's correlation r at lag one: exact for a first-order
+    autoregression.
+    """
+    centred = residual - np.mean(residual)
+    power = float(centred @ centred)
+    if power <= 0:
+        return 1.0
+    r = float(np.clip(centred[1:] @ centred[:-1] / power, 0.0, 0.99))
+    return (1 + r) / (1 - r)

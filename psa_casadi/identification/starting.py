@@ -1,0 +1,77 @@
+"""Where a fit starts: a stack of the size that the records show, and a few shapes of loop."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from psa_casadi.components import BASE
+from psa_casadi.experiment.record import Record
+from psa_casadi.identification.prediction import measured
+from psa_casadi.model.compose import Model, compose
+
+#: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
+ASSUMED_STIFFNESS = 5e7
+#: Stiffness of the bonding layers over that of the wafers, assumed.
+_BONDING_RATIO = 5.0
+#: Capacitance assumed [F]: only R_s C_p shows in a record of voltage and displacement.
+_CAPACITANCE = 1.6e-6
+#: Typical ratio of the peak hysteresis force to the linear force.
+_HYSTERESIS_SHARE = 0.1
+
+#: Shapes of loop to start from: A, beta, gamma over k_L, and n.
+LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
+    {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
+    {"A": -0.15, "beta": 0.05, "gamma": 0.05, "n": 1.1},
+    {"A": -0.3, "beta": 0.1, "gamma": 0.1, "n": 1.0},
+)
+
+
+def starting_model(records: Sequence[Record], stiffness: float | None = None) -> Model:
+    """Return the base model scaled to the records' voltage span, stroke and sampling.
+
+    k_L follows from the regression of displacement on voltage and the stiffness [N/m], which is
+    `ASSUMED_STIFFNESS` where none is given: voltage and displacement do not determine forces.
+    """
+    total = stiffness or ASSUMED_STIFFNESS
+    span = max(float(np.ptp(r.voltage)) for r in records)
+    top = max(float(np.max(np.abs(r.voltage))) for r in records)
+    sample_time = min(r.sample_time for r in records)
+    k_l = max(abs(_slope(records)), 1e-12) * total
+    k_p = total * (1 + _BONDING_RATIO) / _BONDING_RATIO
+    values = {
+        "u_rated": max(span, top),
+        "k_L": k_l,
+        "h_ref": _HYSTERESIS_SHARE * k_l * span,
+        "hold_rate": 1e-3 * span,
+        "tau": float(np.clip(0.7 * sample_time, 1e-6, 0.5)),
+        "R_s": 0.3 * sample_time / _CAPACITANCE,
+        "C_p": _CAPACITANCE,
+        "k_P": k_p,
+        "k_B": _BONDING_RATIO * k_p,
+        "c_P": 0.05 * sample_time * k_p,
+        "c_B": 0.05 * sample_time * _BONDING_RATIO * k_p,
+        **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
+        "n": LOOP_SHAPES[0]["n"],
+    }
+    return compose(BASE, values)
+
+
+def loop_starts(model: Model) -> list[dict[str, float]]:
+    """Return starting values for the hysteresis, scaled to the model's k_L."""
+    k_l = model.values["k_L"]
+    return [
+        {name: value if name == "n" else value * k_l for name, value in shape.items()}
+        for shape in LOOP_SHAPES
+    ]
+
+
+def _slope(records: Sequence[Record]) -> float:
+    """Regression slope of displacement on voltage, records centred each [m/V]."""
+    top = bottom = 0.0
+    for record in records:
+        valid = record.mask
+        v = record.voltage[valid] - np.mean(record.voltage[valid])
+        y = measured(record)[valid]
+        top += float(v @ (y - np.mean(y)))
+        bottom += float(v @ v)
+    return top / bottom if bottom > 0 else 0.0

@@ -1,0 +1,143 @@
+"""MODEL.json: a model by the names of its components, with every value, interval and origin."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from psa_casadi.component import Component
+from psa_casadi.components import COMPONENTS
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.files import atomic_write
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.variables import Interval, Provenance
+
+FORMAT = "psa_casadi.model/1"
+
+
+def dumps(model: Model) -> str:
+    """Return the text of MODEL.json; reading it back gives the same model exactly."""
+    origin = model.provenance
+    parameters = {}
+    for p in model.structure.parameters:
+        interval = origin.intervals.get(p.name)
+        parameters[p.name] = {
+            "value": model.values[p.name],
+            "unit": p.unit,
+            "interval": [interval.low, interval.high] if interval else None,
+            "free": p.name in origin.free,
+        }
+    content = {
+        "format": FORMAT,
+        "name": model.name,
+        "description": model.description,
+        "components": [c.name for c in model.components if c.gain is None],
+        "effects": [c.name for c in model.effects],
+        "parameters": parameters,
+        "force_scale": origin.force_scale,
+        "notes": list(origin.notes),
+        "identified_from": [{"record": n, "sha256": h} for n, h in origin.identified_from],
+        "package_version": origin.package_version,
+    }
+    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def loads(text: str, source: str = "MODEL.json") -> Model:
+    """Read a model; raises InputError that names every unknown name, missing or bad value."""
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise InputError(
+            [f"{source} is not JSON ({error}); give a file that `psa identify` or `psa diagnose` wrote."]
+        ) from error
+    problems = _problems(content, source)
+    if problems:
+        raise InputError(problems)
+    components = [COMPONENTS[n] for n in content["components"]]
+    components += [EFFECTS[n] for n in content["effects"]]
+    given = content["parameters"]
+    try:
+        model = compose(
+            components,
+            {n: e["value"] for n, e in given.items()},
+            name=content.get("name", "psa"),
+            description=content.get("description", ""),
+        )
+    except InputError as error:
+        raise InputError([f"{source}: {problem}" for problem in error.problems]) from error
+    return model.with_values({}, provenance=_provenance(content, given))
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write MODEL.json, whole or not at all."""
+    atomic_write(path, dumps(model))
+
+
+def load_model(path: Path) -> Model:
+    """Read MODEL.json; raises InputError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            [f"The model file {path} cannot be read ({error}); give a file that `psa identify` wrote."]
+        ) from error
+    return loads(text, str(path))
+
+
+def _provenance(content: dict[str, Any], given: dict[str, Any]) -> Provenance:
+    return Provenance(
+        identified_from=tuple((r["record"], r["sha256"]) for r in content.get("identified_from", [])),
+        package_version=content.get("package_version", ""),
+        free=tuple(n for n, e in given.items() if e.get("free")),
+        intervals={n: Interval(*e["interval"]) for n, e in given.items() if e.get("interval")},
+        force_scale=content.get("force_scale", "assumed"),
+        notes=tuple(content.get("notes", ())),
+    )
+
+
+def _problems(content: Any, source: str) -> list[str]:
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, dict) else type(content).__name__
+        return [
+            f"{source} is not a model file: its format is '{found}', expected '{FORMAT}';"
+            " give a file that `psa identify` or `psa diagnose` wrote."
+        ]
+    problems: list[str] = []
+    known: list[Component] = []
+    for key, table in (("components", COMPONENTS), ("effects", EFFECTS)):
+        names = content.get(key)
+        if not isinstance(names, list):
+            problems.append(f"{source}: '{key}' is missing; it must list names.")
+            continue
+        for name in names:
+            if name in table:
+                known.append(table[name])
+            else:
+                problems.append(
+                    f"{source}: unknown name '{name}' in {key}; the known ones are {sorted(table)}."
+                )
+    return problems + _parameter_problems(content.get("parameters"), known, source)
+
+
+def _parameter_problems(given: Any, known: list[Component], source: str) -> list[str]:
+    if not isinstance(given, dict):
+        return [f"{source}: 'parameters' is missing; it must map names to value and unit."]
+    problems = []
+    declared = {p.name: p for c in known for p in c.parameters}
+    for name, parameter in declared.items():
+        entry = given.get(name)
+        if not isinstance(entry, dict) or "value" not in entry:
+            problems.append(f"{source}: parameter '{name}' [{parameter.unit}] has no value; add it.")
+        elif not isinstance(entry["value"], int | float) or isinstance(entry["value"], bool):
+            problems.append(
+                f"{source}: the value of '{name}' is {entry['value']!r}; give a number in"
+                f" {parameter.unit}."
+            )
+        elif entry.get("unit", parameter.unit) != parameter.unit:
+            problems.append(
+                f"{source}: '{name}' is given in '{entry['unit']}'; convert it to '{parameter.unit}'."
+            )
+    unknown = [n for n in given if n not in declared]
+    if unknown and not problems:
+        problems.append(f"{source}: unknown parameters {unknown}; remove them or add their component.")
+    return problems

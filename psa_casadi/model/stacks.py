@@ -1,0 +1,134 @@
+"""Named stacks: a value for every parameter of the base model (cascade), and where it is from.
+
+The paper lists three stacks with rated voltage, stroke and capacitance; its Table 1 is not legible
+in the text at hand. What neither the paper nor a data sheet gives is assumed and says so. How the
+assumed values hang together:
+
+* Ceramic of density 7.8 g/cm^3 and modulus near 40 GPa in the stack's outline gives mass and
+  stiffness; blocking force = stiffness x stroke.
+* In the paper's one-way cascade a load meets the bonding layers only: the stiffness that a data
+  sheet measures is k_B, and blocked force = k_B x free stroke. k_P is 4 or 5 times as stiff.
+* The hysteresis lowers the stroke, so k_L (1/k_P + 1/k_B) is the stroke over 0..u_rated divided
+  by the rated voltage and by 0.86, the share that the loop leaves.
+* A/k_L = -0.25 and beta > gamma make x lag u by 12.5 % of the stroke; without delta f_H is bounded:
+  |f_H| <= h_ref (|A| / (beta - gamma))^(1/n). The layering leaves the loops alike (paper, 4.2).
+* delta/k_L = -0.02 1/s widens the loop from 12.5 to 12.6 % of the stroke at 1 Hz, 15 % at 0.1 Hz.
+"""
+
+from dataclasses import dataclass
+
+PAPER = "Yang and Zhu 2015"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One value in SI units, its source, and whether it is assumed rather than published."""
+
+    value: float
+    source: str
+    assumed: bool
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A stack by name, with a figure for every parameter of the base components (cascade)."""
+
+    name: str
+    description: str
+    values: dict[str, Figure]
+
+
+def _given(value: float, source: str) -> Figure:
+    return Figure(value, source, assumed=False)
+
+
+def _assumed(value: float, reason: str) -> Figure:
+    return Figure(value, reason, assumed=True)
+
+
+def _hysteresis(k_L: float, u_rated: float) -> dict[str, Figure]:
+    """Return the Bouc-Wen figures of a loop 12 % of the stroke wide, for any k_L and u_rated."""
+    loop = "A loop 12 % of the stroke wide, in the range of the paper's figure 6."
+    return {
+        "A": _assumed(-0.25 * k_L, loop),
+        "beta": _assumed(0.285 * k_L, loop),
+        "gamma": _assumed(0.039 * k_L, loop),
+        "delta": _assumed(-0.02 * k_L, "Negative as in the paper; visible, not dominant, at 1 Hz."),
+        "n": _assumed(1.5, "A bend between sharp (2) and gradual (1)."),
+        "h_ref": _assumed(0.075 * k_L * u_rated, "About the peak of |f_H| at rated voltage."),
+        "hold_rate": _assumed(1e-3 * u_rated, "A rated span in 1000 s, far below any test rate."),
+    }
+
+
+PTBS200 = Stack(
+    name="PTBS200",
+    description=(
+        "glued stack, 200 V, 18 um, 1.6 uF, underdamped (the paper prints PTBS2 where its text"
+        " has lost the zeros); outline assumed 8 x 8 x 20 mm"
+    ),
+    values={
+        "G": _given(1.0, "definition: the voltage is the one that the amplifier puts out"),
+        "R_s": _assumed(8.0, "R_s C_p = 13 us gives the paper's voltage rise of under 30 us."),
+        "C_p": _given(1.6e-6, f"{PAPER}, section 4.2: 1.6 uF"),
+        "u_rated": _given(200.0, f"{PAPER}, section 4.2: 200 V"),
+        "k_L": _assumed(10.1, "The paper's 18 um at 200 V through the assumed stiffness."),
+        **_hysteresis(10.1, 200.0),
+        "tau": _assumed(2e-5, "Short, since the measured step rings."),
+        "m_P": _assumed(4e-3, "0.4 of the 10 g of ceramic moves with the free end."),
+        "c_P": _assumed(280.0, "Damping ratio 0.1 of the wafers, lossier than the soft glue."),
+        "k_P": _assumed(4.8e8, "Four times k_B, so that the bonding layers set the stiffness."),
+        "m_B": _assumed(7e-3, "The other share of the ceramic and an end piece of about 1 g."),
+        "c_B": _assumed(
+            55.0, "Damping ratio 0.03 at 21 kHz: the ringing ends after a millisecond."
+        ),
+        "k_B": _assumed(1.2e8, "8 x 8 x 20 mm at 38 GPa; blocking force 2.2 kN."),
+    },
+)
+
+WYDS0808020 = Stack(
+    name="WYDS0808020",
+    description=(
+        "stack sintered layer by layer, 200 V, 18 um, 1.6 uF, overdamped (the name is partly lost:"
+        " the text has WYDS882 without its zeros, most likely 08 x 08 x 020 mm)"
+    ),
+    values={
+        "G": _given(1.0, "definition: the voltage is the one that the amplifier puts out"),
+        "R_s": _assumed(8.0, "R_s C_p = 13 us gives the paper's voltage rise of under 30 us."),
+        "C_p": _given(1.6e-6, f"{PAPER}, section 4.2: 1.6 uF"),
+        "u_rated": _given(200.0, f"{PAPER}, section 4.2: 200 V"),
+        "k_L": _assumed(10.1, "The paper's 18 um at 200 V through the assumed stiffness."),
+        **_hysteresis(10.1, 200.0),
+        "tau": _assumed(2e-4, "The slowest pole: the step takes about a millisecond."),
+        "m_P": _assumed(4e-3, "0.4 of the 10 g of ceramic moves with the free end."),
+        "c_P": _assumed(5500.0, "Damping ratio 2: the paper calls the stack overdamped."),
+        "k_P": _assumed(4.8e8, "Four times k_B, so that the bonding layers set the stiffness."),
+        "m_B": _assumed(7e-3, "The other share of the ceramic and an end piece of about 1 g."),
+        "c_B": _assumed(5500.0, "Damping ratio 3: the paper calls the stack overdamped."),
+        "k_B": _assumed(1.2e8, "8 x 8 x 20 mm at 38 GPa; blocking force 2.2 kN."),
+    },
+)
+
+P88551 = Stack(
+    name="P-885.51",
+    description=(
+        "co-fired PICMA stack of Physik Instrumente, 120 V, 18 um, 1.5 uF, overdamped;"
+        " 5 x 5 x 18 mm (the paper's type name is lost; the figures are those of the P-885.51)"
+    ),
+    values={
+        "G": _given(1.0, "definition: the voltage is the one that the amplifier puts out"),
+        "R_s": _assumed(8.0, "R_s C_p = 12 us gives the paper's voltage rise of under 30 us."),
+        "C_p": _given(1.5e-6, f"{PAPER}, section 4.2: 1.5 uF; so the data sheet of the P-885.51"),
+        "u_rated": _given(120.0, f"{PAPER}, section 4.2: 120 V; so the data sheet"),
+        "k_L": _given(7.3, "18 um at 120 V (paper, data sheet) through k_P and k_B"),
+        **_hysteresis(7.3, 120.0),
+        "tau": _assumed(1e-4, "The slowest pole; the paper's quickest stack to settle."),
+        "m_P": _assumed(1.2e-3, "A third of the 3.5 g of ceramic."),
+        "c_P": _assumed(1300.0, "Damping ratio 1.2: the paper calls the stack overdamped."),
+        "k_P": _assumed(2.5e8, "Five times k_B, so that the data sheet's stiffness is k_B."),
+        "m_B": _assumed(1.0e-3, "With k_B 35 kHz: clamped, half of the data sheet's free 70 kHz."),
+        "c_B": _assumed(670.0, "Damping ratio 1.5: the paper calls the stack overdamped."),
+        "k_B": _given(5e7, "Physik Instrumente data sheet P-885.51: 50 N/um, 900 N blocking force"),
+    },
+)
+
+STACKS: dict[str, Stack] = {stack.name: stack for stack in (PTBS200, WYDS0808020, P88551)}

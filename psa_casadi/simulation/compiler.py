@@ -1,0 +1,102 @@
+"""The C compiler, and a cache of compiled models.
+
+The compiler is `$CC` or `cc` where there is one, else the one in the `ziglang` wheel.
+"""
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from psa_casadi.errors import PsaError
+
+#: Flags for speed that keep the results of one source the same on every compiler.
+OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
+
+
+def sources_directory() -> Path:
+    """Return the folder of the C sources, in the installed package or in the checkout."""
+    here = Path(__file__).resolve().parent.parent
+    for candidate in (here / "fmu_src", here.parent / "fmu_src"):
+        if candidate.is_dir():
+            return candidate
+    raise PsaError("The C sources (fmu_src) are missing from this installation; reinstall psa_casadi.")
+
+
+def cache_directory() -> Path:
+    """Return the user's cache folder for compiled models (`PSA_CASADI_CACHE` overrides it)."""
+    override = os.environ.get("PSA_CASADI_CACHE")
+    if override:
+        return Path(override)
+    if platform.system() == "Windows":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    elif platform.system() == "Darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "psa_casadi"
+
+
+def compiler_command() -> list[str]:
+    """Return the command that compiles C on this machine."""
+    wanted = os.environ.get("CC")
+    if wanted:
+        return wanted.split()
+    found = None if platform.system() == "Windows" else shutil.which("cc")
+    return [found] if found else zig_command()
+
+
+def zig_command() -> list[str]:
+    """Return the command of the C compiler in the `ziglang` wheel."""
+    return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def run_compiler(command: Sequence[str], directory: Path) -> None:
+    """Run a compiler command in a directory; raise PsaError with its messages if it fails."""
+    environment = dict(os.environ)
+    environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(cache_directory() / "zig"))
+    environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(cache_directory() / "zig"))
+    done = subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise PsaError(
+            f"The C compiler failed ({' '.join(command[:3])} ...):\n{done.stderr[-4000:]}\n"
+            "Set CC to a working C99 compiler, or reinstall the ziglang wheel."
+        )
+
+
+def shared_library(
+    generated: Mapping[str, str], sources: Sequence[str], flags: Sequence[str] = ()
+) -> Path:
+    """Compile generated text and files of `fmu_src` to a shared library; cached by content."""
+    folder = sources_directory()
+    command = compiler_command()
+    digest = hashlib.sha256(repr((command, OPTIMISE, flags, platform.machine(), sys.platform)).encode())
+    for name, text in sorted(generated.items()):
+        digest.update(name.encode() + text.encode())
+    for path in sorted(folder.glob("*.[ch]")):
+        digest.update(path.name.encode() + path.read_bytes())
+    suffix = {"Windows": ".dll", "Darwin": ".dylib"}.get(platform.system(), ".so")
+    target = cache_directory() / "models" / (digest.hexdigest()[:32] + suffix)
+    if target.exists():
+        return target
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent) as work:
+        for name, text in generated.items():
+            (Path(work) / name).write_text(text)
+        files = [n for n in generated if n.endswith(".c")] + [str(folder / s) for s in sources]
+        output = "model" + suffix
+        position = () if platform.system() == "Windows" else ("-fPIC",)
+        run_compiler(
+            [*command, *OPTIMISE, *flags, *position, "-fvisibility=hidden", "-shared", "-I.",
+             f"-I{folder}", *files, "-lm", "-o", output],
+            Path(work),
+        )  # fmt: skip
+        os.replace(Path(work) / output, target)
+    return target

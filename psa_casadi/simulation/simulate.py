@@ -1,0 +1,80 @@
+"""Simulate a model on a record's voltage, or on any voltage given as samples."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.experiment.record import Record
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.stepper import Steps, run
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A simulated experiment in SI units; arrays of shape (n,), one per state and output."""
+
+    time: FloatArray
+    voltage: FloatArray
+    states: Mapping[str, FloatArray]
+    outputs: Mapping[str, FloatArray]
+    steps: int
+
+    @property
+    def displacement(self) -> FloatArray:
+        """Displacement that the sensor shows, or that of the output where there is no sensor [m]."""
+        name = "measured_displacement"
+        return self.outputs[name if name in self.outputs else "displacement"]
+
+
+def simulate(
+    model: Model,
+    time: npt.ArrayLike,
+    voltage: npt.ArrayLike,
+    *,
+    load_force: npt.ArrayLike | None = None,
+    memory: Mapping[str, float] | None = None,
+    from_rest_at_zero: bool = False,
+    rtol: float = 1e-6,
+    hold: str = "linear",
+) -> Trajectory:
+    """Simulate a model over samples of voltage [V] at strictly increasing times [s].
+
+    Between samples the voltage is linear (`hold="linear"`) or constant (`hold="zero"`). The model
+    starts in the state that the first voltage and its rate imply, with `memory` deviations
+    (see `start_state`), or with every state at 0 if `from_rest_at_zero`. `rtol` is the relative
+    tolerance of the error-controlled stepper. Raises SimulationError.
+    """
+    t, v = np.asarray(time, dtype=float), np.asarray(voltage, dtype=float)
+    u = np.zeros((len(t), len(model.input_names)))
+    u[:, model.input_names.index("voltage")] = v
+    if load_force is not None:
+        u[:, model.input_names.index("load_force")] = np.asarray(load_force, dtype=float)
+    x0 = np.zeros(len(model.state_names))
+    if not from_rest_at_zero:
+        rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
+        x0 = start_state(model, list(u[0]), rates, memory, float(t[0])).x
+    return _trajectory(model, t, v, run(model, t, u, x0, rtol=rtol, hold=hold))
+
+
+def simulate_record(
+    model: Model, record: Record, memory: Mapping[str, float] | None = None, rtol: float = 1e-6
+) -> Trajectory:
+    """Simulate a model on the voltage, and the load force if there is one, of a record."""
+    return simulate(
+        model, record.time, record.voltage, load_force=record.load_force, memory=memory, rtol=rtol
+    )
+
+
+def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps) -> Trajectory:
+    return Trajectory(
+        time=t,
+        voltage=v,
+        states=dict(zip(model.state_names, steps.x.T, strict=True)),
+        outputs=dict(zip(model.output_names, steps.y.T, strict=True)),
+        steps=steps.steps,
+    )

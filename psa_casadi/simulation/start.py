@@ -1,0 +1,164 @@
+"""The state at the start of a record: at rest, or in steady motion, with an unknown memory.
+
+All states without memory start where the voltage and its rate put them; memories start at their
+rest value plus a deviation that is 0 unless it is estimated or given.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Expression
+from psa_casadi.errors import PsaError
+from psa_casadi.model.compose import Model, Structure
+
+FloatArray = npt.NDArray[np.float64]
+
+_NEWTON_STEPS = 30
+
+
+@dataclass(frozen=True)
+class Start:
+    """Initial state (nx,) and its derivatives with respect to parameters and memory deviations."""
+
+    x: FloatArray
+    by_parameter: FloatArray
+    by_memory: FloatArray
+
+
+def memory_names(structure: Structure) -> tuple[str, ...]:
+    """Names of the states whose start a record does not tell."""
+    return tuple(s.name for s in structure.states if s.memory)
+
+
+def initial_slope(t: FloatArray, v: FloatArray) -> float:
+    """Rate of the voltage at the start [V/s]: the smallest of the first three, 0 if they disagree.
+
+    So a record that starts in motion starts in motion, and one that starts with a step at rest.
+    """
+    rates = np.diff(v[:4]) / np.diff(t[:4])
+    if np.all(rates > 0) or np.all(rates < 0):
+        return float(rates[np.argmin(np.abs(rates))])
+    return 0.0
+
+
+def start_state(
+    model: Model,
+    inputs: Sequence[float],
+    rates: Sequence[float] | None = None,
+    memory: Mapping[str, float] | None = None,
+    time: float = 0.0,
+) -> Start:
+    """Return the initial state for inputs (nu,) that change at `rates` (nu,).
+
+    Solves f_s(x_s, m) = w_s for the states without memory, where w_s is the steady rate that the
+    inputs' rates cause, by Newton's method; the derivatives follow from the same linear systems.
+    """
+    structure = model.structure
+    rest, moving = _functions(structure)
+    names = memory_names(structure)
+    deviation = np.array([(memory or {}).get(n, 0.0) for n in names])
+    u, w = np.array(inputs, dtype=float), np.array(rates or [0.0] * len(inputs), dtype=float)
+    p = model.parameter_vector()
+    gains = [model.parameter_names.index(c.gain) for c in model.effects if c.gain]
+    without = p.copy()
+    without[gains] = 0.0  # a saturating effect would lead Newton's method astray from far away
+    nominal = model.state_nominals()
+    x = _settle(rest, np.zeros(len(structure.states)), (time, u, without, deviation), nominal)
+    x = _settle(rest, x, (time, u, p, deviation), nominal)
+    final, by_p, by_memory = (np.array(a) for a in moving(time, x, u, w, p, deviation))
+    return Start(final.ravel(), by_p, by_memory)
+
+
+def _settle(
+    rest: ca.Function,
+    x: FloatArray,
+    where: tuple[float, FloatArray, FloatArray, FloatArray],
+    nominal: FloatArray,
+) -> FloatArray:
+    time, u, p, deviation = where
+    for _ in range(_NEWTON_STEPS):
+        new: FloatArray = np.array(rest(time, x, u, p, deviation)).ravel()
+        change = np.max(np.abs(new - x) / (np.abs(new) + nominal))
+        x = new
+        if not change > 1e-13:
+            break
+    if not change < 1e-9:
+        raise PsaError(
+            "The state at the start of the record has no equilibrium; the parameter values are the"
+            " likely cause: check them."
+        )
+    return x
+
+
+@cache
+def _functions(structure: Structure) -> tuple[ca.Function, ca.Function]:
+    s = structure
+    memory = [i for i, state in enumerate(s.states) if state.memory]
+    settling = [i for i, state in enumerate(s.states) if not state.memory or state.settles]
+    fast = [i for i, state in enumerate(s.states) if not state.memory]
+    deviation = ca.SX.sym("deviation", len(memory))
+    settled = _newton(s, settling, _placed(s, s.x, memory, deviation, settled=False))
+    start = _newton(s, fast, _placed(s, settled, memory, deviation, settled=True))
+    rest = ca.Function("rest", [s.time, s.x, s.u, s.p, deviation], [start])
+    rate = ca.SX.sym("rate", len(s.inputs))
+    moving = start
+    for _ in range(2):
+        moving = _in_motion(s, start, moving, fast, memory, rate)
+    derivatives = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
+    return rest, ca.Function(
+        "moving", [s.time, s.x, s.u, rate, s.p, deviation], [moving, *derivatives]
+    )
+
+
+def _at(s: Structure, expression: Expression, x: Expression) -> Expression:
+    return ca.substitute([expression], [s.x], [x])[0]
+
+
+def _placed(
+    s: Structure, x: Expression, memory: list[int], deviation: Expression, *, settled: bool
+) -> Expression:
+    """Return x with the memories at their deviation, added to the settled value where there is one."""
+    parts = [x[i] for i in range(len(s.states))]
+    for column, i in enumerate(memory):
+        if not s.states[i].settles:
+            parts[i] = deviation[column]
+        elif settled:
+            parts[i] = x[i] + deviation[column]
+    return ca.vertcat(*parts)
+
+
+def _newton(s: Structure, rows: list[int], x: Expression) -> Expression:
+    """One Newton step for the rows' derivatives to vanish; its derivative is the implicit one."""
+    jacobian = ca.jacobian(s.xdot, s.x)[rows, rows]
+    step = ca.solve(_at(s, jacobian, x), _at(s, s.xdot, x)[rows])
+    parts = [x[i] for i in range(len(s.states))]
+    for k, i in enumerate(rows):
+        parts[i] = parts[i] - step[k]
+    return ca.vertcat(*parts)
+
+
+def _in_motion(
+    s: Structure,
+    rest: Expression,
+    x: Expression,
+    fast: list[int],
+    memory: list[int],
+    rate: Expression,
+) -> Expression:
+    """Move the fast states from rest to a steady motion at the rate of inputs and memories."""
+    jacobian = _at(s, ca.jacobian(s.xdot, s.x), rest)
+    by_input = _at(s, ca.jacobian(s.xdot, s.u), rest)
+    drive = by_input[fast, :] @ rate
+    if memory:
+        drive += jacobian[fast, memory] @ _at(s, s.xdot, x)[memory]
+    steady = -ca.solve(jacobian[fast, fast], drive)
+    lag = ca.solve(jacobian[fast, fast], steady)
+    parts = [rest[i] for i in range(len(s.states))]
+    for k, i in enumerate(fast):
+        parts[i] = parts[i] + lag[k]
+    return ca.vertcat(*parts)

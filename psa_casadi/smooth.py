@@ -1,0 +1,34 @@
+"""Smooth forms of sign and magnitude that are exactly zero at zero and have finite slopes there."""
+
+import casadi as ca
+
+from psa_casadi.component import Expression, Symbols
+
+
+def direction(s: Symbols) -> Expression:
+    """Return the sign of the voltage rate, `s(u') = u' / sqrt(u'^2 + hold_rate^2)` [1].
+
+    Far above `hold_rate` this is sgn(u'); a held voltage (u' -> 0) has no direction, so that the
+    hysteresis force rests during a hold.
+    """
+    rate = s.voltage_rate
+    return rate / ca.sqrt(rate**2 + s.hold_rate**2)
+
+
+def rate_magnitude(s: Symbols) -> Expression:
+    """Return `|u'| = u' s(u')` [V/s]."""
+    return s.voltage_rate * direction(s)
+
+
+def magnitude_power(value: Expression, exponent: Expression) -> Expression:
+    """Return `|value|^exponent`, as `(value^2 + 1e-24)^(exponent/2)`.
+
+    The tiny constant keeps the derivatives with respect to value and exponent finite at 0; it
+    changes the result only where `|value|` is below 1e-12.
+    """
+    return (value**2 + 1e-24) ** (exponent / 2)
+
+
+def signed_power(value: Expression, exponent: Expression) -> Expression:
+    """Return `sign(value) |value|^exponent`, smooth at 0 like `magnitude_power`."""
+    return value * (value**2 + 1e-24) ** ((exponent - 1) / 2)

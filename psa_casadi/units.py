@@ -1,0 +1,247 @@
+"""The table of units, and conversion between them.
+
+A unit string is written as FMI writes it: symbols joined by `.`, at most one `/`, exponents after
+the symbol, a denominator of several symbols in parentheses: `N.s/m`, `N/(V.s)`, `kg.m/s2`, `1/A`.
+
+Source: FMI 2.0.5, section 2.2.2, and FMI 3.0.2, section 2.4.3 (definition of units).
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+#: The base units in FMI's order; `Unit.exponents` follows it.
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+Exponents = tuple[int, int, int, int, int, int, int, int]
+NO_DIMENSION: Exponents = (0, 0, 0, 0, 0, 0, 0, 0)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One unit: `value in SI base units = factor * value + offset`.
+
+    `ratio` is the factor as an exact fraction. `exponents` are those of `BASE_UNITS`. `counts` is
+    the exponent of a sensor's count, which no factor turns into anything else. `quantity` names
+    what the unit measures; it is empty for a compound unit.
+    """
+
+    name: str
+    ratio: Fraction
+    offset: float
+    exponents: Exponents
+    counts: int = 0
+    quantity: str = ""
+
+    @property
+    def factor(self) -> float:
+        """Size of the unit in SI base units."""
+        return float(self.ratio)
+
+    @property
+    def dimension(self) -> tuple[Exponents, int]:
+        """What must be equal for two units to be convertible."""
+        return self.exponents, self.counts
+
+    @property
+    def base_exponents(self) -> dict[str, int]:
+        """The exponents that are not zero by the name of the base unit, as FMI's BaseUnit wants."""
+        return {b: e for b, e in zip(BASE_UNITS, self.exponents, strict=True) if e}
+
+
+_PREFIXES = {
+    "p": Fraction(1, 10**12),
+    "n": Fraction(1, 10**9),
+    "u": Fraction(1, 10**6),
+    "m": Fraction(1, 10**3),
+    "": Fraction(1),
+    "k": Fraction(10**3),
+    "M": Fraction(10**6),
+    "G": Fraction(10**9),
+}
+
+# symbol, quantity, prefixes in use beside none, exponents of kg m s A K mol cd rad
+_SI_UNITS: tuple[tuple[str, str, str, Exponents], ...] = (
+    ("s", "time", "num", (0, 0, 1, 0, 0, 0, 0, 0)),
+    ("V", "voltage", "umk", (1, 2, -3, -1, 0, 0, 0, 0)),
+    ("m", "length", "pnumk", (0, 1, 0, 0, 0, 0, 0, 0)),
+    ("N", "force", "umkM", (1, 1, -2, 0, 0, 0, 0, 0)),
+    ("A", "current", "pnumk", (0, 0, 0, 1, 0, 0, 0, 0)),
+    ("K", "temperature", "m", (0, 0, 0, 0, 1, 0, 0, 0)),
+    ("Hz", "frequency", "mkMG", (0, 0, -1, 0, 0, 0, 0, 0)),
+    ("Ohm", "resistance", "mkMG", (1, 2, -3, -2, 0, 0, 0, 0)),
+    ("F", "capacitance", "pnum", (-1, -2, 4, 2, 0, 0, 0, 0)),
+    ("C", "charge", "pnum", (0, 0, 1, 1, 0, 0, 0, 0)),
+    ("H", "inductance", "num", (1, 2, -2, -2, 0, 0, 0, 0)),
+    ("S", "conductance", "num", (-1, -2, 3, 2, 0, 0, 0, 0)),
+    ("J", "energy", "num", (1, 2, -2, 0, 0, 0, 0, 0)),
+    ("W", "power", "umk", (1, 2, -3, 0, 0, 0, 0, 0)),
+    ("Pa", "pressure", "kMG", (1, -1, -2, 0, 0, 0, 0, 0)),
+    ("mol", "amount of substance", "", (0, 0, 0, 0, 0, 1, 0, 0)),
+    ("cd", "luminous intensity", "", (0, 0, 0, 0, 0, 0, 1, 0)),
+    ("rad", "angle", "num", (0, 0, 0, 0, 0, 0, 0, 1)),
+)
+
+_OTHER_UNITS: tuple[Unit, ...] = (
+    Unit("g", Fraction(1, 1000), 0.0, (1, 0, 0, 0, 0, 0, 0, 0), quantity="mass"),
+    Unit("kg", Fraction(1), 0.0, (1, 0, 0, 0, 0, 0, 0, 0), quantity="mass"),
+    Unit("min", Fraction(60), 0.0, (0, 0, 1, 0, 0, 0, 0, 0), quantity="time"),
+    Unit("h", Fraction(3600), 0.0, (0, 0, 1, 0, 0, 0, 0, 0), quantity="time"),
+    Unit("deg", Fraction(math.pi / 180), 0.0, (0, 0, 0, 0, 0, 0, 0, 1), quantity="angle"),
+    Unit("degC", Fraction(1), 273.15, (0, 0, 0, 0, 1, 0, 0, 0), quantity="temperature"),
+    Unit("1", Fraction(1), 0.0, NO_DIMENSION, quantity="ratio"),
+    Unit("%", Fraction(1, 100), 0.0, NO_DIMENSION, quantity="ratio"),
+    Unit("counts", Fraction(1), 0.0, NO_DIMENSION, counts=1, quantity="sensor counts"),
+)
+
+
+def _table() -> Iterator[Unit]:
+    for symbol, quantity, prefixes, exponents in _SI_UNITS:
+        for prefix in ("", *prefixes):
+            yield Unit(prefix + symbol, _PREFIXES[prefix], 0.0, exponents, quantity=quantity)
+    yield from _OTHER_UNITS
+
+
+#: Every unit that has a symbol of its own, by that symbol.
+UNITS: dict[str, Unit] = {unit.name: unit for unit in _table()}
+
+_ALIASES = str.maketrans(
+    {"\u00b5": "u", "\u03bc": "u", "\u03a9": "Ohm", "\u2126": "Ohm", "°": "deg", "·": "."}
+)
+_FACTOR = re.compile(r"(?P<symbol>1|%|[A-Za-z]+)(?P<exponent>[+-]?\d+)?")
+_FORM = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<group>[^/()]+)\)|(?P<one>[^/().]+)))?")
+
+
+def units_of(quantity: str) -> tuple[str, ...]:
+    """Return the symbols of the units of one quantity, such as "voltage", largest first."""
+    found = [unit for unit in UNITS.values() if unit.quantity == quantity]
+    return tuple(unit.name for unit in sorted(found, key=lambda unit: -unit.ratio))
+
+
+def parse_unit(text: str, quantity: str = "") -> Unit:
+    """Return the unit that an FMI-style unit string names.
+
+    In a compound a temperature is a difference: `V/degC` has no offset. `quantity` says what the
+    unit is meant to measure ("voltage"), so that the message on an unknown unit lists the right
+    ones; it does not restrict the result.
+
+    Raises:
+        InputError: a symbol is unknown (the sentence lists units that exist), or the string is not
+            a unit string.
+    """
+    name = text.strip().translate(_ALIASES)
+    if name in UNITS:
+        return UNITS[name]
+    form = _FORM.fullmatch(name)
+    if form is None:
+        raise InputError(_not_a_unit(text))
+    ratio, exponents, counts = Fraction(1), list(NO_DIMENSION), 0
+    below = form["group"] or form["one"]
+    for part, sign in ((form["above"], 1), (below, -1)):
+        for factor in part.split(".") if part else ():
+            match = _FACTOR.fullmatch(factor)
+            if match is None:
+                raise InputError(_not_a_unit(text))
+            unit = UNITS.get(match["symbol"])
+            if unit is None:
+                raise InputError(_unknown_symbol(match["symbol"], text, quantity))
+            power = sign * int(match["exponent"] or 1)
+            ratio *= unit.ratio**power
+            counts += power * unit.counts
+            exponents = [e + power * own for e, own in zip(exponents, unit.exponents, strict=True)]
+    kg, m, s, A, K, mol, cd, rad = exponents
+    return Unit(name, ratio, 0.0, (kg, m, s, A, K, mol, cd, rad), counts)
+
+
+def _not_a_unit(text: str) -> str:
+    return (
+        f"'{text}' is not a unit string; write symbols joined by '.', at most one '/', and a "
+        f"denominator of several symbols in parentheses, such as N.s/m or N/(V.s)."
+    )
+
+
+def _unknown_symbol(symbol: str, text: str, quantity: str) -> str:
+    within = "" if symbol == text.strip() else f" in '{text}'"
+    by_case = [unit.quantity for unit in UNITS.values() if unit.name.lower() == symbol.lower()]
+    listed = units_of(quantity or by_case[0]) if quantity or by_case else tuple(UNITS)
+    what = f"units of {quantity or by_case[0]}" if quantity or by_case else "units"
+    return f"the unit '{symbol}'{within} is unknown; {what} that exist: {', '.join(listed)}."
+
+
+@overload
+def convert(value: float, from_unit: str, to_unit: str) -> float: ...
+@overload
+def convert(value: FloatArray, from_unit: str, to_unit: str) -> FloatArray: ...
+def convert(value: float | FloatArray, from_unit: str, to_unit: str) -> float | FloatArray:
+    """Return `value`, given in `from_unit`, in `to_unit`.
+
+    Powers of ten convert with a single rounding: 7 um becomes exactly the float 7e-6.
+
+    Raises:
+        InputError: a unit is unknown, or the two measure different quantities.
+    """
+    source, target = parse_unit(from_unit), parse_unit(to_unit)
+    if source.dimension != target.dimension:
+        raise InputError(
+            f"cannot convert '{from_unit}' ({_describe(source)}) to '{to_unit}' "
+            f"({_describe(target)}): they measure different quantities; correct one of the units."
+        )
+    ratio = source.ratio / target.ratio
+    scaled = value * float(ratio) if ratio >= 1 else value / float(1 / ratio)
+    if source.offset == target.offset:
+        return scaled
+    return scaled + (source.offset - target.offset) / target.factor
+
+
+@overload
+def to_si(value: float, unit: str) -> float: ...
+@overload
+def to_si(value: FloatArray, unit: str) -> FloatArray: ...
+def to_si(value: float | FloatArray, unit: str) -> float | FloatArray:
+    """Return `value`, given in `unit`, in SI base units; counts stay counts.
+
+    Raises:
+        InputError: the unit is unknown.
+    """
+    return convert(value, unit, si_unit(unit))
+
+
+def si_unit(unit: str) -> str:
+    """Return the coherent SI unit of the quantity that `unit` measures, such as "m" for "um".
+
+    A unit with a symbol keeps one (V for mV); a compound is spelled in base units (m/s for um/ms).
+
+    Raises:
+        InputError: the unit is unknown.
+    """
+    parsed = parse_unit(unit)
+    if parsed.ratio == 1 and not parsed.offset:
+        return parsed.name
+    coherent = replace(parsed, ratio=Fraction(1), offset=0.0)
+    for candidate in UNITS.values():
+        if replace(candidate, name=parsed.name) == coherent:
+            return candidate.name
+    return _spell(parsed)
+
+
+def _spell(unit: Unit) -> str:
+    powers = [*unit.base_exponents.items(), *([("counts", unit.counts)] if unit.counts else [])]
+    above = ".".join(f"{b}{e}" if e != 1 else b for b, e in powers if e > 0) or "1"
+    below = [f"{b}{-e}" if e != -1 else b for b, e in powers if e < 0]
+    if not below:
+        return above
+    return f"{above}/{below[0]}" if len(below) == 1 else f"{above}/({'.'.join(below)})"
+
+
+def _describe(unit: Unit) -> str:
+    return unit.quantity or f"dimension {_spell(unit)}"

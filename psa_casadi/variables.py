@@ -1,0 +1,103 @@
+"""The words of every model: parameters, states, inputs and outputs, named as FMI names them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+Values = Mapping[str, float]
+Nominal = float | Callable[[Values], float]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A constant of the model that a user may tune between steps (FMI: parameter, tunable).
+
+    `value` is the default in SI units, `bounds` the closed interval that is physically meaningful,
+    `log` says that the parameter spans decades and is searched on a logarithmic scale.
+    `scale` is the size of an ordinary change in SI units, where the value itself may be zero.
+    """
+
+    name: str
+    value: float
+    unit: str
+    bounds: tuple[float, float]
+    description: str
+    display_unit: str | None = None
+    log: bool = False
+    scale: Nominal | None = None
+
+    def typical(self, values: Values) -> float:
+        """Return the size of an ordinary change: `scale`, else the magnitude of the value."""
+        if self.scale is not None:
+            return nominal_value(self.scale, values)
+        size = abs(values.get(self.name, self.value))
+        return size if size > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class State:
+    """A continuous state (FMI: local, continuous, initial exact).
+
+    A state with `memory` remembers a history that the record does not show (hysteresis, creep): its
+    deviation from rest at the start of a record is unknown and is estimated; all others start at
+    rest. A memory that `settles` (creep) has an equilibrium; one that does not (hysteresis) rests
+    at any value.
+    `nominal` is the size the state usually has, a number or a function of the parameter values.
+    """
+
+    name: str
+    unit: str
+    description: str
+    nominal: Nominal
+    start: float = 0.0
+    display_unit: str | None = None
+    memory: bool = False
+    settles: bool = True
+
+
+@dataclass(frozen=True)
+class Input:
+    """A signal that the surroundings impose (FMI: input, continuous)."""
+
+    name: str
+    unit: str
+    description: str
+    start: float = 0.0
+    nominal: Nominal = 1.0
+    display_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class Output:
+    """A signal that the model reports (FMI: output, continuous, calculated)."""
+
+    name: str
+    unit: str
+    description: str
+    nominal: Nominal = 1.0
+    display_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate's 95 % confidence interval, in the unit of the parameter."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a model's values come from: records, package version, what was free, how sure."""
+
+    identified_from: tuple[tuple[str, str], ...] = ()
+    package_version: str = ""
+    free: tuple[str, ...] = ()
+    intervals: Mapping[str, Interval] = field(default_factory=dict)
+    force_scale: str = "assumed"
+    notes: tuple[str, ...] = ()
+
+
+def nominal_value(nominal: Nominal, values: Values) -> float:
+    """Evaluate a nominal that may be a function of the parameter values."""
+    value = nominal(values) if callable(nominal) else nominal
+    return float(value) if value else 1.0

@@ -1,0 +1,55 @@
+"""Models and their FMUs for the tests of the export; each is exported once per process."""
+
+import tempfile
+import zipfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.fmu import export_fmu, write_archive
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS
+
+_FOLDER = tempfile.TemporaryDirectory()
+
+#: A micromanipulator: a soft, heavy mechanism with a lag of 5 ms.
+_MANIPULATOR = {
+    "R_s": 5.0, "C_p": 2e-6, "u_rated": 100.0, "k_L": 1.0, "A": -0.2, "beta": 0.2, "gamma": 0.05,
+    "h_ref": 10.0, "n": 1.0, "tau": 5e-3, "m_P": 0.02, "m_B": 0.1, "k_P": 1e6, "k_B": 5e6,
+    "c_P": 10.0, "c_B": 30.0,
+}  # fmt: skip
+
+
+@cache
+def model_named(name: str) -> Model:
+    """Return a stack by its name, or one of: manipulator, single_mass, flexure, slow_creep."""
+    if name in STACKS:
+        return compose(BASE, {k: figure.value for k, figure in STACKS[name].values.items()})
+    if name == "manipulator":
+        return compose(BASE, _MANIPULATOR)
+    if name == "single_mass":
+        return compose(SIMPLIFIED)
+    if name == "flexure":
+        return compose([COMPONENTS["flexure"]], name="flexure")
+    return compose((*BASE, EFFECTS["slow_creep"]), {"creep_gain": 0.05})
+
+
+@cache
+def exported(name: str) -> Path:
+    """Return the FMU of a named model."""
+    return export_fmu(model_named(name), Path(_FOLDER.name) / f"{name}.fmu")
+
+
+def rewritten(source: Path, target: Path, changes: dict[str, Callable[[bytes], bytes]]) -> Path:
+    """Copy an FMU with some entries changed; a change that changes nothing is an error."""
+    with zipfile.ZipFile(source) as archive:
+        entries = {n: archive.read(n) for n in archive.namelist()}
+    for name, change in changes.items():
+        before = entries[name]
+        entries[name] = change(before)
+        if entries[name] == before:
+            raise ValueError(f"the change of {name} has no effect")
+    write_archive(target, entries)
+    return target

@@ -1,0 +1,32 @@
+"""What a hidden effect is: a displacement added to the base, with a gain that removes it at 0."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.plants.base import Run
+from tests.plants.stack import FloatArray
+
+Parameters = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """One effect hidden in a record.
+
+    name: as in the project's table of effects, or a name that the table lacks (foreign). gain,
+    unit: what scales it. draw: random secondary parameters, SI. contribution: (run, secondary
+    parameters, gain) -> displacement with the effect minus without it at the samples, (N,) [m];
+    exactly zero at gain 0. plausible: smallest and largest gain that a real set-up could have.
+    linear: the contribution is proportional to the gain.
+    """
+
+    name: str
+    gain: str
+    unit: str
+    draw: Callable[[np.random.Generator, Run], dict[str, float]]
+    contribution: Callable[[Run, Parameters, float], FloatArray]
+    plausible: tuple[float, float]
+    linear: bool
+    foreign: bool = False

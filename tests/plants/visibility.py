@@ -1,0 +1,48 @@
+"""How much of an effect a record shows once the base model has absorbed what it can.
+
+    ratio = rms(contribution - its least-squares fit by `base_directions`) / sigma
+
+Columns: 1, base displacement, its rate, command, and the derivatives of the base displacement with
+respect to R_s C_p, A, beta, gamma, n, delta and tau (central differences on a coarse grid). The
+first four alone would call an effect visible that a re-fitted hysteresis swallows.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from tests.plants.base import Run, simulate_base
+from tests.plants.stack import FloatArray, Stack
+
+COARSE_SUB_INTERVALS = 6
+RELATIVE_STEP = 0.02
+FREE = ("r_s", "a", "beta", "gamma", "n", "delta", "tau")
+
+
+def base_directions(run: Run) -> FloatArray:
+    """Orthonormal directions in which the base model can move, (N, 11)."""
+    x = run.displacement
+    columns = [np.ones_like(x), x, np.gradient(x, run.times), run.command]
+    columns += [_derivative(run, name) for name in FREE]
+    matrix = np.column_stack([column / np.linalg.norm(column) for column in columns])
+    return np.asarray(np.linalg.qr(matrix)[0], dtype=np.float64)
+
+
+def _derivative(run: Run, name: str) -> FloatArray:
+    def moved(factor: float) -> FloatArray:
+        stack: Stack = replace(run.stack, **{name: getattr(run.stack, name) * factor})
+        return simulate_base(stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+
+    step = RELATIVE_STEP / 2.0
+    return (moved(1.0 + step) - moved(1.0 - step)) / RELATIVE_STEP
+
+
+def left_over(directions: FloatArray, contribution: FloatArray) -> FloatArray:
+    """What is left of the contribution beside the directions, (N,) [m]."""
+    return contribution - directions @ (directions.T @ contribution)
+
+
+def visible_ratio(directions: FloatArray, contribution: FloatArray, sigma: float) -> float:
+    """Rms of what is left over the noise's sigma [1]."""
+    return math.sqrt(float(np.mean(left_over(directions, contribution) ** 2))) / sigma

@@ -1,0 +1,172 @@
+"""What an FMU says and does where calls fail or look wrong, and its derivatives and states."""
+
+import ctypes
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from psa_casadi.export.fmu_instance import (
+    CO_SIMULATION,
+    DISCARD,
+    ERROR,
+    MODEL_EXCHANGE,
+    OK,
+    WARNING,
+    Fmu,
+    FmuError,
+    Instance,
+)
+from tests.fmu_models import exported
+
+STACK = "P-885.51"
+
+
+@pytest.fixture
+def slave() -> Iterator[Instance]:
+    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION) as instance:
+        yield instance
+
+
+def _set(instance: Instance, name: str, value: float) -> int:
+    one, number = ctypes.c_size_t(1), (ctypes.c_double * 1)(value)
+    return instance.call("SetReal", instance.references([name]), one, number)
+
+
+def test_refusal_names_call_and_state(slave: Instance) -> None:
+    slave.step(0.0, 1e-3)
+    assert slave.call("EnterInitializationMode") == ERROR
+    assert "fmi2EnterInitializationMode" in slave.messages[-1]
+    assert "'step complete'" in slave.messages[-1]
+    assert "t = 0.001 s" in slave.messages[-1]
+
+
+def test_failed_step_names_state_and_time_and_can_be_undone(slave: Instance) -> None:
+    slave.set({"voltage": 50.0})
+    slave.step(0.0, 1e-3)
+    snapshot = slave.save()
+    slave.set({"voltage": 1e300})
+    assert slave.call("DoStep", 1e-3, 1e-3, 1) == DISCARD
+    said = re.fullmatch(r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1])
+    assert said is not None
+    assert said[2] in slave.fmu.states()
+    reached = ctypes.c_double()
+    assert slave.call("GetRealStatus", 2, ctypes.byref(reached)) == OK
+    assert 1e-3 <= reached.value < 2e-3
+    assert float(said[1]) == pytest.approx(reached.value, rel=1e-8)
+    assert slave.call("DoStep", reached.value, 1e-3, 1) == ERROR
+    slave.restore(snapshot)
+    slave.set({"voltage": 60.0})
+    slave.step(1e-3, 1e-3)
+    assert 0.0 < slave.get(["displacement"])[0] < 20e-6
+    slave.drop(snapshot)
+    assert snapshot.value is None
+
+
+def test_parameter_out_of_bounds_is_taken_with_a_warning(slave: Instance) -> None:
+    assert _set(slave, "tau", 5.0) == WARNING
+    assert "'tau' is set to 5, outside its interval" in slave.messages[-1]
+    assert slave.get(["tau"])[0] == 5.0
+
+
+def test_values_are_set_all_or_none(slave: Instance) -> None:
+    with pytest.raises(FmuError, match="'current' is calculated and cannot be set"):
+        slave.set({"voltage": 10.0, "current": 1.0})
+    assert slave.get(["voltage"])[0] == 0.0
+
+
+def test_stop_time_is_kept() -> None:
+    with Fmu(exported(STACK)) as fmu, fmu.open(CO_SIMULATION) as slave:
+        slave.require("SetupExperiment", 0, 0.0, 0.0, 1, 2e-3)
+        slave.require("EnterInitializationMode")
+        slave.require("ExitInitializationMode")
+        slave.step(0.0, 2e-3)
+        assert slave.call("DoStep", 2e-3, 1e-3, 1) == ERROR
+        assert "beyond the stop time" in slave.messages[-1]
+
+
+def test_initial_states_are_taken() -> None:
+    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION, values={"u": 80.0}) as slave:
+        assert slave.get(["u", "charge"]) == pytest.approx([80.0, 80.0 * 1.5e-6])
+        assert slave.get(["current"])[0] == pytest.approx(-80.0 / 8.0)
+
+
+def test_debug_logging_shows_the_solver(slave: Instance) -> None:
+    slave.step(0.0, 1e-3)
+    assert not slave.messages
+    assert slave.call("SetDebugLogging", 1, ctypes.c_size_t(0), None) == OK
+    slave.step(1e-3, 1e-3)
+    assert "solver steps" in slave.messages[-1]
+    names = (ctypes.c_char_p * 1)(b"noise")
+    assert slave.call("SetDebugLogging", 1, ctypes.c_size_t(1), names) == ERROR
+
+
+def test_output_derivatives_are_those_of_the_trajectory(slave: Instance) -> None:
+    """Compared with a central difference over two steps that continue the same ramp."""
+    names = ["displacement", "velocity", "current", "charge", "blocked_force"]
+    size, rate = 1e-6, 2e4
+    before = ahead = exact = np.zeros(0)
+    for k in range(41):
+        slave.set({"voltage": rate * k * size})
+        slave.set_rates({"voltage": rate})
+        slave.step(k * size, size)
+        if k == 38:
+            before = slave.get(names)
+        if k == 39:
+            exact = slave.output_rates(names)
+        ahead = slave.get(names)
+    assert (ahead - before) / (2 * size) == pytest.approx(exact, rel=2e-3)
+
+
+def test_rate_is_forgotten_after_its_step(slave: Instance) -> None:
+    slave.set_rates({"voltage": 1e4})
+    slave.step(0.0, 1e-3)
+    assert slave.get(["voltage"])[0] == pytest.approx(10.0)
+    slave.step(1e-3, 1e-3)
+    assert slave.get(["voltage"])[0] == pytest.approx(10.0)
+
+
+def test_instances_run_in_threads() -> None:
+    def run(share: float) -> bytes:
+        with fmu.start(CO_SIMULATION) as slave:
+            rows = []
+            for k in range(300):
+                slave.set({"voltage": share * (k % 50)})
+                slave.step(k * 1e-5, 1e-5)
+                rows.append(slave.get(["displacement", "velocity"]))
+            return np.array(rows).tobytes()
+
+    shares = [0.5, 1.0, 1.5, 2.0]
+    with Fmu(exported(STACK)) as fmu:
+        alone = [run(s) for s in shares]
+        with ThreadPoolExecutor(4) as pool:
+            assert list(pool.map(run, shares)) == alone
+    assert len(set(alone)) == 4
+
+
+def test_snapshot_of_another_model_or_interface_is_refused(slave: Instance) -> None:
+    snapshot = slave.save()
+    data = slave.serialize(snapshot)
+    with slave.fmu.start(MODEL_EXCHANGE) as other, pytest.raises(FmuError, match="other interface"):
+        other.restore(snapshot)
+    with (
+        Fmu(exported("PTBS200")) as fmu,
+        fmu.open(CO_SIMULATION) as stranger,
+        pytest.raises(FmuError, match="another model"),
+    ):
+        stranger.deserialize(data)
+    slave.drop(snapshot)
+
+
+def test_many_instances() -> None:
+    with Fmu(exported(STACK)) as fmu:
+        instances = [fmu.start(CO_SIMULATION) for _ in range(50)]
+        for k, slave in enumerate(instances):
+            slave.set({"voltage": float(k)})
+            slave.step(0.0, 1e-2)
+        final = [float(s.get(["charge"])[0]) for s in instances]
+        for slave in instances:
+            slave.free()
+    assert final == pytest.approx([1.5e-6 * k for k in range(50)], rel=1e-5, abs=1e-12)

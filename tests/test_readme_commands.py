@@ -1,0 +1,77 @@
+from pathlib import Path
+
+import pytest
+
+from build_scripts.readme_commands import Block, find_blocks, run_text
+
+TEXT = """
+# Title
+
+<!-- run: skip -->
+
+```console
+$ exit 7
+```
+
+```python
+$ exit 8
+```
+
+```console
+$ test -z "$(ls)"
+$ echo one > file; \\
+  echo two >> file
+one
+$ grep two file
+```
+
+Words.
+
+<!-- run: continue -->
+```console
+$ grep one file
+```
+"""
+
+
+def test_blocks_and_their_marks_are_found() -> None:
+    first, second, third = find_blocks(TEXT)
+    assert first == Block(6, ("exit 7",), frozenset({"skip"}))
+    assert second.marks == set()
+    assert len(second.commands) == 3
+    assert second.commands[1] == "echo one > file; \\\n  echo two >> file"
+    assert third.marks == {"continue"}
+
+
+def test_commands_run_in_an_empty_directory_that_the_next_block_may_share() -> None:
+    assert run_text(TEXT) == []
+    assert len(run_text(TEXT.replace("<!-- run: continue -->", ""))) == 1
+
+
+def test_a_command_that_fails_is_named_with_its_line() -> None:
+    (failure,) = run_text(TEXT.replace("<!-- run: skip -->", "").replace("$ grep two", "$ true"))
+    assert failure == "README.md line 6: 'exit 7' ended with exit code 7."
+    (failure,) = run_text("```console\n$ false | cat\n$ touch never\n```")
+    assert "'false | cat' ended with exit code 1" in failure
+
+
+def test_a_block_that_needs_data_is_skipped_without_them_except_in_ci(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    text = '<!-- run: needs-data -->\n```console\n$ test -f "$PSA_CASADI_DATA/a.csv"\n```'
+    monkeypatch.setenv("PSA_CASADI_DATA", str(tmp_path / "absent"))
+    monkeypatch.delenv("CI", raising=False)
+    assert run_text(text) == []
+    monkeypatch.setenv("CI", "true")
+    assert run_text(text) == ["README.md line 2: the measured records are not here."]
+    monkeypatch.setenv("PSA_CASADI_DATA", str(tmp_path))
+    assert len(run_text(text)) == 1
+    (tmp_path / "a.csv").touch()
+    assert run_text(text) == []
+
+
+def test_a_mark_that_does_not_exist_and_a_block_without_end_are_refused() -> None:
+    with pytest.raises(ValueError, match="line 1: 'never' is no mark"):
+        find_blocks("<!-- run: never -->\n")
+    with pytest.raises(ValueError, match="line 2: this block has no end"):
+        find_blocks("text\n```console\n$ true\n")

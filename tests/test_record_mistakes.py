@@ -1,0 +1,155 @@
+from pathlib import Path
+
+import pytest
+
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import read_record, read_records
+from tests.record_files import HEADER, ROWS, write
+
+
+def problems_of(path: Path, **needs: bool) -> tuple[str, ...]:
+    with pytest.raises(InputError) as caught:
+        read_record(path, **needs)
+    assert all(problem.startswith((str(path), "... and")) for problem in caught.value.problems)
+    return caught.value.problems
+
+
+def with_row(row: int, text: str) -> list[str]:
+    return [*ROWS[:row], text, *ROWS[row + 1 :]]
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("time [s],displacement [um]", r"line 1: the column 'voltage' is missing \(found: time, d"),
+        ("time [s],voltge [V],displacement [um]", r"'voltge' is unknown; if 'voltage' is meant"),
+        (f"{HEADER},load_fource [N]", r"'load_fource' is unknown; if 'load_force' is meant"),
+        ("time [s],voltage [volt],displacement [um]", r"'volt' is unknown; units of voltage .*kV"),
+        ("time [s],voltage,displacement [um]", r"column 'voltage': has no unit; .*'voltage \[V\]'"),
+        ("time [s],voltage [],displacement [um]", r"column 'voltage': has no unit"),
+        ("time [V],voltage [V],displacement [um]", r"'time': the unit 'V' does not measure time"),
+        ("time [s],voltage [V],displacement [V]", r"not measure length; .* um, nm, pm, counts\."),
+        (f"{HEADER},Voltage [mV]", r"column 4: 'voltage' stands twice .*\(first as column 2\)"),
+        ("0,1,2", r"line 1: found '0,1,2', expected a header; write .*'time \[s\],voltage \[V\]"),
+    ],
+)
+def test_mistakes_of_the_header(tmp_path: Path, header: str, expected: str) -> None:
+    rows = [f"{row},1" if header.count(",") == 3 else row for row in ROWS]
+    rows = [row.rsplit(",", 1)[0] if header.count(",") == 1 else row for row in rows]
+    problems = problems_of(write(tmp_path / "a.csv", header, *rows))
+    assert len(problems) == 1
+    with pytest.raises(InputError, match=expected):
+        raise InputError(problems)
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"),
+    [
+        ("0.004,abc,1", "line 6, column 'voltage': found 'abc', expected a number; correct"),
+        ("0.004,1_0,1", "line 6, column 'voltage': found '1_0', expected a number"),
+        ("0.004,1,#REF!", "line 6, column 'displacement': found '#REF!', expected a number"),
+        ("0.004,,1", "line 6, column 'voltage': found no value, expected a number"),
+        ("nan,1,1", "line 6, column 'time': found no value, expected a number"),
+        ("0.004,inf,1", "line 6, column 'voltage': found inf, expected a finite number"),
+        ("0.004,1,-inf", "line 6, column 'displacement': found -inf, expected a finite number"),
+        ("0.003,1,1", "line 6, column 'time': time stands still (from 0.003 in line 5 to 0.003)"),
+        ("0.002,1,1", "line 6, column 'time': time goes back (from 0.003 in line 5 to 0.002)"),
+        ("0.004,1", "line 6: found 2 cells, expected 3 as in the header"),
+        ("0.004,1,1,1", "line 6: found 4 cells, expected 3 as in the header"),
+    ],
+)
+def test_mistakes_of_a_row(tmp_path: Path, row: str, expected: str) -> None:
+    problems = problems_of(write(tmp_path / "a.csv", HEADER, *with_row(4, row)))
+    assert len(problems) == 1
+    assert expected in problems[0]
+    assert problems[0].endswith(".")
+    assert ";" in problems[0]
+
+
+def test_a_decimal_comma_is_recognised(tmp_path: Path) -> None:
+    rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
+    problems = problems_of(write(tmp_path / "a.csv", HEADER.replace(",", ";"), *rows))
+    assert "decimal point instead of a decimal comma" in problems[0]
+
+
+def test_line_numbers_count_comments_and_blank_lines(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "# one", HEADER, "", *with_row(4, "0.001,1,1"))
+    assert "line 8, column 'time': time goes back (from 0.003 in line 7" in problems_of(path)[0]
+
+
+def test_time_is_compared_across_a_row_without_time(tmp_path: Path) -> None:
+    rows = with_row(4, ",1,1")
+    rows[5] = "0.003,1,1"
+    problems = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
+    assert len(problems) == 2
+    assert "line 7, column 'time': time stands still (from 0.003 in line 5" in problems[1]
+
+
+def test_every_mistake_of_a_file_is_reported_at_once(tmp_path: Path) -> None:
+    rows = ROWS.copy()
+    rows[2], rows[9], rows[12] = "0.002,x,1", "0.001,1,1", "0.012,inf,1"
+    header = "time [s],voltage [KV],displacement"
+    problems = problems_of(write(tmp_path / "a.csv", header, *rows))
+    everything = "\n".join(problems)
+    assert len(problems) == 5
+    for part in ("'KV' is unknown", "'displacement': has no unit", "line 4", "line 11", "line 14"):
+        assert part in everything
+
+
+@pytest.mark.parametrize("row", ["0,1,1", "inf,nan,1", "a,b,c"])
+def test_a_file_full_of_mistakes_lists_twenty_and_counts_the_others(
+    tmp_path: Path, row: str
+) -> None:
+    problems = problems_of(write(tmp_path / "a.csv", HEADER, *[row] * 500))
+    expected = {"0,1,1": 499, "inf,nan,1": 1000, "a,b,c": 1501}[row]
+    assert len(problems) == 21
+    assert problems[-1] == f"... and {expected - 20} more"
+
+
+def test_too_few_samples_and_no_displacement_are_refused(tmp_path: Path) -> None:
+    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *ROWS[:7]))
+    assert "found 7 samples, expected at least 16" in problem
+    (problem,) = problems_of(write(tmp_path / "b.csv", HEADER))
+    assert "found 0 samples" in problem
+    empty = [row.rsplit(",", 1)[0] + "," for row in ROWS]
+    (problem,) = problems_of(write(tmp_path / "c.csv", HEADER, *empty))
+    assert "column 'displacement': found no valid values in 20 rows" in problem
+
+
+def test_a_constant_voltage_is_refused_only_for_a_fit(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", HEADER, *(f"{k},3.5,{k}" for k in range(20)))
+    assert read_record(path).n == 20
+    (problem,) = problems_of(path, need_excitation=True)
+    assert "column 'voltage': found 3.5 in every row, expected a voltage that changes" in problem
+
+
+def test_files_that_are_no_csv_are_named_with_the_reason(tmp_path: Path) -> None:
+    (tmp_path / "empty.csv").write_text("\n \n")
+    (tmp_path / "comments.csv").write_text("# only\n# comments\n")
+    (tmp_path / "binary.csv").write_bytes(b"PK\x03\x04\x00\x00\x08")
+    (tmp_path / "wide.csv").write_bytes("time [s]".encode("utf-16"))
+    reasons = {
+        "absent.csv": "there is no such file; check the name",
+        "": "is a directory; name the CSV files in it",
+        "empty.csv": "the file is empty",
+        "comments.csv": "holds no header and no data",
+        "binary.csv": "is not text but a binary file",
+        "wide.csv": "is UTF-16 text, expected UTF-8",
+    }
+    for name, reason in reasons.items():
+        (problem,) = problems_of(tmp_path / name)
+        assert reason in problem
+
+
+def test_several_files_report_the_mistakes_of_all(tmp_path: Path) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    bad = write(tmp_path / "bad.csv", HEADER, *with_row(4, "0.004,x,1"))
+    assert [r.name for r in read_records([good, good])] == ["good", "good"]
+    with pytest.raises(InputError) as caught:
+        read_records([good, bad, tmp_path / "absent.csv"])
+    assert [p.split(":")[0] for p in caught.value.problems] == [
+        str(bad),
+        str(tmp_path / "absent.csv"),
+    ]
+    with pytest.raises(InputError, match="name at least one CSV file"):
+        read_records([])

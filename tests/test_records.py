@@ -1,0 +1,194 @@
+import hashlib
+import time as clock
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, read_record, write_record
+from tests.record_files import HEADER, ROWS, write
+
+
+def test_a_record_is_read_in_si_units_whatever_the_order_and_the_unit(tmp_path: Path) -> None:
+    lines = [f"{k + 5},{k},{k / 8},{k * 3},{k * 2},{k}" for k in range(20)]
+    header = (
+        "temperature [degC],displacement [nm],time [ms],load_force [kN],current [mA],voltage [kV]"
+    )
+    path = write(tmp_path / "a.csv", header, *lines)
+    record = read_record(path)
+    k = np.arange(20.0)
+    np.testing.assert_array_equal(record.time, k / 8 / 1000)
+    np.testing.assert_array_equal(record.voltage, k * 1000)
+    assert record.displacement is not None
+    assert record.load_force is not None
+    assert record.current is not None
+    assert record.temperature is not None
+    np.testing.assert_array_equal(record.displacement, k / 1e9)
+    np.testing.assert_array_equal(record.load_force, 3000 * k)
+    np.testing.assert_array_equal(record.current, 2 * k / 1000)
+    np.testing.assert_allclose(record.temperature, k + 278.15, rtol=1e-15)
+    assert record.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert (record.name, record.source, record.displacement_unit) == ("a", str(path), "m")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_what_spreadsheets_write_is_read(
+    tmp_path: Path, end: str, delimiter: str, encoding: str
+) -> None:
+    lines = ["time [s],voltage [V],displacement [µm],remark", *(f"{row},ok" for row in ROWS)]
+    lines = [line.replace(",", delimiter) for line in lines]
+    path = write(tmp_path / "a.csv", *lines, end=end, encoding=encoding)
+    plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
+    record = read_record(path)
+    assert record.displacement is not None
+    np.testing.assert_array_equal(record.time, plain.time)
+    np.testing.assert_array_equal(record.displacement, plain.displacement)
+
+
+def test_comments_quotes_blank_lines_and_capitals_are_tolerated(tmp_path: Path) -> None:
+    quoted = [f'"{row.split(",")[0]}",{row.split(",", 1)[1]}' for row in ROWS]
+    header = '"Time [s]", Voltage [V] ,"Load Force [N]"'
+    path = write(tmp_path / "a.csv", "# rig 3", "# 2024", "", header, *quoted, "", " ")
+    record = read_record(path, need_displacement=False)
+    assert record.n == 20
+    assert record.displacement is None
+    assert record.load_force is not None
+    assert not record.mask.any()
+    assert record.mask.shape == (20,)
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_missing_displacement_is_masked_and_nothing_is_made_up(tmp_path: Path, slow: bool) -> None:
+    rows = ROWS.copy()
+    rows[3], rows[5], rows[6] = "0.003,3,", "0.005,5,nan", "0.006,6, " if slow else "0.006,6,NaN"
+    record = read_record(write(tmp_path / "a.csv", HEADER, *rows))
+    assert record.displacement is not None
+    assert list(np.flatnonzero(~record.mask)) == [3, 5, 6]
+    assert np.isnan(record.displacement[[3, 5, 6]]).all()
+    first = [",".join([row.split(",")[2], *row.split(",")[:2]]) for row in rows]
+    again = read_record(write(tmp_path / "b.csv", "displacement [um],time [s],voltage [V]", *first))
+    assert again.displacement is not None
+    np.testing.assert_array_equal(again.displacement, record.displacement)
+    middle = [",".join([row.split(",")[i] for i in (0, 2, 2, 1)]) for row in rows]
+    again = read_record(
+        write(tmp_path / "c.csv", "time [s],displacement [um],other,voltage [V]", *middle)
+    )
+    assert again.displacement is not None
+    np.testing.assert_array_equal(again.displacement, record.displacement)
+
+
+def test_counts_stay_counts(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "time [s],voltage [V],displacement [counts]", *ROWS)
+    record = read_record(path)
+    assert record.displacement_unit == "counts"
+    assert record.range_m == pytest.approx(0.6)
+
+
+@given(
+    st.lists(
+        st.floats(allow_nan=True, allow_infinity=False, width=64), min_size=16, max_size=40
+    ).filter(lambda values: np.isfinite(values).sum() >= 16)
+)
+def test_what_is_written_reads_back_bit_for_bit(
+    tmp_path_factory: pytest.TempPathFactory, values: list[float]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "round_trip.csv"
+    instants = np.arange(len(values)) / 3.0
+    write_record(path, {"time [s]": instants, "voltage [V]": instants, "displacement [m]": values})
+    record = read_record(path)
+    assert record.displacement is not None
+    np.testing.assert_array_equal(record.time, instants)
+    np.testing.assert_array_equal(record.displacement, values)
+
+
+@pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
+def test_the_measured_records_are_read(measured_data: Path, file: str) -> None:
+    path = measured_data / "micromanipulator" / f"{file}.csv"
+    record = read_record(path, need_excitation=True)
+    expected = np.genfromtxt(path, delimiter=",", skip_header=1)
+    assert record.displacement is not None
+    assert record.n == {"sine_1hz": 7927, "minor_loops": 3600}[file]
+    assert record.mask.all()
+    assert record.sample_time == pytest.approx(0.005)
+    np.testing.assert_array_equal(record.voltage, expected[:, 1])
+    np.testing.assert_allclose(record.displacement, expected[:, 2] * 1e-6, rtol=1e-15)
+    assert 35e-6 < record.range_m < 50e-6
+
+
+def test_a_million_rows_are_read_quickly(tmp_path: Path) -> None:
+    rows = [f"{k / 10000:.4f},{k % 1000 / 10},{k % 1000 / 100}" for k in range(10**6)]
+    path = write(tmp_path / "long.csv", HEADER, *rows)
+    started = clock.process_time()
+    assert read_record(path).n == 10**6
+    assert clock.process_time() - started < 5.0
+
+
+def make_record() -> Record:
+    time = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
+    return Record("r", time, 2 * time, np.array([1.0, np.nan, 3.0, -1.0, 0.0]) * 1e-6)
+
+
+def test_a_record_cannot_be_changed_and_does_not_share_memory() -> None:
+    voltage = np.arange(5.0)
+    record = Record("r", np.arange(5.0), voltage)
+    voltage[0] = 99.0
+    assert record.voltage[0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        record.voltage[0] = 1.0
+    with pytest.raises(AttributeError):
+        record.name = "other"  # type: ignore[misc]
+
+
+def test_facts_of_a_record() -> None:
+    record = make_record()
+    assert record.n == 5
+    assert list(record.mask) == [True, False, True, True, True]
+    assert record.range_m == pytest.approx(4e-6)
+    assert record.sample_time == pytest.approx(0.1)
+    assert record.duration == pytest.approx(0.5)
+
+
+def test_records_made_in_memory_are_told_apart_by_their_hash() -> None:
+    record = make_record()
+    assert record.sha256 == make_record().sha256
+    other = Record("r", record.time, record.voltage, record.voltage)
+    assert other.sha256 != record.sha256
+    as_force = Record("r", record.time, record.voltage, load_force=record.voltage)
+    assert as_force.sha256 != other.sha256
+
+
+def test_a_slice_keeps_origin_and_all_columns() -> None:
+    record = make_record()
+    part = record.slice(1, -1)
+    assert (part.name, part.sha256, part.n) == ("r[1:4]", record.sha256, 3)
+    np.testing.assert_array_equal(part.time, record.time[1:4])
+    assert part.displacement is not None
+    assert part.load_force is None
+    np.testing.assert_array_equal(part.mask, [False, True, True])
+    with pytest.raises(InputError, match="fewer than two"):
+        record.slice(3, 4)
+
+
+def test_arrays_that_do_not_fit_are_all_named() -> None:
+    with pytest.raises(InputError) as caught:
+        Record("r", np.arange(4.0), np.arange(3.0), np.zeros((4, 1)))
+    assert len(caught.value.problems) == 2
+    assert "'voltage' has shape (3,)" in caught.value.problems[0]
+    assert "'displacement' has shape (4, 1)" in caught.value.problems[1]
+    with pytest.raises(InputError, match="has no range"):
+        _ = Record("r", np.arange(4.0), np.arange(4.0)).range_m
+
+
+def test_writing_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "out.csv"
+    with pytest.raises(InputError) as caught:
+        write_record(path, {"time": [0, 1], "voltage [vlt]": [0, 1], "x [m]": [1, 2, 3]})
+    assert len(caught.value.problems) == 3
+    with pytest.raises(InputError, match="no columns to write"):
+        write_record(path, {})
+    assert not path.exists()
