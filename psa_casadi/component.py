@@ -1,8 +1,8 @@
 """What a piece of physics must declare, and the balances it may add to.
 
-A component never edits another one: it adds terms to balances, named sums with a unit and a meaning.
-`psa_casadi.model.compose` adds the terms up, puts the sums in the order of their dependence and
-refuses a loop.
+A component never edits another one: it adds terms to balances, named sums with a unit and a
+meaning. `psa_casadi.model.structure` adds the terms up, puts the sums in the order of their
+dependence and refuses a loop.
 """
 
 from collections.abc import Callable, Mapping

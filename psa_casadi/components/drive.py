@@ -20,8 +20,8 @@ def _equations(s: Symbols) -> Equations:
 
 DRIVE = Component(
     name="drive",
-    description="amplifier of gain G and output resistance R_s charging the stack's capacitance C_p",
-    source="electrical circuit of a stack on a voltage amplifier; supplies u' to Yang and Zhu eq. 8",
+    description="amplifier of gain G and output resistance R_s charging the stack (C_p)",
+    source="circuit of a stack on a voltage amplifier; supplies u' to Yang and Zhu 2015, eq. 8",
     equations=_equations,
     equation_text="C_p u' = i,  i = (G v - u) / R_s",
     parameters=(

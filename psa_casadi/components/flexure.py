@@ -20,18 +20,26 @@ FLEXURE = Component(
     equations=_equations,
     parameters=(
         Parameter("m_f", 0.2, "kg", (1e-6, 1e3), "mass of the stage", log=True),
-        Parameter("c_f", 50.0, "N.s/m", (0.0, 1e9), "damping of the flexure", log=True),
-        Parameter("k_f", 5e6, "N/m", (0.0, 1e12), "stiffness of the flexure", log=True),
+        Parameter("c_f", 50.0, "N.s/m", (0.0, 1e9), "damping of the flexure"),
+        Parameter("k_f", 5e6, "N/m", (0.0, 1e12), "stiffness of the flexure"),
         Parameter("k_c", 5e7, "N/m", (1.0, 1e12), "contact stiffness", log=True),
-        Parameter("c_c", 500.0, "N.s/m", (0.0, 1e9), "contact damping", log=True),
+        Parameter("c_c", 500.0, "N.s/m", (0.0, 1e9), "contact damping"),
     ),
     states=(
         State("x_f", "m", "position of the stage", 1e-5, display_unit="um"),
         State("v_f", "m/s", "velocity of the stage", 1e-2, display_unit="um/s"),
     ),
     inputs=(
-        Input("tip_position", "m", "position of the stack's output", display_unit="um", nominal=1e-5),
-        Input("tip_velocity", "m/s", "velocity of the stack's output", display_unit="um/s", nominal=1e-2),
+        Input(
+            "tip_position", "m", "position of the stack's output", display_unit="um", nominal=1e-5
+        ),
+        Input(
+            "tip_velocity",
+            "m/s",
+            "velocity of the stack's output",
+            display_unit="um/s",
+            nominal=1e-2,
+        ),
     ),
     outputs=(
         Output("reaction_force", "N", "force of the stage on the stack", 100.0),

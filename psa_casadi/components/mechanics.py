@@ -38,9 +38,7 @@ def _cascade(s: Symbols) -> Equations:
             "y": s.v_y,
             "v_y": (s.wafer_force - transmitted) / s.m_P,
             "x": s.v_x,
-            "v_x": (
-                transmitted + s.tip_force - s.c_B * (s.v_x - s.v_y) - s.k_B * (s.x - s.y)
-            )
+            "v_x": (transmitted + s.tip_force - s.c_B * (s.v_x - s.v_y) - s.k_B * (s.x - s.y))
             / s.m_B,
         },
         add={

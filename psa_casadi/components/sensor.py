@@ -20,6 +20,8 @@ SENSOR = Component(
     belongs_to="sensor",
     equations=_equations,
     outputs=(
-        Output("measured_displacement", "m", "displacement as the sensor shows it", stroke_scale, "um"),
+        Output(
+            "measured_displacement", "m", "displacement as the sensor shows it", stroke_scale, "um"
+        ),
     ),
 )

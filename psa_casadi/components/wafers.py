@@ -29,9 +29,7 @@ def _bouc_wen(s: Symbols) -> Equations:
 
 
 def _creep_lag(s: Symbols) -> Equations:
-    return Equations(
-        der={"f_out": (s.free_force - s.f_out) / s.tau}, add={"wafer_force": s.f_out}
-    )
+    return Equations(der={"f_out": (s.free_force - s.f_out) / s.tau}, add={"wafer_force": s.f_out})
 
 
 def _hysteresis_scale(p: Values) -> float:
@@ -43,7 +41,7 @@ def _rate_scale(p: Values) -> float:
 
 
 def _delta_scale(p: Values) -> float:
-    return 0.01 * abs(p["k_L"])
+    return 0.05 * abs(p["k_L"])
 
 
 LINEAR_FORCE = Component(
@@ -52,9 +50,7 @@ LINEAR_FORCE = Component(
     source="Yang and Zhu 2015, eq. 7 with f_0 = 0",
     equation_text="f_L = k_L u",
     equations=_linear_force,
-    parameters=(
-        Parameter("k_L", 10.0, "N/V", (1e-6, 1e6), "linear force per volt", log=True),
-    ),
+    parameters=(Parameter("k_L", 10.0, "N/V", (1e-6, 1e6), "linear force per volt", log=True),),
 )
 
 BOUC_WEN = Component(
@@ -67,16 +63,24 @@ BOUC_WEN = Component(
     ),
     equations=_bouc_wen,
     parameters=(
-        Parameter("A", -2.0, "N/V", (-1e5, 1e5), "slope of the hysteresis force", scale=_rate_scale),
+        Parameter(
+            "A", -2.0, "N/V", (-1e5, 1e5), "slope of the hysteresis force", scale=_rate_scale
+        ),
         Parameter("beta", 1.0, "N/V", (-1e5, 1e5), "dissipative bend", scale=_rate_scale),
         Parameter("gamma", 0.5, "N/V", (-1e5, 1e5), "elastic bend", scale=_rate_scale),
         Parameter(
             "delta", 0.0, "N/(V.s)", (-1e5, 1e5), "asymmetry of the paper", scale=_delta_scale
         ),
         Parameter("n", 1.2, "1", (1.0, 4.0), "sharpness of the bend", scale=0.5),
-        Parameter("h_ref", 100.0, "N", (1e-9, 1e7), "reference force that makes (|f_H|/h_ref)^n pure"),
         Parameter(
-            "hold_rate", 0.1, "V/s", (1e-9, 1e6), "voltage rate below which the voltage counts as held"
+            "h_ref", 100.0, "N", (1e-9, 1e7), "reference force that makes (|f_H|/h_ref)^n pure"
+        ),
+        Parameter(
+            "hold_rate",
+            0.1,
+            "V/s",
+            (1e-9, 1e6),
+            "voltage rate below which the voltage counts as held",
         ),
     ),
     states=(State("f_H", "N", "hysteresis force", _hysteresis_scale, memory=True, settles=False),),

@@ -12,7 +12,7 @@ from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.probes import directions
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import Screening, screen
-from psa_casadi.diagnosis.selection import Extension, choose, extend, leading
+from psa_casadi.diagnosis.selection import Extension, choose, extend, extend_afresh, leading
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.record import Record
@@ -27,6 +27,10 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Most causes that are named for one set of records.
 MOST_CAUSES = 3
+#: An extension whose residual is within this factor of the noise needs no further starts.
+SETTLED = 1.05
+#: How many of the leading extensions are fitted again from an ordinary loop where structure is left.
+AFRESH = 2
 
 
 @dataclass(eq=False)
@@ -99,7 +103,9 @@ def _search(
             if extension is not None:
                 current.extensions.append(extension)
         before = rms(np.concatenate(held_out_residuals(experiments, current.predicted)))
-        ranked = choose(current.extensions, before)
+        floor = high_frequency_noise(current.fit.residuals)
+        _try_afresh(current, experiments, inflation, floor, progress)
+        ranked = choose(current.extensions, before, floor)
         if not ranked:
             break
         current.chosen, current.rivals = ranked[0], ranked[1:]
@@ -110,6 +116,23 @@ def _search(
             )
         )
     return rounds
+
+
+def _try_afresh(
+    current: Round,
+    experiments: Sequence[Experiment],
+    inflation: float,
+    floor: float,
+    progress: Progress,
+) -> None:
+    """Where the best extensions leave structure, fit them again from an ordinary loop."""
+    ranked = sorted(current.extensions, key=lambda e: -e.evidence)[:AFRESH]
+    for extension in ranked:
+        if extension.fit.rms < SETTLED * floor:
+            return
+        progress(f"fitting {extension.effect.name} afresh")
+        again = extend_afresh(current.fit, experiments, extension, inflation)
+        current.extensions[current.extensions.index(extension)] = again
 
 
 def _examine(

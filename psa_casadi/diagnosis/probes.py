@@ -19,6 +19,7 @@ from psa_casadi.simulation.start import memory_names
 FloatArray = npt.NDArray[np.float64]
 
 _PEAKS = 4
+_RTOL = 1e-5  # of derivatives; finite steps are differences and need the fit's own tolerance
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,7 @@ def _column(
     for e, start in zip(experiments, memory, strict=True):
         deviation = np.array([start.get(n, 0.0) for n in names])
         y, by_gain, _ = predict_record(
-            changed, e.record, deviation, [gain], stop=e.stop, rtol=FIT_RTOL
+            changed, e.record, deviation, [gain], stop=e.stop, rtol=FIT_RTOL if step else _RTOL
         )
         used = e.used[: e.stop]
         count = int(used.sum())

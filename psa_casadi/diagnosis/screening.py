@@ -32,6 +32,11 @@ class Score:
     gain: float
     detectable_gain: float
 
+    @property
+    def start(self) -> float:
+        """Gain to start a fit from: the linear estimate, or the finite step that was tried."""
+        return self.direction.unit_gain if self.direction.finite else self.gain
+
 
 @dataclass(frozen=True, eq=False)
 class Screening:

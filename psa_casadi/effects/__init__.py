@@ -1,4 +1,4 @@
-"""What real stacks do that the paper's model does not: one small file each, one line in the table."""
+"""What real stacks do that the paper's model does not: one small file each, a line in the table."""
 
 from psa_casadi.component import Component
 from psa_casadi.effects.current_limit import CURRENT_LIMIT

@@ -33,7 +33,9 @@ CURRENT_LIMIT = Component(
     finite_step=(0.1, 0.3, 1.0, 3.0, 10.0, 30.0),
     equation_text="C_p u' = i / (1 + |i/i_max|^8)^(1/8),  inverse_current_limit = 1/i_max",
     parameters=(
-        Parameter("inverse_current_limit", 0.0, "1/A", (0.0, 1e9), "one over the limit", scale=_scale),
+        Parameter(
+            "inverse_current_limit", 0.0, "1/A", (0.0, 1e9), "one over the limit", scale=_scale
+        ),
     ),
     equations=_equations,
     looks_like="steps become ramps; the rate of the displacement is capped at one value",

@@ -22,8 +22,12 @@ OFFSET_DRIFT = Component(
     gain="drift_rate",
     equation_text="x_m gains drift_rate t (1 + drift_bend t / drift_span)",
     parameters=(
-        Parameter("drift_rate", 0.0, "m/s", (-1e-3, 1e-3), "rate of the drift", "um/s", scale=_scale),
-        Parameter("drift_bend", 0.0, "1", (-3.0, 3.0), "change of the rate over drift_span", scale=0.3),
+        Parameter(
+            "drift_rate", 0.0, "m/s", (-1e-3, 1e-3), "rate of the drift", "um/s", scale=_scale
+        ),
+        Parameter(
+            "drift_bend", 0.0, "1", (-3.0, 3.0), "change of the rate over drift_span", scale=0.3
+        ),
         Parameter("drift_span", 10.0, "s", (1e-6, 1e9), "time over which drift_bend counts"),
     ),
     equations=_equations,

@@ -38,15 +38,24 @@ def _relaxed_scale(p: Values) -> float:
 SLOW_CREEP = Component(
     name="slow_creep",
     description="displacement that keeps growing for seconds to hours at constant voltage",
-    source="Croft, Shed and Devasia, J. Dyn. Sys. Meas. Control 123 (2001) 35, parallel relaxations",
+    source="Croft, Shed and Devasia, J. Dyn. Sys. Meas. Control 123 (2001) 35: relaxations",
     gain="creep_gain",
     equation_text="x_c = creep_gain (z_1 + z_2 + z_3),  creep_time 10^(i-1) z_i' + z_i = x",
     parameters=(
-        Parameter("creep_gain", 0.0, "1", (-0.2, 0.5), "creep per decade of time over elongation", scale=0.01),
-        Parameter("creep_time", 0.1, "s", (1e-3, 1e4), "fastest time constant of the creep", log=True),
+        Parameter(
+            "creep_gain",
+            0.0,
+            "1",
+            (-0.2, 0.5),
+            "creep per decade of time over elongation",
+            scale=0.01,
+        ),
+        Parameter(
+            "creep_time", 0.1, "s", (1e-3, 1e4), "fastest time constant of the creep", log=True
+        ),
     ),
     states=(_state(1), _state(2), _state(3)),
     equations=_equations,
-    probe={"creep_time": (0.03, 0.3, 3.0, 30.0)},
+    probe={"creep_time": (0.03, 0.3, 3.0)},
     looks_like="the residual is a straight line in log time after every change of voltage",
 )

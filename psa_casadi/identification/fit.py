@@ -1,23 +1,23 @@
 """Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.levenberg_marquardt import Evaluate, minimise
 from psa_casadi.identification.prediction import measured, predict
 from psa_casadi.identification.unknowns import Unknowns, unknowns_of
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.stepper import SimulationError
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Relative tolerance of the stepper in fits: integration errors far below any sensor's noise.
 FIT_RTOL = 1e-6
-_FAILED = 1e4  # weighted residual of a trial point that cannot be simulated
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,107 +76,65 @@ def fit(
 ) -> Fit:
     """Fit the free parameters, every record's memory and offset to the used samples.
 
-    Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by a trust-region
-    Gauss-Newton method (scipy's `trf`) within the parameters' bounds; the coordinates and their
-    weak priors are those of `unknowns_of(model, ...)`, the search begins at `start`. Raises
-    InputError when no sample can be used, SimulationError when the start cannot be simulated.
+    Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
+    Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
+    those of `unknowns_of(model, ...)`, the search begins at `start`. Raises InputError when no
+    sample can be used, SimulationError when the start cannot be simulated.
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
     scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
-    unknowns = unknowns_of(model, free, len(experiments), max(scale, 1e-12))
+    unknowns = unknowns_of(model, free, len(experiments), 30.0 * max(scale, 1e-12))
     theta = _starting_point(model, experiments, unknowns, start or {}, start_memory)
-    problem = _Problem(model, experiments, unknowns, tuple(sigma), rtol)
-    problem.evaluate(theta, strict=True)
-    low, high = unknowns.bounds()
-    inside = np.clip(theta, low + 1e-9, high - 1e-9)
-    solution = least_squares(
-        problem.residual,
-        inside,
-        problem.derivative,
-        bounds=(low, high),
-        method="dogbox",
-        ftol=tolerance,
-        xtol=1e-8,
-        gtol=None,
-        max_nfev=evaluations,
+    weights = np.concatenate(
+        [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
     )
-    final = problem.evaluate(solution.x, strict=True)
-    count = len(final.residual) - unknowns.size
-    weights = problem.weights
+    evaluate = _objective(model, experiments, unknowns, weights, rtol)
+    minimum = minimise(
+        evaluate, theta, unknowns.bounds(), tolerance=tolerance, evaluations=evaluations
+    )
+    if minimum is None:
+        raise SimulationError(
+            "The model cannot be simulated at the start of the fit; start from other values."
+        )
     return Fit(
-        model=model.with_values(unknowns.values(solution.x)),
+        model=model.with_values(unknowns.values(minimum.theta)),
         unknowns=unknowns,
-        theta=solution.x,
-        residuals=-final.residual[:count] * weights,
-        jacobian=final.jacobian[:count] * weights[:, None],
+        theta=minimum.theta,
+        residuals=-minimum.residual[: len(weights)] * weights,
+        jacobian=minimum.jacobian[: len(weights)] * weights[:, None],
         sigma=tuple(sigma),
-        cost=float(final.residual @ final.residual),
-        converged=solution.status > 0,
-        evaluations=problem.count,
+        cost=minimum.cost,
+        converged=minimum.converged,
+        evaluations=minimum.evaluations,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Evaluation:
-    theta: FloatArray
-    residual: FloatArray
-    jacobian: FloatArray
+def _objective(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    weights: FloatArray,
+    rtol: float,
+) -> Evaluate:
+    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian."""
+    target = np.concatenate([measured(e.record)[e.used] for e in experiments])
+    used = [e.used[: e.stop] for e in experiments]
+    prior = 1.0 / unknowns.prior
 
-
-class _Problem:
-    """Weighted residuals (predicted - measured, then priors) and their Jacobian, computed once."""
-
-    def __init__(
-        self,
-        model: Model,
-        experiments: Sequence[Experiment],
-        unknowns: Unknowns,
-        sigma: tuple[float, ...],
-        rtol: float,
-    ) -> None:
-        self._predict: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-        self.weights = np.concatenate(
-            [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
-        )
-        self.count = 0
-        self._last: _Evaluation | None = None
-        self._unknowns = unknowns
-        target = np.concatenate([measured(e.record)[e.used] for e in experiments])
-
-        def compute(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-            parts = predict(model, experiments, unknowns, theta, rtol=rtol)
-            used = [e.used[: e.stop] for e in experiments]
-            y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
-            j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
-            return (y - target) / self.weights, j / self.weights[:, None]
-
-        self._predict = compute
-
-    def evaluate(self, theta: FloatArray, *, strict: bool = False) -> _Evaluation:
-        if self._last is not None and np.array_equal(self._last.theta, theta):
-            return self._last
-        self.count += 1
+    def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         try:
-            residual, jacobian = self._predict(theta)
+            parts = predict(model, experiments, unknowns, theta, rtol=rtol)
         except PsaError:
-            if strict:
-                raise
-            residual = np.full(len(self.weights), _FAILED)
-            jacobian = np.zeros((len(self.weights), self._unknowns.size))
-        prior = 1.0 / self._unknowns.prior
-        self._last = _Evaluation(
-            theta.copy(),
-            np.concatenate([residual, theta * prior]),
-            np.vstack([jacobian, np.diag(prior)]),
+            return None
+        y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
+        j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
+        return (
+            np.concatenate([(y - target) / weights, theta * prior]),
+            np.vstack([j / weights[:, None], np.diag(prior)]),
         )
-        return self._last
 
-    def residual(self, theta: FloatArray) -> FloatArray:
-        return self.evaluate(theta).residual
-
-    def derivative(self, theta: FloatArray) -> FloatArray:
-        return self.evaluate(theta).jacobian
+    return evaluate
 
 
 def _starting_point(

@@ -16,6 +16,7 @@ from psa_casadi.identification.starting import loop_starts, starting_model
 from psa_casadi.identification.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.variables import Provenance
+from psa_casadi.version import __version__
 
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "c")
@@ -136,7 +137,7 @@ def refit(previous: Fit, experiments: Sequence[Experiment], free: Sequence[str])
     sigma = _residual_noise(previous, experiments)
     memory = [previous.memory(r) for r in range(len(experiments))]
     return fit(
-        previous.model, experiments, free, sigma=sigma, start_memory=memory, evaluations=60
+        previous.model, experiments, free, sigma=sigma, start_memory=memory, evaluations=150
     )
 
 
@@ -196,6 +197,4 @@ def _warnings(best: Fit, found: Determinacy) -> tuple[str, ...]:
 
 
 def version() -> str:
-    from psa_casadi import __version__
-
     return __version__

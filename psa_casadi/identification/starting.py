@@ -22,7 +22,7 @@ _HYSTERESIS_SHARE = 0.1
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
     {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
     {"A": -0.15, "beta": 0.05, "gamma": 0.05, "n": 1.1},
-    {"A": -0.3, "beta": 0.1, "gamma": 0.1, "n": 1.0},
+    {"A": -0.3, "beta": 0.1, "gamma": 0.1, "n": 1.05},
 )
 
 
@@ -63,6 +63,12 @@ def loop_starts(model: Model) -> list[dict[str, float]]:
         {name: value if name == "n" else value * k_l for name, value in shape.items()}
         for shape in LOOP_SHAPES
     ]
+
+
+def ordinary_loop(model: Model) -> dict[str, float]:
+    """Return an ordinary loop of some 12 % width, scaled to the model's k_L."""
+    k_l = model.values["k_L"]
+    return {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
 
 
 def _slope(records: Sequence[Record]) -> float:

@@ -16,6 +16,9 @@ FloatArray = npt.NDArray[np.float64]
 LOG_PRIOR = 3.0
 LINEAR_PRIOR = 10.0
 MEMORY_PRIOR = 3.0
+#: Lags beside the creep lag are alike in most records: each stays near its start unless told to move.
+LAG_PRIOR = 1.0
+_LAGS = ("R_s", "c_P", "c_B", "c")
 _LOOP = ("k_L", "A", "beta", "gamma")
 _BEND_STEP = 0.2  # an ordinary change of beta A / s, in units of 0.1 k_L
 
@@ -153,6 +156,7 @@ def unknowns_of(
     memories = memory_names(model.structure)
     log = np.array([p.log for p in parameters], dtype=bool)
     prior = np.where(log, LOG_PRIOR, LINEAR_PRIOR)
+    prior = np.where([n in _LAGS for n in free], LAG_PRIOR, prior)
     loop = None
     slope = values.get("k_L", 0.0) + values.get("A", 0.0)
     if all(n in free for n in _LOOP) and values["A"] != 0 and slope > 0:

@@ -1,0 +1,1 @@
+"""The composed model, its file, and named sets of values."""

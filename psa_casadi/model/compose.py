@@ -1,60 +1,17 @@
-"""Compose components into one model: a table of variables and symbolic functions over it."""
+"""Compose components into one model: a table of variables with values, and its equations."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import BALANCES, Component, Equations, Expression, Symbols
+from psa_casadi.component import Component
 from psa_casadi.errors import InputError
-from psa_casadi.variables import (
-    Input,
-    Output,
-    Parameter,
-    Provenance,
-    State,
-    nominal_value,
-)
+from psa_casadi.model.structure import Structure, structure_of
+from psa_casadi.variables import Parameter, Provenance, nominal_value
 
-
-@dataclass(frozen=True, eq=False)
-class Structure:
-    """The equations of a composed model, without parameter values.
-
-    `time`, `x`, `u`, `p` are the symbols (columns, in the order of the variable tables);
-    `balances` maps each balance to its terms' sum with balances kept as symbols (for people);
-    `xdot` and `y` have everything substituted (for machines).
-    """
-
-    components: tuple[Component, ...]
-    parameters: tuple[Parameter, ...]
-    states: tuple[State, ...]
-    inputs: tuple[Input, ...]
-    outputs: tuple[Output, ...]
-    time: Expression
-    x: Expression
-    u: Expression
-    p: Expression
-    symbols: Mapping[str, Expression]
-    balances: Mapping[str, Expression]
-    der: Mapping[str, Expression]
-    out: Mapping[str, Expression]
-    xdot: Expression
-    y: Expression
-
-    @cached_property
-    def f(self) -> ca.Function:
-        """Casadi function `(time, x, u, p) -> (xdot, y)`; columns of nx, nu, np and nx, ny."""
-        return ca.Function(
-            "f",
-            [self.time, self.x, self.u, self.p],
-            [self.xdot, self.y],
-            ["time", "x", "u", "p"],
-            ["xdot", "y"],
-        )
+__all__ = ["Model", "Structure", "compose"]
 
 
 @dataclass(frozen=True)
@@ -180,129 +137,3 @@ def _check_values(structure: Structure, values: Mapping[str, float]) -> None:
             )
     if problems:
         raise InputError(problems)
-
-
-@cache
-def structure_of(components: tuple[Component, ...]) -> Structure:
-    """Add up the components' terms, order the balances and substitute them."""
-    parameters = tuple(p for c in components for p in c.parameters)
-    states = tuple(s for c in components for s in c.states)
-    inputs = tuple(i for c in components for i in c.inputs)
-    outputs = tuple(o for c in components for o in c.outputs)
-    _refuse_duplicates([v.name for v in (*parameters, *states, *inputs)])
-    _refuse_duplicates([o.name for o in outputs])
-    table = {v.name: ca.SX.sym(v.name) for v in (*parameters, *states, *inputs)}
-    table["time"] = ca.SX.sym("time")
-    balance_symbols = {name: ca.SX.sym(name) for name in BALANCES}
-    parts = [_equations_of(c, Symbols({**table, **balance_symbols})) for c in components]
-    balances = _sum_terms(parts, components)
-    der = {k: v for e in parts for k, v in e.der.items()}
-    out = {k: v for e in parts for k, v in e.out.items()}
-    missing = [s.name for s in states if s.name not in der]
-    if missing:
-        raise InputError([f"State '{name}' has no derivative; declare it in `der`." for name in missing])
-    full = _substitute_in_order(balances, balance_symbols)
-
-    def resolve(expression: Expression) -> Expression:
-        return ca.substitute([ca.SX(expression)], list(balance_symbols.values()), full)[0]
-
-    x = ca.vertcat(*[table[s.name] for s in states])
-    xdot = ca.vertcat(*[resolve(der[s.name]) for s in states])
-    if "displacement" in balances:
-        out["velocity"] = _time_derivative(
-            resolve(balance_symbols["displacement"]), x, xdot, table["time"]
-        )
-    y = ca.vertcat(*[resolve(out[o.name]) for o in outputs])
-    return Structure(
-        components=components,
-        parameters=parameters,
-        states=states,
-        inputs=inputs,
-        outputs=outputs,
-        time=table["time"],
-        x=x,
-        u=ca.vertcat(*[table[i.name] for i in inputs]),
-        p=ca.vertcat(*[table[q.name] for q in parameters]),
-        symbols={**table, **balance_symbols},
-        balances=balances,
-        der=der,
-        out=out,
-        xdot=xdot,
-        y=y,
-    )
-
-
-def _refuse_duplicates(names: list[str]) -> None:
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise InputError(
-            [f"Two components declare '{n}'; rename one or leave one out." for n in twice]
-        )
-
-
-def _equations_of(component: Component, symbols: Symbols) -> Equations:
-    try:
-        return component.equations(symbols)
-    except AttributeError as error:
-        raise InputError(
-            [f"Component '{component.name}' cannot be composed: {error}; add the component that has it."]
-        ) from error
-
-
-def _sum_terms(
-    parts: list[Equations], components: tuple[Component, ...]
-) -> dict[str, Expression]:
-    balances: dict[str, Expression] = {}
-    for component, part in zip(components, parts, strict=True):
-        for name, term in part.add.items():
-            if name not in BALANCES:
-                raise InputError(
-                    [f"Component '{component.name}' adds to '{name}', which is no balance; "
-                     f"the balances are {sorted(BALANCES)}."]
-                )
-            balances[name] = balances[name] + term if name in balances else ca.SX(term)
-    return balances
-
-
-def _substitute_in_order(
-    balances: Mapping[str, Expression], symbols: Mapping[str, Expression]
-) -> list[Expression]:
-    """Substitute balances into each other until none is left; name the loop if there is one."""
-    resolved: dict[str, Expression] = {n: ca.SX(0) for n in symbols if n not in balances}
-    waiting = dict(balances)
-    while waiting:
-        ready = [
-            name
-            for name, expression in waiting.items()
-            if not any(ca.depends_on(expression, symbols[other]) for other in waiting)
-        ]
-        if not ready:
-            loop = " -> ".join(_find_loop(waiting, symbols))
-            raise InputError(
-                [f"The balances form a loop: {loop}; put a state between two of them."]
-            )
-        for name in ready:
-            known = list(resolved)
-            resolved[name] = ca.substitute(
-                [waiting.pop(name)], [symbols[k] for k in known], [resolved[k] for k in known]
-            )[0]
-    return [resolved[name] for name in symbols]
-
-
-def _find_loop(
-    waiting: Mapping[str, Expression], symbols: Mapping[str, Expression]
-) -> list[str]:
-    """Follow dependencies until a name repeats; return the names from its first appearance on."""
-    path = [next(iter(waiting))]
-    while True:
-        following = next(n for n in waiting if ca.depends_on(waiting[path[-1]], symbols[n]))
-        if following in path:
-            return [*path[path.index(following) :], following]
-        path.append(following)
-
-
-def _time_derivative(
-    expression: Expression, x: Expression, xdot: Expression, time: Expression
-) -> Expression:
-    """Return d/dt of an expression in states and time."""
-    return ca.jtimes(expression, x, xdot) + ca.jacobian(expression, time)

@@ -48,7 +48,8 @@ def loads(text: str, source: str = "MODEL.json") -> Model:
         content = json.loads(text)
     except ValueError as error:
         raise InputError(
-            [f"{source} is not JSON ({error}); give a file that `psa identify` or `psa diagnose` wrote."]
+            f"{source} is not JSON ({error}); give a file that `psa identify` or `psa diagnose`"
+            " wrote."
         ) from error
     problems = _problems(content, source)
     if problems:
@@ -79,14 +80,17 @@ def load_model(path: Path) -> Model:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            [f"The model file {path} cannot be read ({error}); give a file that `psa identify` wrote."]
+            f"The model file {path} cannot be read ({error}); give a file that `psa identify`"
+            " wrote."
         ) from error
     return loads(text, str(path))
 
 
 def _provenance(content: dict[str, Any], given: dict[str, Any]) -> Provenance:
     return Provenance(
-        identified_from=tuple((r["record"], r["sha256"]) for r in content.get("identified_from", [])),
+        identified_from=tuple(
+            (r["record"], r["sha256"]) for r in content.get("identified_from", [])
+        ),
         package_version=content.get("package_version", ""),
         free=tuple(n for n, e in given.items() if e.get("free")),
         intervals={n: Interval(*e["interval"]) for n, e in given.items() if e.get("interval")},
@@ -110,13 +114,51 @@ def _problems(content: Any, source: str) -> list[str]:
             problems.append(f"{source}: '{key}' is missing; it must list names.")
             continue
         for name in names:
-            if name in table:
+            if isinstance(name, str) and name in table:
                 known.append(table[name])
             else:
                 problems.append(
                     f"{source}: unknown name '{name}' in {key}; the known ones are {sorted(table)}."
                 )
-    return problems + _parameter_problems(content.get("parameters"), known, source)
+    given = content.get("parameters")
+    problems += _parameter_problems(given, known, source)
+    return problems + _origin_problems(content, given, source)
+
+
+def _origin_problems(content: dict[str, Any], given: Any, source: str) -> list[str]:
+    problems = [
+        f"{source}: '{key}' is {content[key]!r}; give a text."
+        for key in ("name", "description", "force_scale", "package_version")
+        if not isinstance(content.get(key, ""), str)
+    ]
+    notes = content.get("notes", [])
+    if not isinstance(notes, list) or not all(isinstance(n, str) for n in notes):
+        problems.append(f"{source}: 'notes' is {notes!r}; give a list of texts.")
+    records = content.get("identified_from", [])
+    if not isinstance(records, list) or not all(
+        isinstance(r, dict)
+        and isinstance(r.get("record"), str)
+        and isinstance(r.get("sha256"), str)
+        for r in records
+    ):
+        problems.append(f"{source}: 'identified_from' must list a record and its sha256 each.")
+    entries = given if isinstance(given, dict) else {}
+    intervals = {
+        n: e["interval"] for n, e in entries.items() if isinstance(e, dict) and "interval" in e
+    }
+    return problems + [
+        f"{source}: the interval of '{name}' is {interval!r}; give [low, high] or null."
+        for name, interval in intervals.items()
+        if not (interval is None or _is_interval(interval))
+    ]
+
+
+def _is_interval(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    )
 
 
 def _parameter_problems(given: Any, known: list[Component], source: str) -> list[str]:
@@ -127,7 +169,9 @@ def _parameter_problems(given: Any, known: list[Component], source: str) -> list
     for name, parameter in declared.items():
         entry = given.get(name)
         if not isinstance(entry, dict) or "value" not in entry:
-            problems.append(f"{source}: parameter '{name}' [{parameter.unit}] has no value; add it.")
+            problems.append(
+                f"{source}: parameter '{name}' [{parameter.unit}] has no value; add it."
+            )
         elif not isinstance(entry["value"], int | float) or isinstance(entry["value"], bool):
             problems.append(
                 f"{source}: the value of '{name}' is {entry['value']!r}; give a number in"
@@ -135,9 +179,12 @@ def _parameter_problems(given: Any, known: list[Component], source: str) -> list
             )
         elif entry.get("unit", parameter.unit) != parameter.unit:
             problems.append(
-                f"{source}: '{name}' is given in '{entry['unit']}'; convert it to '{parameter.unit}'."
+                f"{source}: '{name}' is given in '{entry['unit']}'; convert it to"
+                f" '{parameter.unit}'."
             )
     unknown = [n for n in given if n not in declared]
     if unknown and not problems:
-        problems.append(f"{source}: unknown parameters {unknown}; remove them or add their component.")
+        problems.append(
+            f"{source}: unknown parameters {unknown}; remove them or add their component."
+        )
     return problems

@@ -1,0 +1,1 @@
+"""A diagnosis or an identification as text, picture and page; nothing is computed here."""

@@ -25,7 +25,9 @@ def sources_directory() -> Path:
     for candidate in (here / "fmu_src", here.parent / "fmu_src"):
         if candidate.is_dir():
             return candidate
-    raise PsaError("The C sources (fmu_src) are missing from this installation; reinstall psa_casadi.")
+    raise PsaError(
+        "The C sources (fmu_src) are missing from this installation; reinstall psa_casadi."
+    )
 
 
 def cache_directory() -> Path:
@@ -77,7 +79,9 @@ def shared_library(
     """Compile generated text and files of `fmu_src` to a shared library; cached by content."""
     folder = sources_directory()
     command = compiler_command()
-    digest = hashlib.sha256(repr((command, OPTIMISE, flags, platform.machine(), sys.platform)).encode())
+    digest = hashlib.sha256(
+        repr((command, OPTIMISE, flags, platform.machine(), sys.platform)).encode()
+    )
     for name, text in sorted(generated.items()):
         digest.update(name.encode() + text.encode())
     for path in sorted(folder.glob("*.[ch]")):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.errors import Problems
 from psa_casadi.experiment.record import Record
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import initial_slope, start_state
@@ -26,7 +27,7 @@ class Trajectory:
 
     @property
     def displacement(self) -> FloatArray:
-        """Displacement that the sensor shows, or that of the output where there is no sensor [m]."""
+        """Displacement that the sensor shows; without a sensor, that of the output [m]."""
         name = "measured_displacement"
         return self.outputs[name if name in self.outputs else "displacement"]
 
@@ -47,18 +48,40 @@ def simulate(
     Between samples the voltage is linear (`hold="linear"`) or constant (`hold="zero"`). The model
     starts in the state that the first voltage and its rate imply, with `memory` deviations
     (see `start_state`), or with every state at 0 if `from_rest_at_zero`. `rtol` is the relative
-    tolerance of the error-controlled stepper. Raises SimulationError.
+    tolerance of the error-controlled stepper.
+
+    Raises SimulationError, and InputError for samples that do not fit the times or the model.
     """
     t, v = np.asarray(time, dtype=float), np.asarray(voltage, dtype=float)
-    u = np.zeros((len(t), len(model.input_names)))
-    u[:, model.input_names.index("voltage")] = v
+    given = {"voltage": v}
     if load_force is not None:
-        u[:, model.input_names.index("load_force")] = np.asarray(load_force, dtype=float)
+        given["load_force"] = np.asarray(load_force, dtype=float)
+    _check(model, t, given)
+    u = np.zeros((len(t), len(model.input_names)))
+    for name, samples in given.items():
+        u[:, model.input_names.index(name)] = samples
     x0 = np.zeros(len(model.state_names))
     if not from_rest_at_zero:
         rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
         x0 = start_state(model, list(u[0]), rates, memory, float(t[0])).x
     return _trajectory(model, t, v, run(model, t, u, x0, rtol=rtol, hold=hold))
+
+
+def _check(model: Model, t: FloatArray, given: Mapping[str, FloatArray]) -> None:
+    problems = Problems()
+    if t.ndim != 1 or t.size < 2 or not np.all(np.diff(t) > 0):
+        problems.add("The times do not strictly increase; give two or more, sorted, in seconds.")
+    for name, samples in given.items():
+        if name not in model.input_names:
+            problems.add(
+                f"The model has no input '{name}', it has {model.input_names}; use `run` for models"
+                " other than a stack."
+            )
+        if samples.shape != t.shape:
+            problems.add(f"{name} has {samples.size} samples for {t.size} times; give one each.")
+        elif not np.isfinite(samples).all():
+            problems.add(f"{name} has samples that are not finite; remove or replace them.")
+    problems.raise_if_any()
 
 
 def simulate_record(

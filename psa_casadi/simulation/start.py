@@ -106,10 +106,10 @@ def _functions(structure: Structure) -> tuple[ca.Function, ca.Function]:
     start = _newton(s, fast, _placed(s, settled, memory, deviation, settled=True))
     rest = ca.Function("rest", [s.time, s.x, s.u, s.p, deviation], [start])
     rate = ca.SX.sym("rate", len(s.inputs))
-    moving = start
+    moving: Expression = start
     for _ in range(2):
         moving = _in_motion(s, start, moving, fast, memory, rate)
-    derivatives = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
+    derivatives: list[Expression] = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
     return rest, ca.Function(
         "moving", [s.time, s.x, s.u, rate, s.p, deviation], [moving, *derivatives]
     )
@@ -122,7 +122,7 @@ def _at(s: Structure, expression: Expression, x: Expression) -> Expression:
 def _placed(
     s: Structure, x: Expression, memory: list[int], deviation: Expression, *, settled: bool
 ) -> Expression:
-    """Return x with the memories at their deviation, added to the settled value where there is one."""
+    """Return x with the memories at their deviation from the settled value, if there is one."""
     parts = [x[i] for i in range(len(s.states))]
     for column, i in enumerate(memory):
         if not s.states[i].settles:

@@ -1,26 +1,28 @@
 """The compiled stepper of a model: one trajectory, with or without sensitivities.
 
-The method is ESDIRK4(3)6L[2]SA (Kennedy and Carpenter 2003): L-stable, stiffly accurate, order 4 with
-an embedded error estimate; its discrete equations are differentiated exactly for the sensitivities.
-It is the C code of `fmu_src/solver.c`, the same that runs inside an exported FMU.
+The method is ESDIRK4(3)6L[2]SA (Kennedy and Carpenter 2003): L-stable, stiffly accurate, order 4
+with an embedded error estimate; its discrete equations are differentiated exactly for the
+sensitivities. It is the C code of `fmu_src/solver.c`, the same that runs inside an exported FMU.
 """
 
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import PsaError
+from psa_casadi.errors import Problems, PsaError
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import generate_c
 from psa_casadi.simulation.compiler import shared_library
 
 FloatArray = npt.NDArray[np.float64]
 
-_SOURCES = ("solver.c", "linear.c", "model_casadi.c", "trajectory.c")
+#: The files of `fmu_src` that integrate a model.
+SOURCES = ("solver.c", "linear.c", "model_casadi.c", "trajectory.c")
 _STAGES = 6
 _POINTER = ctypes.c_void_p
 _REASONS = {
@@ -37,10 +39,11 @@ class SimulationError(PsaError):
 class _Run(ctypes.Structure):
     """Mirror of `psa_trajectory` in trajectory.h."""
 
-    _fields_ = [  # noqa: RUF012
+    _fields_ = [
         ("samples", ctypes.c_long), ("t", _POINTER), ("u", _POINTER),
         ("zero_order_hold", ctypes.c_int), ("p", _POINTER), ("x0", _POINTER), ("nominal", _POINTER),
-        ("rtol", ctypes.c_double), ("max_step", ctypes.c_double), ("steps_limit", ctypes.c_long), ("x", _POINTER), ("y", _POINTER),
+        ("rtol", ctypes.c_double), ("max_step", ctypes.c_double), ("steps_limit", ctypes.c_long),
+        ("x", _POINTER), ("y", _POINTER),
         ("count", ctypes.c_int), ("which", _POINTER), ("s0", _POINTER), ("output", ctypes.c_int),
         ("dy", _POINTER), ("work", _POINTER), ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
         ("evaluations", ctypes.c_long), ("t_failed", ctypes.c_double), ("culprit", ctypes.c_int),
@@ -61,7 +64,7 @@ class Steps:
 
 @cache
 def _library(structure: Structure) -> ctypes.CDLL:
-    path = shared_library(generate_c(structure, sensitivities=True), _SOURCES)
+    path = shared_library(generate_c(structure, sensitivities=True), SOURCES)
     library = ctypes.CDLL(str(path))
     library.psa_run.argtypes = [ctypes.POINTER(_Run)]
     library.psa_run.restype = ctypes.c_int
@@ -86,44 +89,91 @@ def run(
     """Integrate a model over the times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
 
     `unknowns` names the parameters of the sensitivities d output / d unknown; an integer k stands
-    for the initial value of state k. `s0` (nx, k) is d x0 / d unknown, zero by default except for the
-    initial values themselves. `steps_limit` bounds the work between two samples. Raises SimulationError, which names state and time.
+    for the initial value of state k. `s0` (nx, k) is d x0 / d unknown, zero by default except for
+    the initial values themselves. `steps_limit` bounds the work between two samples.
+
+    Raises SimulationError, which names state and time, and InputError for arrays of wrong shape,
+    times that do not increase, or numbers that are not finite.
     """
-    structure = model.structure
-    n, nx, ny = len(t), len(structure.states), len(structure.outputs)
-    p = model.parameter_vector() if values is None else np.array(
-        [values[name] for name in model.parameter_names]
-    )  # fmt: skip
+    arrays = _arrays(model, values or model.values, (t, u, x0), unknowns, s0)
+    _check(model, arrays, hold)
     count = len(unknowns)
-    which = np.array(
-        [model.parameter_names.index(q) if isinstance(q, str) else -1 for q in unknowns],
-        dtype=np.int32,
-    )
-    start = np.zeros((nx, count)) if s0 is None else np.array(s0, dtype=float)
-    if s0 is None:
-        for column, unknown in enumerate(unknowns):
-            if isinstance(unknown, int):
-                start[unknown, column] = 1.0
-    arrays = {
-        "t": np.ascontiguousarray(t, dtype=float), "u": np.ascontiguousarray(u, dtype=float), "p": p,
-        "x0": np.ascontiguousarray(x0, dtype=float), "nominal": model.state_nominals(),
-        "x": np.empty((n, nx)), "y": np.empty((n, ny)), "which": which,
-        "s0": np.ascontiguousarray(start), "dy": np.empty((n, count)),
-        "work": np.empty((_STAGES + 3) * nx * max(count, 1)),
-    }  # fmt: skip
     request = _Run(
-        samples=n, zero_order_hold=int(hold == "zero"), rtol=rtol, max_step=max_step, steps_limit=steps_limit, count=count,
+        samples=len(t),
+        zero_order_hold=int(hold == "zero"),
+        rtol=rtol,
+        max_step=max_step,
+        steps_limit=steps_limit,
+        count=count,
         output=model.output_names.index(output) if count else 0,
         **{name: array.ctypes.data for name, array in arrays.items()},
-    )  # fmt: skip
-    status = _library(structure).psa_run(ctypes.byref(request))
+    )
+    status = _library(model.structure).psa_run(ctypes.byref(request))
     if status:
         raise SimulationError(
             f"The simulation stopped at t = {request.t_failed:.6g} s in state"
-            f" '{model.state_names[request.culprit]}': {_REASONS[status]}. Parameter values far from"
-            " physical ones are the likely cause; check them, or loosen the tolerance."
+            f" '{model.state_names[request.culprit]}': {_REASONS[status]}. Parameter values far"
+            " from physical ones are the likely cause; check them, or loosen the tolerance."
         )
-    return Steps(
-        arrays["x"], arrays["y"], arrays["dy"] if count else None,
-        request.steps, request.rejected, request.evaluations,
-    )  # fmt: skip
+    cost = (request.steps, request.rejected, request.evaluations)
+    return Steps(arrays["x"], arrays["y"], arrays["dy"] if count else None, *cost)
+
+
+def _arrays(
+    model: Model,
+    values: Mapping[str, float],
+    given: tuple[FloatArray, FloatArray, FloatArray],
+    unknowns: Sequence[str | int],
+    s0: FloatArray | None,
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays that `_Run` points to, by the names of its fields."""
+    n, nx, count = len(given[0]), len(model.state_names), len(unknowns)
+    return {
+        **{name: _doubles(array) for name, array in zip(("t", "u", "x0"), given, strict=True)},
+        "p": np.array([values[name] for name in model.parameter_names]),
+        "nominal": model.state_nominals(),
+        "x": np.empty((n, nx)),
+        "y": np.empty((n, len(model.output_names))),
+        "which": _which(model, unknowns),
+        "s0": _initial_sensitivities(nx, unknowns) if s0 is None else _doubles(s0),
+        "dy": np.empty((n, count)),
+        "work": np.empty((_STAGES + 3) * nx * max(count, 1)),
+    }
+
+
+def _doubles(values: npt.ArrayLike) -> FloatArray:
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def _which(model: Model, unknowns: Sequence[str | int]) -> npt.NDArray[np.int32]:
+    """Return the index of each unknown parameter, -1 for an initial value, shape (k,)."""
+    names = model.parameter_names
+    return np.array([names.index(q) if isinstance(q, str) else -1 for q in unknowns], np.int32)
+
+
+def _initial_sensitivities(nx: int, unknowns: Sequence[str | int]) -> FloatArray:
+    """Return d x0 / d unknown where no start depends on a parameter, shape (nx, k)."""
+    start = np.zeros((nx, len(unknowns)))
+    for column, unknown in enumerate(unknowns):
+        if isinstance(unknown, int):
+            start[unknown, column] = 1.0
+    return start
+
+
+def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> None:
+    n, nx, k = arrays["t"].size, len(model.state_names), arrays["which"].size
+    shapes = {"t": (n,), "u": (n, len(model.input_names)), "x0": (nx,), "s0": (nx, k)}
+    problems = Problems()
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            problems.add(
+                f"The array {name} has the shape {arrays[name].shape} where {shape} is needed; give"
+                " one row for each time and one column for each input."
+            )
+        elif not np.isfinite(arrays[name]).all():
+            problems.add(f"The array {name} holds numbers that are not finite; replace them.")
+    if n == 0 or not (np.diff(arrays["t"], axis=0) > 0).all():
+        problems.add("The times do not strictly increase; sort them and remove the repeated ones.")
+    if hold not in ("linear", "zero"):
+        problems.add(f"The hold '{hold}' does not exist; use 'linear' or 'zero'.")
+    problems.raise_if_any()

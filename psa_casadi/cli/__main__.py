@@ -1,0 +1,5 @@
+"""`python -m psa_casadi.cli` is the command `psa`."""
+
+from psa_casadi.cli.app import main
+
+main()

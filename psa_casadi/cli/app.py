@@ -1,0 +1,64 @@
+"""The table of subcommands."""
+
+from typing import Annotated
+
+import typer
+
+from psa_casadi.cli.check import check
+from psa_casadi.cli.demo import demo
+from psa_casadi.cli.diagnose import diagnose
+from psa_casadi.cli.effects import effects
+from psa_casadi.cli.export_fmu import fmu
+from psa_casadi.cli.failures import guarded
+from psa_casadi.cli.identify import identify
+from psa_casadi.cli.simulate import simulate
+from psa_casadi.version import __version__
+
+app = typer.Typer(
+    name="psa",
+    help="Models of piezoelectric stack actuators: identify, diagnose what is missing, export.",
+    epilog="Start with: psa demo",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+export = typer.Typer(help="Write a model in a format that other tools read.", no_args_is_help=True)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"psa_casadi {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and stop."
+        ),
+    ] = False,
+) -> None:
+    """Models of piezoelectric stack actuators: identify, diagnose what is missing, export."""
+
+
+app.command(epilog="Example: psa demo my_demo")(guarded(demo))
+app.command(epilog="Example: psa identify slow.csv fast.csv -o model.json --report fit.html")(
+    guarded(identify)
+)
+app.command(epilog="Example: psa simulate --model model.json --input planned.csv -o motion.csv")(
+    guarded(simulate)
+)
+app.command(
+    epilog="Example: psa diagnose a.csv --holdout b.csv -o extended.json --report report.html"
+)(guarded(diagnose))
+app.command(epilog="Example: psa effects slow_creep")(guarded(effects))
+app.add_typer(export, name="export")
+export.command(epilog="Example: psa export fmu --model extended.json -o stack.fmu")(guarded(fmu))
+app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))
+
+
+def main() -> None:
+    """Run the command line."""
+    app(prog_name="psa")

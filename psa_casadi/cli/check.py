@@ -1,0 +1,37 @@
+"""`psa check`: is an FMU valid, does it behave, does it agree with its model."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Quiet, show, show_table, working
+
+
+def check(
+    fmu: Annotated[Path, typer.Argument(help="FMU to check.", show_default=False)],
+    model: Annotated[
+        Path | None,
+        typer.Option(help="MODEL.json to compare with; by default the one that the FMU carries."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Check an FMU: description, calling sequences, trajectories; exit code 1 if a check fails."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.export.check import check_fmu
+    from psa_casadi.model.model_file import load_model
+    from psa_casadi.report.tables import check_table
+    from psa_casadi.report.text import check_sentence
+
+    given = Given()
+    if not fmu.is_file():
+        what = "is a directory" if fmu.is_dir() else "there is no such file"
+        given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
+    chosen = None if model is None else given.attempt(lambda: load_model(model))
+    given.check()
+    with working("checking", quiet):
+        report = check_fmu(fmu, chosen)
+    show_table(check_table(report), quiet)
+    show(f"\n{check_sentence(report)}", quiet)
+    if not report.passed:
+        raise typer.Exit(1)

@@ -1,0 +1,83 @@
+"""`psa demo`: the whole story on a synthetic record that ships with the package."""
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Quiet, show, show_table, width, working
+
+RECORD = "synthetic_record.csv"
+FILES = {
+    RECORD: "the synthetic record: a stack with one effect hidden in it",
+    "model.json": "the base model, identified from the whole record",
+    "extended.json": "the model with the effect that the diagnosis named",
+    "diagnosis.json": "the verdict for machines",
+    "report.html": "the report: open it in a browser",
+    "diagnosis.png": "its picture",
+    "extended.fmu": "the extended model as an FMU (FMI 2.0), checked",
+}
+_ORIGIN = "synthetic"
+
+
+def demo(
+    directory: Annotated[
+        Path, typer.Argument(help="Where to leave the files; it is created.")
+    ] = Path("psa_demo"),
+    quiet: Quiet = False,
+) -> None:
+    """Identify, diagnose, extend, export and check a stack, on a synthetic record."""
+    from psa_casadi.diagnosis.diagnose import diagnose
+    from psa_casadi.experiment import read_record
+    from psa_casadi.export.check import check_fmu
+    from psa_casadi.export.fmu import export_fmu
+    from psa_casadi.files import atomic_write
+    from psa_casadi.identification.identify import identify
+    from psa_casadi.model.model_file import save_model
+    from psa_casadi.report.figure import save_figure
+    from psa_casadi.report.page import write_report
+    from psa_casadi.report.tables import check_table
+    from psa_casadi.report.text import check_sentence, story
+
+    paths = _prepared(directory)
+    record = read_record(paths[RECORD], need_excitation=True)
+    show("A synthetic record, made by a simulated stack with one effect hidden in it.", quiet)
+    with working("identifying", quiet) as progress:
+        save_model(identify([record], progress=progress).model, paths["model.json"])
+    with working("diagnosing", quiet) as progress:
+        d = diagnose([record], progress=progress)
+        save_model(d.model, paths["extended.json"])
+        atomic_write(paths["diagnosis.json"], d.to_json())
+        write_report(d, paths["report.html"], origin=_ORIGIN)
+        save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
+    show(f"\n{story(d, origin=_ORIGIN, width=width())}\n", quiet)
+    with working("exporting and checking the FMU", quiet):
+        export_fmu(d.model, paths["extended.fmu"])
+        checked = check_fmu(paths["extended.fmu"], d.model)
+    show_table(check_table(checked), quiet)
+    files = "\n".join(f"  {name:<20}  {meaning}" for name, meaning in FILES.items())
+    show(f"\n{check_sentence(checked)}\n\nleft in {directory}:\n{files}", quiet)
+    if not checked.passed:
+        raise typer.Exit(1)
+
+
+def _prepared(directory: Path) -> dict[str, Path]:
+    """Create the directory, check that every file can be written, copy the record to it."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.errors import InputError
+    from psa_casadi.files import atomic_write
+
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{directory}: cannot be created ({error.strerror}); name another directory."
+        ) from error
+    paths = {name: directory / name for name in FILES}
+    given = Given()
+    given.outputs(paths, [])
+    given.check()
+    packaged = resources.files("psa_casadi").joinpath("data", "demo.csv")
+    atomic_write(paths[RECORD], packaged.read_bytes())
+    return paths

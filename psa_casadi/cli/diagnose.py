@@ -1,0 +1,88 @@
+"""`psa diagnose`: what the simulation gets wrong, the cause, the extended model, the gain."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Origin, OriginOption, Quiet, show, tell_written, width, working
+
+if TYPE_CHECKING:
+    from psa_casadi.diagnosis.result import Diagnosis
+
+
+def diagnose(
+    records: Annotated[
+        list[Path], typer.Argument(help="Records of one device: CSV files.", show_default=False)
+    ],
+    holdout: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Record kept for judging only (repeat the option for several); without it, the"
+            " last quarter of every record."
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="MODEL.json whose values the base fit starts from.")
+    ] = None,
+    stiffness: Annotated[
+        float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="MODEL.json of the extended model.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="DIAGNOSIS.json to write.")] = None,
+    report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="PNG picture to write.")] = None,
+    origin: OriginOption = Origin.MEASURED,
+    quiet: Quiet = False,
+) -> None:
+    """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
+
+    The exit code is 0 for every verdict.
+    """
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.diagnosis.diagnose import diagnose as run
+    from psa_casadi.report.text import story
+
+    given, held = Given(), holdout or []
+    given.stiffness(stiffness)
+    outputs = {"--output": output, "--json": json, "--report": report, "--figure": figure}
+    given.outputs(outputs, [*records, *held, model])
+    found = given.records(records, held_out=held)
+    start = given.model(model)
+    given.check()
+    count = len(records)
+    with working("diagnosing", quiet) as progress:
+        d = run(
+            found[:count],
+            holdout=found[count:],
+            model=start,
+            stiffness=stiffness,
+            progress=progress,
+        )
+        progress("writing")
+        _write(d, outputs, origin.value)
+    show(story(d, origin=origin.value, width=width()), quiet)
+    tell_written(*outputs.values(), quiet=quiet)
+    if output is not None and not d.causes:
+        show(f"nothing was added: {output} holds the base model", quiet)
+
+
+def _write(d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str) -> None:
+    """Write what was asked for, each file whole or not at all."""
+    from psa_casadi.files import atomic_write
+    from psa_casadi.model.model_file import save_model
+    from psa_casadi.report.figure import save_figure
+    from psa_casadi.report.page import write_report
+
+    writers: dict[str, Callable[[Path], None]] = {
+        "--output": lambda path: save_model(d.model, path),
+        "--json": lambda path: atomic_write(path, d.to_json()),
+        "--report": lambda path: write_report(d, path, origin=origin),
+        "--figure": lambda path: save_figure(d, path, origin=origin),
+    }
+    for option, path in outputs.items():
+        if path is not None:
+            writers[option](path)

@@ -1,0 +1,60 @@
+"""`psa export fmu`: a model as an FMU."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Quiet, show, tell_written, working
+
+
+class FmiVersion(StrEnum):
+    """Versions of the standard."""
+
+    TWO = "2"
+    THREE = "3"
+
+
+def fmu(
+    model: Annotated[Path, typer.Option(help="MODEL.json to export.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
+    fmi: Annotated[FmiVersion, typer.Option(help="Version of the standard.")] = FmiVersion.TWO,
+    platforms: Annotated[
+        str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
+    ] = "host",
+    name: Annotated[
+        str | None, typer.Option(help="Model identifier, a C name; by default the model's name.")
+    ] = None,
+    include_sensor: Annotated[
+        bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a model as an FMU: FMI 2.0, co-simulation and model exchange in one archive."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.export.fmu import export_fmu
+    from psa_casadi.export.platforms import chosen_platforms
+    from psa_casadi.model.model_file import load_model
+
+    given = Given()
+    if fmi is FmiVersion.THREE:
+        given.add("--fmi 3: FMI 3.0 is not available yet; leave --fmi out, or give 2.")
+    given.outputs({"--output": output}, [model])
+    wanted = [p.strip() for p in platforms.split(",") if p.strip()]
+    targets = given.attempt(lambda: chosen_platforms(wanted))
+    chosen = given.attempt(lambda: load_model(model))
+    given.check()
+    if chosen is None or targets is None:
+        return
+    with working("compiling", quiet) as progress:
+        progress(", ".join(t.name for t in targets))
+        export_fmu(chosen, output, name=name, include_sensor=include_sensor, platforms=wanted)
+    kept = chosen if include_sensor else chosen.plant()
+    inside = ", ".join(c.name for c in kept.components)
+    left_out = [c.name for c in chosen.components if c not in kept.components]
+    show(f"inside: {inside}", quiet)
+    if left_out:
+        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
+    tell_written(output, quiet=quiet)

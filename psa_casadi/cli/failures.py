@@ -1,0 +1,63 @@
+"""How a command ends when something is wrong: 2 for the user's input, 1 for everything else."""
+
+import functools
+import os
+from collections.abc import Callable
+from typing import ParamSpec
+
+import typer
+
+from psa_casadi.errors import InputError, PsaError
+
+P = ParamSpec("P")
+
+#: Set in the environment, this variable lets a failure end with its traceback.
+DEBUG = "PSA_CASADI_DEBUG"
+
+
+def guarded(command: Callable[P, None]) -> Callable[P, None]:
+    """Return the command with its errors told in sentences, without a traceback.
+
+    Exit code 2: what the user gave cannot be used; every mistake is listed. Exit code 1: a failure
+    that is not the user's.
+    """
+
+    @functools.wraps(command)
+    def run(*args: P.args, **options: P.kwargs) -> None:
+        try:
+            command(*args, **options)
+        except (typer.Exit, typer.Abort):
+            raise
+        except InputError as error:
+            if os.environ.get(DEBUG):
+                raise
+            _tell_problems(error.problems)
+            raise typer.Exit(2) from error
+        except Exception as error:
+            if os.environ.get(DEBUG):
+                raise
+            _tell_failure(error)
+            raise typer.Exit(1) from error
+
+    return run
+
+
+def _tell_problems(problems: tuple[str, ...]) -> None:
+    if len(problems) == 1:
+        typer.echo(f"Error: {problems[0]}", err=True)
+        return
+    count = sum(not p.startswith("... and") for p in problems)
+    typer.echo(f"Error: {count} problems with what was given:", err=True)
+    for problem in problems:
+        typer.echo(f"  - {problem}", err=True)
+
+
+def _tell_failure(error: Exception) -> None:
+    if isinstance(error, PsaError):
+        typer.echo(f"Failed: {error}", err=True)
+        return
+    typer.echo(
+        f"Failed: an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi,"
+        f" not of the input; set {DEBUG}=1 to see where it happened, and report it.",
+        err=True,
+    )

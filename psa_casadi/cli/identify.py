@@ -1,0 +1,62 @@
+"""`psa identify`: the parameters of a stack, with intervals."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Origin, OriginOption, Quiet, show, tell_written, width, working
+
+
+class Method(StrEnum):
+    """How the parameters are found."""
+
+    PREDICTION_ERROR = "prediction-error"
+    PAPER = "paper"
+
+
+def identify(
+    records: Annotated[
+        list[Path], typer.Argument(help="Records of one device: CSV files.", show_default=False)
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="MODEL.json to write.")],
+    model: Annotated[
+        Path | None, typer.Option(help="MODEL.json whose values the fit starts from.")
+    ] = None,
+    stiffness: Annotated[
+        float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
+    ] = None,
+    method: Annotated[
+        Method, typer.Option(help="How the parameters are found.")
+    ] = Method.PREDICTION_ERROR,
+    report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
+    origin: OriginOption = Origin.MEASURED,
+    quiet: Quiet = False,
+) -> None:
+    """Fit the model of a stack to records; show which parameters the data determine."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.identification.identify import identify as run
+    from psa_casadi.model.model_file import save_model
+    from psa_casadi.report.fit_page import write_fit_report
+    from psa_casadi.report.text import identification_text
+
+    given = Given()
+    if method is Method.PAPER:
+        given.add(
+            "--method paper: the paper's own procedure is not available yet; leave --method out,"
+            " or give prediction-error."
+        )
+    given.stiffness(stiffness)
+    given.outputs({"--output": output, "--report": report}, [*records, model])
+    measured = given.records(records)
+    start = given.model(model)
+    given.check()
+    with working("identifying", quiet) as progress:
+        found = run(measured, model=start, stiffness=stiffness, progress=progress)
+        save_model(found.model, output)
+        if report is not None:
+            progress("writing the report")
+            write_fit_report(found, report, origin=origin.value)
+    show(identification_text(found, origin=origin.value, width=width()), quiet)
+    tell_written(output, report, quiet=quiet)

@@ -1,0 +1,110 @@
+"""What a command is given, checked as a whole before any long work starts."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, read_record
+from psa_casadi.model.compose import Model
+from psa_casadi.model.model_file import load_model
+
+T = TypeVar("T")
+
+
+class Given:
+    """Collects the problems of everything that a command is given, to tell them all at once."""
+
+    def __init__(self) -> None:
+        self._problems: list[str] = []
+
+    def add(self, sentence: str) -> None:
+        """Note one problem."""
+        self._problems.append(sentence)
+
+    def attempt(self, read: Callable[[], T]) -> T | None:
+        """Return what `read` returns, or None after noting the problems it raised."""
+        try:
+            return read()
+        except InputError as error:
+            self._problems.extend(error.problems)
+            return None
+
+    def check(self) -> None:
+        """Raise an `InputError` with all problems, if there are any."""
+        if self._problems:
+            raise InputError(self._problems)
+
+    def records(self, paths: Sequence[Path], *, held_out: Sequence[Path] = ()) -> list[Record]:
+        """Read records to fit, then those held out; no record may be given twice.
+
+        A record to fit must have a voltage that changes, all must have a displacement.
+        """
+        found: list[Record] = []
+        for path in (*paths, *held_out):
+            fitted = path in paths
+            record = self.attempt(
+                lambda p=path, f=fitted: read_record(p, need_excitation=f)  # type: ignore[misc]
+            )
+            if record is None:
+                continue
+            twin = next((r for r in found if r.sha256 == record.sha256), None)
+            if twin is not None:
+                self.add(
+                    f"{path}: holds the same data as {twin.source}; a record counts once, and one"
+                    " that is held out cannot be fitted too: remove one of the two."
+                )
+            found.append(record)
+        return found
+
+    def model(self, path: Path | None) -> Model | None:
+        """Read a model that turns a voltage into a displacement; None where no file is named."""
+        if path is None:
+            return None
+        model = self.attempt(lambda: load_model(path))
+        if model is None:
+            return None
+        if "voltage" not in model.input_names or "displacement" not in model.output_names:
+            self.add(
+                f"{path}: this model has no voltage input or no displacement output, so it is no"
+                " stack; give a file that `psa identify` or `psa diagnose` wrote."
+            )
+            return None
+        return model
+
+    def stiffness(self, value: float | None) -> None:
+        """Demand a positive stiffness, if one is given."""
+        if value is not None and not 0.0 < value < float("inf"):
+            self.add(
+                f"--stiffness is {value:g} N/m; give the positive stiffness of the free stack from"
+                " its data sheet, such as 5e7."
+            )
+
+    def outputs(self, named: Mapping[str, Path | None], inputs: Sequence[Path | None]) -> None:
+        """Demand that every output can be written, and that no two are one file or an input."""
+        sources = {p.resolve() for p in inputs if p is not None}
+        taken: dict[Path, str] = {}
+        for option, path in named.items():
+            if path is None:
+                continue
+            where = path.resolve()
+            if where in taken:
+                self.add(
+                    f"{path}: both {taken[where]} and {option} name it; give each its own file."
+                )
+            elif where in sources:
+                self.add(f"{path}: {option} would overwrite an input; give another name.")
+            taken[where] = option
+            self._writable(path)
+
+    def _writable(self, path: Path) -> None:
+        folder = path.resolve().parent
+        if path.is_dir():
+            self.add(f"{path}: cannot write, this is a directory; name a file in it.")
+        elif not folder.is_dir():
+            self.add(
+                f"{path}: cannot write, the directory {folder} does not exist; create it first."
+            )
+        elif not os.access(folder, os.W_OK):
+            self.add(f"{path}: cannot write, {folder} may not be written to; choose another place.")

@@ -1,0 +1,79 @@
+"""What a command shows: results on stdout, progress on stderr."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from psa_casadi.report.tables import Table
+
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress and no summary; errors still show.")
+]
+
+
+class Origin(StrEnum):
+    """What the records are."""
+
+    MEASURED = "measured"
+    SYNTHETIC = "synthetic"
+
+
+OriginOption = Annotated[
+    Origin, typer.Option("--origin", help="What the report calls the records.")
+]
+
+
+def width() -> int:
+    """Return the columns to write in: the terminal's up to 110, or 100 where there is none."""
+    return min(110, Console().width) if sys.stdout.isatty() else 100
+
+
+@contextmanager
+def working(what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal."""
+    if quiet:
+        yield lambda step: None
+    elif sys.stderr.isatty():
+        console = Console(stderr=True)
+        with console.status(what) as status:
+            yield lambda step: status.update(Text(f"{what}: {step}"))
+    else:
+        typer.echo(f"{what} ...", err=True)
+        yield lambda step: typer.echo(f"  {step}", err=True)
+
+
+def show(text: str, quiet: bool = False) -> None:
+    """Print text as it is."""
+    if not quiet:
+        typer.echo(text)
+
+
+def show_table(table: "Table", quiet: bool = False) -> None:
+    """Print a table: drawn on a terminal, in plain columns elsewhere."""
+    if quiet:
+        return
+    if not sys.stdout.isatty():
+        typer.echo(str(table))
+        return
+    drawn = RichTable(show_edge=False)
+    for name in table.head:
+        drawn.add_column(name, overflow="fold")
+    styles = {"FAIL": "bold red", "pass": "green"}
+    for row in table.rows:
+        drawn.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+    Console().print(drawn)
+
+
+def tell_written(*paths: object, quiet: bool = False) -> None:
+    """Name the files that were written."""
+    named = [str(p) for p in paths if p is not None]
+    if named:
+        show(f"\nwritten: {', '.join(named)}", quiet)

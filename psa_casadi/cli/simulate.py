@@ -1,0 +1,55 @@
+"""`psa simulate`: what a model does with a voltage."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Quiet, show, tell_written, working
+
+if TYPE_CHECKING:
+    from psa_casadi.model.compose import Model
+    from psa_casadi.simulation.simulate import Trajectory
+    from psa_casadi.units import FloatArray
+
+
+def simulate(
+    model: Annotated[Path, typer.Option(help="MODEL.json to simulate.")],
+    record: Annotated[
+        Path, typer.Option("--input", help="CSV with time and voltage, and load_force if any.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a model on a measured or planned voltage; write every output with its unit."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.experiment import read_record, write_record
+    from psa_casadi.simulation.simulate import simulate_record
+
+    given = Given()
+    given.outputs({"--output": output}, [model, record])
+    chosen = given.model(model)
+    voltage = given.attempt(lambda: read_record(record, need_displacement=False))
+    given.check()
+    if chosen is None or voltage is None:
+        return
+    with working("simulating", quiet):
+        found = simulate_record(chosen, voltage)
+        columns = output_columns(chosen, found)
+        write_record(output, columns)
+    show(f"{voltage.n} samples over {voltage.duration:.6g} s in {found.steps} steps", quiet)
+    show(f"columns: {', '.join(columns)}", quiet)
+    tell_written(output, quiet=quiet)
+
+
+def output_columns(model: "Model", found: "Trajectory") -> "dict[str, FloatArray]":
+    """Return time, voltage and every output under headers such as "displacement [um]"."""
+    from psa_casadi.units import convert
+
+    columns = {"time [s]": found.time, "voltage [V]": found.voltage}
+    for declared in model.structure.outputs:
+        unit = declared.display_unit or declared.unit
+        columns[f"{declared.name} [{unit}]"] = convert(
+            found.outputs[declared.name], declared.unit, unit
+        )
+    return columns

@@ -1,0 +1,202 @@
+"""The equations of a composed model: the components' terms added up, ordered and substituted."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import casadi as ca
+
+from psa_casadi.component import BALANCES, Component, Equations, Expression, Symbols
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.variables import Input, Output, Parameter, State
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The equations of a composed model, without parameter values.
+
+    `time`, `x`, `u`, `p` are the symbols (columns, in the order of the variable tables);
+    `balances` maps each balance to its terms' sum with balances kept as symbols (for people);
+    `xdot` and `y` have everything substituted (for machines).
+    """
+
+    components: tuple[Component, ...]
+    parameters: tuple[Parameter, ...]
+    states: tuple[State, ...]
+    inputs: tuple[Input, ...]
+    outputs: tuple[Output, ...]
+    time: Expression
+    x: Expression
+    u: Expression
+    p: Expression
+    symbols: Mapping[str, Expression]
+    balances: Mapping[str, Expression]
+    der: Mapping[str, Expression]
+    out: Mapping[str, Expression]
+    xdot: Expression
+    y: Expression
+
+    @cached_property
+    def f(self) -> ca.Function:
+        """Casadi function `(time, x, u, p) -> (xdot, y)`; columns of nx, nu, np and nx, ny."""
+        return ca.Function(
+            "f",
+            [self.time, self.x, self.u, self.p],
+            [self.xdot, self.y],
+            ["time", "x", "u", "p"],
+            ["xdot", "y"],
+        )
+
+
+@cache
+def structure_of(components: tuple[Component, ...]) -> Structure:
+    """Add up the components' terms, order the balances and substitute them.
+
+    Raises InputError for a name used twice, a missing symbol, an unknown balance, a component that
+    declares what it does not give, and a loop among the balances.
+    """
+    parameters = tuple(p for c in components for p in c.parameters)
+    states = tuple(s for c in components for s in c.states)
+    inputs = tuple(i for c in components for i in c.inputs)
+    outputs = tuple(o for c in components for o in c.outputs)
+    _refuse_duplicates(components)
+    names = [n for c in components for n in _symbol_names(c)]
+    table = {n: ca.SX.sym(n) for n in (*names, "time")}
+    sums = {name: ca.SX.sym(name) for name in BALANCES}
+    parts = [_equations_of(c, Symbols({**table, **sums})) for c in components]
+    balances = _sum_terms(parts, components)
+    der = {k: v for e in parts for k, v in e.der.items()}
+    out = {k: v for e in parts for k, v in e.out.items()}
+    full = _substitute_in_order(balances, sums)
+
+    def resolve(expression: Expression) -> Expression:
+        return ca.substitute([ca.SX(expression)], list(sums.values()), full)[0]
+
+    x = ca.vertcat(*[table[s.name] for s in states])
+    xdot = ca.vertcat(*[resolve(der[s.name]) for s in states])
+    if "displacement" in balances:
+        shown = resolve(sums["displacement"])
+        out["velocity"] = _time_derivative(shown, x, xdot, table["time"])
+    return Structure(
+        components=components,
+        parameters=parameters,
+        states=states,
+        inputs=inputs,
+        outputs=outputs,
+        time=table["time"],
+        x=x,
+        u=ca.vertcat(*[table[i.name] for i in inputs]),
+        p=ca.vertcat(*[table[q.name] for q in parameters]),
+        symbols={**table, **sums},
+        balances=balances,
+        der=der,
+        out=out,
+        xdot=xdot,
+        y=ca.vertcat(*[resolve(out[o.name]) for o in outputs]),
+    )
+
+
+def _symbol_names(component: Component) -> list[str]:
+    names = [p.name for p in component.parameters]
+    names += [s.name for s in component.states]
+    return names + [i.name for i in component.inputs]
+
+
+def _refuse_duplicates(components: tuple[Component, ...]) -> None:
+    """Symbols share one name space with the balances and time, outputs have one of their own."""
+    symbols = [n for c in components for n in _symbol_names(c)]
+    outputs = [o.name for c in components for o in c.outputs]
+    problems = Problems()
+    for names in (symbols, outputs):
+        for name in sorted({n for n in names if names.count(n) > 1}):
+            problems.add(f"Two components declare '{name}'; rename one or leave one out.")
+    for name in sorted({*BALANCES, "time"}.intersection(symbols)):
+        problems.add(f"A component declares '{name}', the name of a balance or of time; rename it.")
+    problems.raise_if_any()
+
+
+def _equations_of(component: Component, symbols: Symbols) -> Equations:
+    try:
+        equations = component.equations(symbols)
+    except AttributeError as error:
+        raise InputError(
+            f"Component '{component.name}' cannot be composed: {error}; add the component that has"
+            " it."
+        ) from error
+    _check_declarations(component, equations)
+    return equations
+
+
+def _check_declarations(component: Component, equations: Equations) -> None:
+    """A component gives what it declares and nothing else; velocity follows from displacement."""
+    outputs = {o.name for o in component.outputs} - {"velocity"}
+    problems = Problems()
+    for kind, declared, given in (
+        ("derivative of the state", {s.name for s in component.states}, set(equations.der)),
+        ("equation of the output", outputs, set(equations.out)),
+    ):
+        for name in sorted(declared - given):
+            problems.add(f"Component '{component.name}' lacks the {kind} '{name}'; declare it.")
+        for name in sorted(given - declared):
+            problems.add(
+                f"Component '{component.name}' has the {kind} '{name}', which it does not declare;"
+                " add a term to a balance instead, or declare it."
+            )
+    problems.raise_if_any()
+
+
+def _sum_terms(parts: list[Equations], components: tuple[Component, ...]) -> dict[str, Expression]:
+    balances: dict[str, Expression] = {}
+    for component, part in zip(components, parts, strict=True):
+        for name, term in part.add.items():
+            if name not in BALANCES:
+                raise InputError(
+                    [
+                        f"Component '{component.name}' adds to '{name}', which is no balance; "
+                        f"the balances are {sorted(BALANCES)}."
+                    ]
+                )
+            balances[name] = balances[name] + term if name in balances else ca.SX(term)
+    return balances
+
+
+def _substitute_in_order(
+    balances: Mapping[str, Expression], symbols: Mapping[str, Expression]
+) -> list[Expression]:
+    """Substitute balances into each other until none is left; name the loop if there is one."""
+    resolved: dict[str, Expression] = {n: ca.SX(0) for n in symbols if n not in balances}
+    waiting = dict(balances)
+    while waiting:
+        ready = [
+            name
+            for name, expression in waiting.items()
+            if not any(ca.depends_on(expression, symbols[other]) for other in waiting)
+        ]
+        if not ready:
+            loop = " -> ".join(_find_loop(waiting, symbols))
+            raise InputError(
+                [f"The balances form a loop: {loop}; put a state between two of them."]
+            )
+        for name in ready:
+            known = list(resolved)
+            resolved[name] = ca.substitute(
+                [waiting.pop(name)], [symbols[k] for k in known], [resolved[k] for k in known]
+            )[0]
+    return [resolved[name] for name in symbols]
+
+
+def _find_loop(waiting: Mapping[str, Expression], symbols: Mapping[str, Expression]) -> list[str]:
+    """Follow dependencies until a name repeats; return the names from its first appearance on."""
+    path = [next(iter(waiting))]
+    while True:
+        following = next(n for n in waiting if ca.depends_on(waiting[path[-1]], symbols[n]))
+        if following in path:
+            return [*path[path.index(following) :], following]
+        path.append(following)
+
+
+def _time_derivative(
+    expression: Expression, x: Expression, xdot: Expression, time: Expression
+) -> Expression:
+    """Return d/dt of an expression in states and time."""
+    return ca.jtimes(expression, x, xdot) + ca.jacobian(expression, time)

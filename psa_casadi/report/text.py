@@ -1,0 +1,126 @@
+"""The results as plain text for a terminal."""
+
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.result import Diagnosis, Errors
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.export.check import CheckReport
+from psa_casadi.identification.identify import Identification
+from psa_casadi.report.phrases import (
+    VERDICTS,
+    Scale,
+    added,
+    cause_estimates,
+    length_scale,
+    listing,
+    number,
+    plain,
+    rest_sentence,
+    verdict_sentence,
+)
+from psa_casadi.report.tables import blind_table, effect_parameter_table, parameter_table
+
+_LABEL = 10
+
+
+def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
+    """Return a diagnosis in about ten lines: verdict, errors, cause, what remains, what to do."""
+    scale = _scale(d.experiments, d.base_errors.holdout_rms_m)
+    lines = [
+        ("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}"),
+        ("records", _records(d.experiments, origin)),
+        ("noise", f"{scale.text(d.noise_floor_rms_m)} rms"),
+        ("base", _errors(d.base_errors, scale)),
+    ]
+    if added(d):
+        lines.append(("extended", _errors(d.extended_errors, scale)))
+    for cause in d.causes:
+        lines.append(("cause", f"{plain(cause.effect)}: {'; '.join(cause_estimates(d, cause))}"))
+        if cause.cannot_be_told_from:
+            rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
+            lines.append(("", f"{plain(cause.effect)} cannot be told from {rivals} on these data"))
+    lines.append(("remains", rest_sentence(d)))
+    blind = [f"{effect} (shows from {size})" for effect, size, _ in blind_table(d).rows]
+    lines.append(("blind to", "; ".join(blind) or "no effect of ordinary size in the table"))
+    lines.append(("next", d.next_experiment.why))
+    lines.extend(("note", note) for note in d.notes)
+    return "\n".join(_line(label, text, width) for label, text in lines)
+
+
+def identification_text(
+    found: Identification, *, origin: str = "measured", width: int = 100
+) -> str:
+    """Return an identification: error, parameters with intervals, warnings."""
+    scale = _scale(found.experiments, found.fit.rms)
+    span = max(e.record.range_m for e in found.experiments)
+    share = number(100.0 * found.fit.rms / span, 2)
+    head = [
+        ("records", _records(found.experiments, origin)),
+        ("error", f"{scale.text(found.fit.rms)} rms, {share} % of the largest range"),
+    ]
+    tail = [("warning", w) for w in found.warnings]
+    tail += [("note", n) for n in found.model.provenance.notes]
+    blocks = ["\n".join(_line(label, text, width) for label, text in head)]
+    blocks.append(str(parameter_table(found.model, found)))
+    blocks += ["\n".join(_line(label, text, width) for label, text in tail)] if tail else []
+    return "\n\n".join(blocks)
+
+
+def effect_page(effect: Component, width: int = 100) -> str:
+    """Return one effect: what it is, equation, signature, source, parameters."""
+    lines = [
+        ("what", effect.description),
+        ("belongs to", effect.belongs_to),
+        ("equation", effect.equation_text),
+        ("signature", effect.looks_like),
+        ("source", effect.source),
+    ]
+    body = "\n".join(_line(label, text, width) for label, text in lines)
+    return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect)}"
+
+
+def check_sentence(report: CheckReport) -> str:
+    """Say how the check of an FMU ended."""
+    against = "" if report.compared else " There was no model to compare it with."
+    if report.passed:
+        return f"{Path(report.path).name} passed all {len(report.rows)} checks.{against}"
+    failed = listing([r.name for r in report.failures])
+    return f"{Path(report.path).name} did not pass: {failed}.{against}"
+
+
+def _line(label: str, text: str, width: int) -> str:
+    return textwrap.fill(
+        text,
+        max(width, 40),
+        initial_indent=f"{label:<{_LABEL}} ",
+        subsequent_indent=" " * (_LABEL + 1),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _scale(experiments: Iterable[Experiment], size: float) -> Scale:
+    counts = any(e.record.displacement_unit == "counts" for e in experiments)
+    return length_scale(size, counts=counts)
+
+
+def _records(experiments: Iterable[Experiment], origin: str) -> str:
+    parts = []
+    for e in experiments:
+        held = int(e.held_out.sum())
+        rest = f", {held} of them held out" if held else ""
+        size = f"{e.record.n} samples in {number(e.record.duration)} s{rest}"
+        parts.append(f"{e.record.name} ({origin}: {size})")
+    return "; ".join(parts)
+
+
+def _errors(e: Errors, scale: Scale) -> str:
+    return (
+        f"held-out error {scale.text(e.holdout_rms_m)} rms"
+        f" ({number(e.holdout_nrmse_percent, 2)} % of range),"
+        f" at most {scale.text(e.holdout_max_m)};"
+        f" training {scale.text(e.train_rms_m)} rms"
+    )

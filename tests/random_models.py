@@ -1,0 +1,56 @@
+"""Models at random parameter values, states and inputs, drawn from a seed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.component import Component
+from psa_casadi.components import BASE
+from psa_casadi.model.compose import Model, compose
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where a model's functions are evaluated: time, states (nx,), inputs (nu,)."""
+
+    time: float
+    x: FloatArray
+    u: FloatArray
+
+
+def random_model(
+    effects: Sequence[Component],
+    generator: np.random.Generator,
+    *,
+    gains: bool,
+    base: Sequence[Component] = BASE,
+) -> Model:
+    """Return the base with effects; every value within 30 % of its default or ordinary size.
+
+    The gains are 0, or with `gains` one to three times their ordinary size.
+    """
+    model = compose((*base, *effects))
+    values: dict[str, float] = {}
+    for parameter in model.structure.parameters:
+        share = generator.uniform(0.7, 1.3)
+        value = parameter.value or 0.3 * parameter.typical(model.values)
+        low, high = parameter.bounds
+        values[parameter.name] = float(np.clip(value * share, low, high))
+    model = model.with_values(values)
+    for effect in effects:
+        gain = model.parameter(str(effect.gain))
+        size = generator.uniform(1.0, 3.0) * gain.typical(model.values)
+        values[gain.name] = size if gains else 0.0
+    return model.with_values(values)
+
+
+def random_point(model: Model, generator: np.random.Generator) -> Point:
+    """Return states of their ordinary size with either sign, and inputs within the ratings."""
+    x = model.state_nominals() * generator.normal(size=len(model.state_names))
+    rated = model.values["u_rated"]
+    u = np.array([generator.uniform(-0.3, 1.0) * rated, generator.uniform(-200.0, 200.0)])
+    return Point(float(generator.uniform(0.0, 10.0)), x, u)

@@ -1,0 +1,94 @@
+"""Diagnoses with chosen findings on a simulated record: what a report must be able to show."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from psa_casadi.components import BASE
+from psa_casadi.diagnosis.result import (
+    BlindSpot,
+    Candidate,
+    Cause,
+    Diagnosis,
+    Errors,
+    Estimate,
+    Gain,
+    NextExperiment,
+    Remaining,
+    Verdict,
+)
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment import Record, multisine, time_grid
+from psa_casadi.experiment.split import Experiment, split
+from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.unknowns import unknowns_of
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+from psa_casadi.variables import Interval, Provenance
+
+NOISE = 5e-9
+ADDED = {"cause_named", "partly_explained", "ambiguous"}
+
+
+@cache
+def experiment(name: str, samples: int) -> tuple[Experiment, FloatArray, FloatArray]:
+    """Return a record of a stack that drifts, some samples missing, without and with the drift."""
+    time = time_grid(samples / 1000.0, 1e-3)
+    voltage = multisine(time, 5.0, 95.0, (1.0, 12.0), seed=3)
+    clean = simulate(compose(BASE), time, voltage).displacement
+    drift = 8e-8 * time / time[-1]
+    y = clean + drift + NOISE * np.random.default_rng(1).standard_normal(len(time))
+    y[40:50] = np.nan
+    return split(Record(name, time, voltage, y)), clean, clean + drift
+
+
+def _fit(model: Model) -> Fit:
+    free = ("k_L", "tau")
+    empty = np.zeros((0, 2))
+    return Fit(model, unknowns_of(model, free, 1, 1e-6), np.zeros(3), np.zeros(0), empty,
+               (NOISE,), 0.0, True, 1)  # fmt: skip
+
+
+def diagnosis(
+    verdict: Verdict, names: tuple[str, ...] = ("plant_a",), samples: int = 1500
+) -> Diagnosis:
+    """Return a diagnosis with the given verdict on the named records."""
+    added = verdict in ADDED
+    parts = [experiment(n, samples) for n in names]
+    base = tuple(p[1] for p in parts)
+    model = compose((*BASE, EFFECTS["slow_creep"]) if added else BASE)
+    intervals = {"k_L": Interval(9.9, 10.1), "tau": Interval(1e-7, 1.0)}
+    model = replace(model, provenance=Provenance(free=("k_L", "tau"), intervals=intervals))
+    cause = Cause("slow_creep", "plant", 0.97,
+                  {"creep_gain": Estimate(0.04, "1", (0.037, 0.043)),
+                   "creep_time": Estimate(0.3, "s", (0.2, 0.45))},
+                  ("offset_drift",) if verdict == "ambiguous" else (), 0.9)  # fmt: skip
+    errors = Errors(4e-8, 5e-8, 1.5e-7, 0.31)
+    return Diagnosis(
+        verdict=verdict,
+        causes=(cause,) if added else (),
+        candidates=(
+            Candidate("slow_creep", 0.93, 1250.0, True),
+            Candidate("offset_drift", -40.0, -3000.0, True),
+            Candidate("sensor_delay", 0.004, 0.2, False),
+        ),
+        noise_floor_rms_m=NOISE,
+        base_errors=errors,
+        extended_errors=Errors(5.1e-9, 8.5e-9, 2e-8, 0.052) if added else errors,
+        gain=Gain(83.0, (79.0, 86.0)) if added else Gain(0.0, (0.0, 0.0)),
+        blind_to=(
+            BlindSpot("sensor_delay", 0.002, "s", "The record is slow <and> short."),
+            BlindSpot("current_limit", 1e300, "1/A", "The current stays small."),
+        ),
+        remaining=Remaining(verdict in ("adequate", "cause_named"), 0.4, "Nothing is left."),
+        next_experiment=NextExperiment(None, (), "Hold the voltage for a minute."),
+        notes=("Forces are assumed.",),
+        experiments=tuple(p[0] for p in parts),
+        base_fit=_fit(compose(BASE)),
+        extended_fit=_fit(model),
+        base=base,
+        extended=tuple(p[2] for p in parts) if added else base,
+        model=model,
+    )

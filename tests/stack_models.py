@@ -1,0 +1,33 @@
+"""Named stacks as models, what their linear part is, and a voltage that starts at rest."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.components import BASE
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS
+
+FloatArray = NDArray[np.float64]
+
+#: Values that take the hysteresis out of a stack.
+LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
+
+
+def stack(name: str, **changes: float) -> Model:
+    figures = {key: figure.value for key, figure in STACKS[name].values.items()}
+    return compose(BASE, figures | changes)
+
+
+def sine(t: FloatArray, frequency: float) -> FloatArray:
+    voltage: FloatArray = 60.0 * (1.0 - np.cos(2 * np.pi * frequency * t))
+    return voltage
+
+
+def jacobian(model: Model) -> FloatArray:
+    """Return df/dx at rest by differences of a linear function, shape (nx, nx)."""
+    linear = model.with_values(LINEAR)
+    p, size = linear.parameter_vector(), linear.state_nominals()
+    columns = [
+        np.array(linear.structure.f(0.0, row, [0.0, 0.0], p)[0]).ravel() for row in np.diag(size)
+    ]
+    return np.array(columns).T / size

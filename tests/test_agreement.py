@@ -1,0 +1,127 @@
+"""The symbolic model against the paper's equations in plain NumPy: two programs, one answer."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import cos, exp, pi, sin
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi import reference
+from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.model.compose import compose
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.reference import Mechanics
+from psa_casadi.simulation.simulate import simulate
+
+FloatArray = NDArray[np.float64]
+
+#: Samples of the stepper's input, linear in between; a sine's error between them is 5e-9 of it.
+SAMPLES = 30001
+DURATION = 2e-3
+FORCE = 0.05
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A voltage in units of the rated one; its kinks and jumps in units of the duration."""
+
+    name: str
+    shape: Callable[[float], float]
+    breakpoints: tuple[float, ...] = ()
+    hold: str = "linear"
+
+
+def _sine(s: float) -> float:
+    return 0.4 * (1.0 - cos(3 * pi * s))
+
+
+def _triangle(s: float) -> float:
+    return 0.8 * (1.0 - abs(2.0 * ((1.5 * s) % 1.0) - 1.0)) - 0.1 * s
+
+
+def _step(s: float) -> float:
+    return 0.6 if s < 0.4 else -0.1 if s < 0.7 else 0.35
+
+
+def _multisine(s: float) -> float:
+    tones = ((1, 0.3), (2, 1.9), (3, 4.4), (5, 2.2))
+    return 0.3 + 0.12 * sum(sin(2 * pi * k * s + phase) for k, phase in tones)
+
+
+def _wander(s: float) -> float:
+    """A chirp on a bend that never comes back."""
+    return 0.3 * s**2 + 0.25 * s * sin(2.0 + 9.0 * float(s**1.5)) + 0.3 * exp(-3.0 * s)
+
+
+DRIVES = (
+    Drive("sine", _sine),
+    Drive("triangle", _triangle, (1 / 3, 2 / 3)),
+    Drive("step", _step, (0.4, 0.7), hold="zero"),
+    Drive("multisine", _multisine),
+    Drive("non_periodic", _wander),
+)
+
+
+def stack_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
+    """Return a named stack's values; for the single mass, both masses on springs in series."""
+    p = {name: figure.value for name, figure in STACKS[stack].values.items()}
+    if mechanics == "single_mass":
+        k = 1 / (1 / p["k_P"] + 1 / p["k_B"])
+        p |= {"m": p["m_P"] + p["m_B"], "k": k, "c": p["c_B"]}
+        for name in ("m_P", "c_P", "k_P", "m_B", "c_B", "k_B"):
+            del p[name]
+    return p
+
+
+@pytest.mark.parametrize("drive", DRIVES, ids=lambda d: d.name)
+@pytest.mark.parametrize("mechanics", ["cascade", "single_mass"])
+@pytest.mark.parametrize("stack", sorted(STACKS))
+def test_displacement_agrees_with_the_reference(
+    stack: str, mechanics: Mechanics, drive: Drive
+) -> None:
+    p = stack_values(stack, mechanics)
+    model = compose(BASE if mechanics == "cascade" else SIMPLIFIED, p)
+    size, force = p["u_rated"], FORCE * p["k_L"] * p["u_rated"]
+    t = np.linspace(0.0, DURATION, SAMPLES)
+
+    def voltage(time: float) -> float:
+        return size * drive.shape(time / DURATION)
+
+    def load(time: float) -> float:
+        return force * sin(7.0 * time / DURATION) if drive.hold == "linear" else 0.0
+
+    found = simulate(
+        model, t, [voltage(s) for s in t], load_force=[load(s) for s in t],
+        from_rest_at_zero=True, rtol=1e-8, hold=drive.hold,
+    )  # fmt: skip
+    every = slice(None, None, 60)
+    true = reference.simulate(
+        p, voltage, t[every], load_force=load, mechanics=mechanics,
+        breakpoints=[b * DURATION for b in drive.breakpoints], rtol=1e-10,
+    )  # fmt: skip
+    error = np.abs(found.outputs["displacement"][every] - true.displacement).max()
+    assert error < 1e-6 * np.ptp(true.displacement)
+    for name, wanted in (
+        ("velocity", true.velocity),
+        ("charge", true.charge),
+        ("blocked_force", true.blocked_force),
+    ):
+        difference = np.abs(found.outputs[name][every] - wanted).max()
+        assert difference < 1e-5 * np.ptp(wanted), name
+
+
+@pytest.mark.parametrize("stack", sorted(STACKS))
+def test_a_slow_path_with_holds_agrees(stack: str) -> None:
+    """A path of ramps and holds from 1 ms to 0.2 s; only its corners and 40 instants are given."""
+    p = stack_values(stack, "cascade")
+    corners = np.array([0.0, 0.05, 0.1, 0.101, 0.15, 0.35, 0.4])
+    levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
+    t = np.union1d(np.linspace(0.0, 0.4, 41), corners)
+    path = reference.from_samples(corners, levels)
+    true = reference.simulate(p, path, t, breakpoints=list(corners), rtol=1e-9)
+    model = compose(BASE, p)
+    found = simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True, rtol=1e-10)
+    error = np.abs(found.outputs["displacement"] - true.displacement).max()
+    assert error < 1e-6 * np.ptp(true.displacement)

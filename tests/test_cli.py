@@ -1,0 +1,247 @@
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import psa_casadi
+from psa_casadi.cli.app import app
+from psa_casadi.cli.demo import FILES
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment import multisine, read_record, time_grid, write_record
+from psa_casadi.model.compose import compose
+from psa_casadi.model.model_file import load_model, save_model
+from psa_casadi.report.text import identification_text
+from psa_casadi.simulation.simulate import simulate_record
+from tests.test_report import Page, png_size
+
+#: The demo takes half a minute: with pytest-xdist's loadgroup it runs once, else once per process.
+pytestmark = pytest.mark.xdist_group("demo")
+
+COMMANDS = {
+    (): "demo",
+    ("demo",): "psa demo",
+    ("identify",): "psa identify",
+    ("simulate",): "psa simulate",
+    ("diagnose",): "psa diagnose",
+    ("effects",): "psa effects",
+    ("export",): "fmu",
+    ("export", "fmu"): "psa export fmu",
+    ("check",): "psa check",
+}
+
+
+@dataclass(frozen=True)
+class Demo:
+    directory: Path
+    said: str
+    progress: str
+
+
+def psa(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def done(*arguments: str | Path) -> Result:
+    result = psa(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
+    directory = tmp_path_factory.mktemp("demo") / "new" / "psa_demo"
+    result = done("demo", directory)
+    return Demo(directory, result.stdout, result.stderr)
+
+
+@pytest.fixture
+def planned(tmp_path: Path) -> tuple[Path, Path]:
+    """Return a model with a delay in its sensor, and a voltage that nobody has measured yet."""
+    model, voltage = tmp_path / "model.json", tmp_path / "planned.csv"
+    save_model(compose((*BASE, EFFECTS["sensor_delay"]), {"sensor_delay": 1e-3}), model)
+    time = time_grid(0.2, 1e-3)
+    drive = multisine(time, 5.0, 95.0, (5.0, 50.0), seed=1)
+    write_record(voltage, {"time [s]": time, "voltage [V]": drive})
+    return model, voltage
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example_that_is_a_command(command: tuple[str, ...]) -> None:
+    text = " ".join(done(*command, "--help").stdout.split())
+    assert COMMANDS[command] in text
+    if command and command != ("export",):
+        assert f"Example: psa {' '.join(command)}" in text
+        assert "--quiet" in text
+
+
+def test_the_version_is_one() -> None:
+    assert done("--version").stdout == f"psa_casadi {psa_casadi.__version__}\n"
+    pyproject = Path(__file__).parent.parent / "pyproject.toml"
+    assert f'version = "{psa_casadi.__version__}"' in pyproject.read_text(encoding="utf-8")
+
+
+def test_every_public_name_is_there() -> None:
+    for name in psa_casadi.__all__:
+        assert getattr(psa_casadi, name) is not None
+    assert set(psa_casadi.__all__) <= set(dir(psa_casadi))
+    with pytest.raises(AttributeError, match="no attribute 'identfy'"):
+        psa_casadi.__getattr__("identfy")
+
+
+def test_the_demo_leaves_what_it_says(demo: Demo) -> None:
+    assert {p.name for p in demo.directory.iterdir()} == set(FILES)
+    for name in FILES:
+        assert (demo.directory / name).stat().st_size > 1000
+        assert name in demo.said.split("left in ")[1]
+    assert "slow creep" in demo.said
+    assert "passed all" in demo.said
+    assert "FAIL" not in demo.said
+    assert "synthetic_record (synthetic:" in demo.said
+    assert "(measured" not in demo.said
+    assert "base fit" in demo.progress
+
+
+def test_the_demo_names_the_hidden_effect_and_gains_by_it(demo: Demo) -> None:
+    d = json.loads((demo.directory / "diagnosis.json").read_text(encoding="utf-8"))
+    assert set(d) >= {"format", "verdict", "causes", "candidates", "errors", "gain", "blind_to",
+                      "remaining", "next_experiment"}  # fmt: skip
+    assert d["verdict"] == "cause_named"
+    assert [c["effect"] for c in d["causes"]] == ["slow_creep"]
+    assert set(d["causes"][0]) >= {"belongs_to", "confidence", "parameters", "cannot_be_told_from"}
+    assert d["gain"]["holdout_rms_reduction_percent"] > 50.0
+    assert d["records"][0]["name"] == "synthetic_record"
+    record = read_record(demo.directory / "synthetic_record.csv")
+    assert d["records"][0]["sha256"] == record.sha256
+    base = load_model(demo.directory / "model.json")
+    extended = load_model(demo.directory / "extended.json")
+    assert [c.name for c in base.effects] == []
+    assert [c.name for c in extended.effects] == ["slow_creep"]
+    assert extended.provenance.identified_from == (("synthetic_record", record.sha256),)
+
+
+def test_the_demos_report_is_whole_and_calls_its_data_synthetic(demo: Demo) -> None:
+    text = (demo.directory / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.loaded == []
+    assert len(text) < 8e6
+    assert text.count("Plotly.newPlot(") >= 4
+    assert "synthetic data" in page.text
+    assert "measured" not in page.text.replace("measured minus model", "")
+    for part in ("The cause is slow creep", "Every effect", "What remains", "could not have shown",
+                 "Next experiment", "Parameters of the extended model", "SHA-256"):  # fmt: skip
+        assert part in page.text
+    assert png_size(demo.directory / "diagnosis.png") == (1600, 1000)
+
+
+def test_the_demos_fmu_is_valid_and_can_be_checked_again(demo: Demo) -> None:
+    fmu = demo.directory / "extended.fmu"
+    assert fmpy.read_model_description(str(fmu)).coSimulation is not None
+    checked = done("check", fmu, "--model", demo.directory / "extended.json", "--quiet")
+    assert checked.output == ""
+    other = psa("check", fmu, "--model", demo.directory / "model.json")
+    assert other.exit_code == 1
+    assert "FAIL" in other.stdout
+    assert "did not pass" in other.stdout
+
+
+def test_identify_starts_from_a_model_and_writes_its_page(demo: Demo, tmp_path: Path) -> None:
+    model, page = tmp_path / "m.json", tmp_path / "fit.html"
+    record = demo.directory / "synthetic_record.csv"
+    result = done(
+        "identify", record, "--model", demo.directory / "model.json", "--stiffness", "5e7",
+        "-o", model, "--report", page, "--origin", "synthetic",
+    )  # fmt: skip
+    for part in ("k_L", "95 % interval", "N/V", "written:", "(synthetic:"):
+        assert part in result.stdout
+    found = load_model(model)
+    assert found.provenance.identified_from[0][1] == read_record(record).sha256
+    assert set(found.provenance.free) <= set(found.provenance.intervals)
+    shown = Page(page.read_text(encoding="utf-8"))
+    assert shown.loaded == []
+    assert "synthetic and model" in shown.text
+    assert "95 % interval" in shown.text
+
+
+def test_diagnose_writes_only_what_is_asked_for_and_can_be_quiet(
+    demo: Demo, tmp_path: Path
+) -> None:
+    record = read_record(demo.directory / "synthetic_record.csv")
+    parts = [record.slice(0, 2600), record.slice(2600, record.n)]
+    paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    for path, part in zip(paths, parts, strict=True):
+        assert part.displacement is not None
+        write_record(
+            path,
+            {
+                "time [s]": part.time,
+                "voltage [V]": part.voltage,
+                "displacement [m]": part.displacement,
+            },
+        )
+    result = done(
+        "diagnose", paths[0], "--holdout", paths[1], "--json", tmp_path / "d.json", "--quiet"
+    )
+    assert result.output == ""
+    assert {p.name for p in tmp_path.iterdir()} == {"a.csv", "b.csv", "d.json"}
+    d = json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))
+    assert [r["name"] for r in d["records"]] == ["a", "b"]
+
+
+def test_simulate_writes_every_output_with_its_unit(
+    planned: tuple[Path, Path], tmp_path: Path
+) -> None:
+    model, voltage = planned
+    out = tmp_path / "motion.csv"
+    said = done("simulate", "--model", model, "--input", voltage, "-o", out).stdout
+    header, *rows = out.read_text(encoding="utf-8").splitlines()
+    names = [re.sub(r" \[.*", "", h) for h in header.split(",")]
+    assert names == ["time", "voltage", *load_model(model).output_names]
+    assert "displacement [um]" in header
+    assert header.replace(",", ", ") in said
+    values = np.array([[float(c) for c in row.split(",")] for row in rows])
+    expected = simulate_record(
+        load_model(model), read_record(voltage, need_displacement=False)
+    ).outputs["displacement"]
+    np.testing.assert_allclose(values[:, names.index("displacement")], 1e6 * expected, rtol=1e-12)
+
+
+def test_export_leaves_the_sensor_out_unless_asked(
+    planned: tuple[Path, Path], tmp_path: Path
+) -> None:
+    model, fmu = planned[0], tmp_path / "x.fmu"
+    said = done("export", "fmu", "--model", model, "-o", fmu, "--name", "my_stack").stdout
+    assert "left out: sensor, sensor_delay" in said
+    description = fmpy.read_model_description(str(fmu))
+    assert description.coSimulation.modelIdentifier == "my_stack"
+    assert "sensor_delay" not in [v.name for v in description.modelVariables]
+    said = done("export", "fmu", "--model", model, "-o", fmu, "--include-sensor").stdout
+    assert "left out" not in said
+    assert "sensor_delay" in [v.name for v in fmpy.read_model_description(str(fmu)).modelVariables]
+
+
+def test_effects_are_listed_and_shown() -> None:
+    listed = done("effects").stdout
+    for name, effect in EFFECTS.items():
+        assert name in listed
+        assert effect.looks_like in listed
+    assert done("effects", "--quiet").stdout.split() == list(EFFECTS)
+    shown = done("effects", "slow-creep").stdout
+    assert "equation" in shown
+    assert "Croft, Shed and Devasia" in " ".join(shown.split())
+
+
+def test_an_identification_tells_its_warnings(demo: Demo) -> None:
+    record = read_record(demo.directory / "synthetic_record.csv").slice(0, 800)
+    found = psa_casadi.identify([record], model=load_model(demo.directory / "model.json"))
+    text = identification_text(found)
+    for warning in found.warnings:
+        assert " ".join(warning.split()) in " ".join(text.split())
+    for name in found.determinacy.undetermined:
+        assert re.search(rf"^{name} .*fit, (undetermined|on its bound)", text, re.MULTILINE)
+    assert "Force scale assumed" in text

@@ -1,0 +1,261 @@
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from psa_casadi.cli.app import app
+from psa_casadi.components import BASE, COMPONENTS
+from psa_casadi.effects import EFFECTS
+from psa_casadi.model.compose import compose
+from psa_casadi.model.model_file import dumps
+from tests.record_files import HEADER, ROWS, write
+
+MODEL = dumps(compose((*BASE, EFFECTS["slow_creep"])))
+
+
+def psa(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def refused(*arguments: str | Path, outputs: Path, code: int = 2) -> str:
+    """Run a command that must fail in the given way, and return what it says on stderr."""
+    before = sorted(outputs.rglob("*"))
+    result = psa(*arguments)
+    assert result.exit_code == code, result.output
+    assert isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+    assert sorted(outputs.rglob("*")) == before
+    return result.stderr
+
+
+def rows_with(row: int, text: str) -> list[str]:
+    return [*ROWS[:row], text, *ROWS[row + 1 :]]
+
+
+RECORDS: dict[str, tuple[list[str], str]] = {
+    "wrong unit": (["time [s],voltage [N],displacement [um]", *ROWS], "'N' does not measure"),
+    "unknown unit": (["time [s],voltage [volts],displacement [um]", *ROWS], "'volts' is unknown"),
+    "unit of a load": (
+        [f"{HEADER},load_force [kg]", *(f"{r},0" for r in ROWS)], "'kg' does not measure force"
+    ),
+    "text in a number": ([HEADER, *rows_with(4, "0.004,abc,1")], "line 6, column 'voltage'"),
+    "time goes back": ([HEADER, *rows_with(4, "0.001,1,1")], "time goes back"),
+    "nan time": ([HEADER, *rows_with(4, "nan,1,1")], "line 6, column 'time': found no value"),
+    "three samples": ([HEADER, *ROWS[:3]], "found 3 samples, expected at least"),
+    "constant voltage": (
+        [HEADER, *(f"{k},3,{k}" for k in range(20))], "expected a voltage that changes"
+    ),
+    "no displacement": ([HEADER, *(f"{k},{k % 3}," for k in range(20))], "found no valid values"),
+    "no header": (ROWS, "expected a header"),
+    "empty": ([""], "the file is empty"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", RECORDS)
+def test_a_record_with_a_mistake(tmp_path: Path, case: str) -> None:
+    lines, expected = RECORDS[case]
+    bad = write(tmp_path / "bad.csv", *lines)
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    model = write(tmp_path / "model.json", MODEL)
+    out = tmp_path / "out"
+    out.mkdir()
+    commands: list[tuple[str | Path, ...]] = [
+        ("identify", bad, "-o", out / "m.json", "--report", out / "r.html"),
+        (
+            "diagnose",
+            bad,
+            "-o",
+            out / "m.json",
+            "--json",
+            out / "d.json",
+            "--figure",
+            out / "f.png",
+        ),
+    ]
+    if case not in ("constant voltage", "no displacement"):
+        commands.append(("simulate", "--model", model, "--input", bad, "-o", out / "y.csv"))
+    if case != "constant voltage":
+        commands.append(("diagnose", good, "--holdout", bad, "-o", out / "m.json"))
+    for command in commands:
+        said = refused(*command, outputs=tmp_path)
+        assert str(bad) in said
+        assert expected in said
+
+
+def test_a_record_that_is_not_there(tmp_path: Path) -> None:
+    absent, out = tmp_path / "absent.csv", tmp_path / "m.json"
+    for command in ("identify", "diagnose"):
+        said = refused(command, absent, "-o", out, outputs=tmp_path)
+        assert "there is no such file" in said
+        assert "is a directory" in refused(command, tmp_path, "-o", out, outputs=tmp_path)
+    assert "--output" in refused("identify", absent, outputs=tmp_path)
+    assert "records" in refused("diagnose", "-o", out, outputs=tmp_path).lower()
+
+
+def test_the_same_record_twice(tmp_path: Path) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    copy = write(tmp_path / "copy.csv", HEADER, *ROWS)
+    out = tmp_path / "m.json"
+    for command in (
+        ("identify", good, good, "-o", out),
+        ("identify", good, copy, "-o", out),
+        ("diagnose", good, copy, "-o", out),
+        ("diagnose", good, "--holdout", copy, "-o", out),
+        ("diagnose", good, "--holdout", good, "-o", out),
+    ):
+        said = refused(*command, outputs=tmp_path)
+        assert "holds the same data as" in said
+        assert "good.csv" in said
+
+
+def _edited(change: Callable[[dict[str, Any]], object]) -> str:
+    content = json.loads(MODEL)
+    change(content)
+    return json.dumps(content)
+
+
+MODELS = {
+    "not JSON": ("{", "is not JSON"),
+    "other JSON": ('{"format": "psa_casadi.diagnosis/1"}', "is not a model file"),
+    "a list": ("[1, 2]", "is not a model file"),
+    "unknown effect": (_edited(lambda m: m["effects"].append("warp")), "unknown name 'warp'"),
+    "missing parameter": (
+        _edited(lambda m: m["parameters"].pop("k_L")),
+        "'k_L' [N/V] has no value",
+    ),
+    "out of bounds": (
+        _edited(lambda m: m["parameters"]["creep_gain"].update(value=7.0)),
+        "'creep_gain' is 7 1, outside its bounds",
+    ),
+    "text as a value": (
+        _edited(lambda m: m["parameters"]["k_L"].update(value="1")),
+        "give a number",
+    ),
+    "another unit": (_edited(lambda m: m["parameters"]["k_L"].update(unit="kN/V")), "convert it"),
+}
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_a_model_file_with_a_mistake(tmp_path: Path, case: str) -> None:
+    text, expected = MODELS[case]
+    model = write(tmp_path / "model.json", text)
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    (tmp_path / "x.fmu").write_bytes(b"not read")
+    for command in (
+        ("identify", good, "--model", model, "-o", tmp_path / "m.json"),
+        ("simulate", "--model", model, "--input", good, "-o", tmp_path / "y.csv"),
+        ("diagnose", good, "--model", model, "--report", tmp_path / "r.html"),
+        ("export", "fmu", "--model", model, "-o", tmp_path / "y.fmu"),
+        ("check", tmp_path / "x.fmu", "--model", model),
+    ):
+        said = refused(*command, outputs=tmp_path)
+        assert expected in said
+        assert str(model) in said
+
+
+def test_a_model_from_nowhere_or_of_something_else(tmp_path: Path) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    stage = compose([COMPONENTS["flexure"]], name="flexure")
+    other = write(tmp_path / "flexure.json", dumps(stage))
+    nowhere = tmp_path / "nowhere.json"
+    out = tmp_path / "y.csv"
+    said = refused("simulate", "--model", nowhere, "--input", good, "-o", out, outputs=tmp_path)
+    assert "nowhere.json cannot be read" in said
+    said = refused("simulate", "--model", other, "--input", good, "-o", out, outputs=tmp_path)
+    assert "is no stack" in said
+
+
+def test_everything_wrong_with_a_command_is_told_at_once(tmp_path: Path) -> None:
+    bad = write(tmp_path / "bad.csv", HEADER, *rows_with(4, "0.004,abc,1"))
+    said = refused(
+        "diagnose", bad, "--holdout", tmp_path / "absent.csv", "--model", tmp_path / "no.json",
+        "-o", tmp_path / "missing" / "m.json", "--json", tmp_path, "--stiffness", "-3",
+        outputs=tmp_path,
+    )  # fmt: skip
+    assert "6 problems" in said
+    for part in ("'abc'", "absent.csv", "no.json", "create it first", "is a directory", "-3 N/m"):
+        assert part in said
+
+
+def test_outputs_that_collide(tmp_path: Path) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    same = tmp_path / "same"
+    said = refused("diagnose", good, "-o", same, "--json", same, outputs=tmp_path)
+    assert "both -o and --json name it" in said.replace("--output", "-o")
+    said = refused("identify", good, "-o", good, outputs=tmp_path)
+    assert "would overwrite an input" in said
+    assert good.read_text(encoding="utf-8").startswith(HEADER)
+
+
+def test_what_is_not_available_yet_says_so(tmp_path: Path) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    model = write(tmp_path / "model.json", MODEL)
+    said = refused(
+        "identify", good, "--method", "paper", "-o", tmp_path / "m.json", outputs=tmp_path
+    )
+    assert "not available yet" in said
+    fmu = ("export", "fmu", "--model", model, "-o", tmp_path / "x.fmu")
+    assert "not available yet" in refused(*fmu, "--fmi", "3", outputs=tmp_path)
+    assert "'vax' is not known" in refused(*fmu, "--platforms", "vax", outputs=tmp_path)
+    assert "cannot name an FMU" in refused(*fmu, "--name", "1st", outputs=tmp_path)
+    assert "--fmi" in refused(*fmu, "--fmi", "7", outputs=tmp_path)
+
+
+def test_fmus_that_are_none(tmp_path: Path) -> None:
+    text = tmp_path / "text.fmu"
+    text.write_text("not a zip")
+    assert "cannot be read as an FMU" in refused("check", text, outputs=tmp_path)
+    assert "no such file" in refused("check", tmp_path / "absent.fmu", outputs=tmp_path)
+    assert "is a directory" in refused("check", tmp_path, outputs=tmp_path)
+
+
+def test_an_effect_that_does_not_exist_is_answered_with_what_is_close(tmp_path: Path) -> None:
+    assert "did you mean slow_creep" in refused("effects", "slow_crep", outputs=tmp_path)
+    assert "current_limit" in refused("effects", "xyzzy", outputs=tmp_path)
+
+
+def test_a_demo_where_a_file_stands(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("here")
+    assert "cannot be created" in refused("demo", tmp_path / "file", outputs=tmp_path)
+    assert "cannot be created" in refused("demo", tmp_path / "file" / "sub", outputs=tmp_path)
+
+
+def test_a_fault_of_the_package_ends_with_1_and_a_short_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("one over none")
+
+    monkeypatch.setattr("psa_casadi.identification.identify.identify", broken)
+    monkeypatch.delenv("PSA_CASADI_DEBUG", raising=False)
+    out = tmp_path / "m.json"
+    said = refused("identify", good, "-o", out, "--quiet", outputs=tmp_path, code=1)
+    assert "unexpected ZeroDivisionError (one over none)" in said
+    assert len(said.splitlines()) == 1
+    monkeypatch.setenv("PSA_CASADI_DEBUG", "1")
+    assert isinstance(psa("identify", good, "-o", out).exception, ZeroDivisionError)
+
+
+def test_the_command_itself_prints_no_traceback(tmp_path: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if k != "PSA_CASADI_DEBUG"}
+    done = subprocess.run(
+        [sys.executable, "-m", "psa_casadi.cli", "identify", tmp_path / "absent.csv",
+         "-o", tmp_path / "m.json"],
+        capture_output=True, text=True, check=False, env=environment,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == (
+        f"Error: {tmp_path / 'absent.csv'}: there is no such file; check the name and the"
+        " directory it is in.\n"
+    )
+    assert list(tmp_path.iterdir()) == []

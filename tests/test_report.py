@@ -1,0 +1,192 @@
+import json
+import re
+import struct
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from psa_casadi.diagnosis.result import Verdict
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.check import CheckReport, CheckRow
+from psa_casadi.report.figure import save_figure
+from psa_casadi.report.page import write_report
+from psa_casadi.report.phrases import length_scale, listing, number
+from psa_casadi.report.series import kept, noise_density, series_of, spectrum, telling_window
+from psa_casadi.report.tables import blind_table, check_table, error_table, parameter_table
+from psa_casadi.report.text import check_sentence, effect_page, story
+from tests.report_cases import ADDED, NOISE, diagnosis
+
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
+SENTENCES = {
+    "adequate": "Nothing beyond the noise is missing",
+    "cause_named": "The cause is slow creep (plant, confidence 97 %)",
+    "partly_explained": "The closest known cause is slow creep",
+    "ambiguous": "cannot tell whether it is slow creep or offset drift",
+    "unexplained": "no effect in the table explains",
+}
+
+
+class Page(HTMLParser):
+    """Resources that a page loads, and its text outside of scripts and style."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.words: list[str] = []
+        self._open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._open.append(tag)
+        self.loaded += [v or "" for k, v in attrs if k in ("src", "href", "srcset", "data")]
+
+    def handle_endtag(self, tag: str) -> None:
+        while self._open and self._open.pop() != tag:
+            pass
+
+    def handle_data(self, data: str) -> None:
+        if not {"script", "style"} & set(self._open):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    data = path.read_bytes()
+    assert data.startswith(b"\x89PNG\r\n\x1a\n")
+    width, height = struct.unpack(">II", data[16:24])
+    return width, height
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict) -> None:
+    d = diagnosis(verdict)
+    write_report(d, tmp_path / "r.html", origin="synthetic")
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.loaded == []
+    assert not re.search(r"@import|url\(", text.split("<script>", 1)[0])
+    assert len(text) < 8e6
+    assert SENTENCES[verdict] in page.text
+    assert "synthetic data" in page.text
+    assert "measured" not in page.text.replace("measured minus model", "")
+    assert d.experiments[0].record.sha256 in page.text
+    assert "The record is slow <and> short." in page.text
+    assert text.count("Plotly.newPlot(") == text.count('class="plot"')
+    shown = story(d, origin="synthetic")
+    assert SENTENCES[verdict] in " ".join(shown.split())
+    assert ("extended" in shown) == (verdict in ADDED)
+    assert 8 <= len(shown.splitlines()) <= 16
+    assert max(map(len, shown.splitlines())) <= 100
+    json.loads(d.to_json())
+
+
+@pytest.mark.parametrize("verdict", ["cause_named", "unexplained"])
+def test_the_picture_has_its_size_and_shows_something(tmp_path: Path, verdict: Verdict) -> None:
+    path = tmp_path / "d.png"
+    save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic")
+    assert png_size(path) == (1600, 1000)
+    assert path.stat().st_size > 50_000
+    assert [p.name for p in tmp_path.iterdir()] == ["d.png"]
+
+
+def test_a_report_that_cannot_be_written_is_the_users_problem(tmp_path: Path) -> None:
+    for write in (write_report, save_figure):
+        with pytest.raises(InputError, match="does not exist"):
+            write(diagnosis("adequate"), tmp_path / "absent" / "x")
+
+
+def test_a_long_record_stays_small_and_keeps_its_extremes(tmp_path: Path) -> None:
+    write_report(diagnosis("cause_named", ("a", "b", "c"), 60_000), tmp_path / "r.html")
+    assert (tmp_path / "r.html").stat().st_size < 8e6
+    rng = np.random.default_rng(0)
+    one, two = rng.standard_normal(100_000), rng.standard_normal(100_000)
+    one[777], two[90_000], one[5] = 50.0, -60.0, np.nan
+    shown = kept([one, two], 2000)
+    assert len(shown) <= 2100
+    assert {777, 90_000, 0, 99_999} <= set(shown.tolist())
+    assert np.all(np.diff(shown) > 0)
+
+
+def test_the_window_shows_where_the_models_differ_most() -> None:
+    (series,) = series_of(diagnosis("cause_named"))
+    window = telling_window(series)
+    base, extended = (c.values for c in series.curves)
+    inside = np.abs(extended - base)[window]
+    assert series.held_out[window].all()
+    assert 48 <= len(inside) <= len(base) // 8
+    assert np.mean(inside) > np.mean(np.abs(extended - base))
+
+
+def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:
+    (series,) = series_of(diagnosis("cause_named", samples=20_000))
+    frequency, density = spectrum(series.time, series.residual(series.curves[1]))
+    assert frequency[-1] == pytest.approx(500.0, rel=2e-3)
+    assert float(np.sqrt(np.mean(density[5:] ** 2))) == pytest.approx(
+        noise_density(series), rel=0.05
+    )
+    assert noise_density(series) == pytest.approx(NOISE * np.sqrt(2e-3))
+
+
+def test_tables_show_display_units_and_say_what_is_not_known() -> None:
+    d = diagnosis("cause_named")
+    rows = {row[0]: row for row in parameter_table(d.model).rows}
+    assert rows["tau"][1:4] == ("0.1000", "not determined", "ms")
+    assert rows["k_L"][2:5] == ("9.90 to 10.1", "N/V", "fit")
+    assert rows["m_P"][4] == "not fitted"
+    assert [row[1] for row in blind_table(d).rows] == ["0.00200 s", "at no size"]
+    assert [row[0] for row in error_table(d, "nm", 1e9).rows] == ["base", "extended", "noise"]
+    assert error_table(d, "nm", 1e9).rows[1][2] == "8.50"
+    assert [r[0] for r in error_table(diagnosis("adequate"), "nm", 1e9).rows] == ["base", "noise"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"), (1234.5, "1230"), (12.345, "12.3"), (-0.00123456, "-0.00123"), (9.996, "10.0"),
+        (1e300, "1.00e300"), (2.5e-7, "2.50e-7"), (6e7, "6.00e7"), (float("inf"), "not finite"),
+    ],
+)  # fmt: skip
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_lengths_and_lists_are_handy() -> None:
+    assert length_scale(3e-5).text(1.8e-5) == "18.0 µm"
+    assert length_scale(2e-8).text(1.8e-8) == "18.0 nm"
+    assert length_scale(4000.0, counts=True).text(12.0) == "12.0 counts"
+    assert [listing(["a", "b", "c"][:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_the_page_of_an_effect_tells_all_of_it(name: str) -> None:
+    effect = EFFECTS[name]
+    page = " ".join(effect_page(effect).split())
+    for part in (effect.equation_text, effect.source, effect.looks_like, effect.belongs_to):
+        assert part
+        assert " ".join(part.split()) in page
+    for parameter in effect.parameters:
+        assert parameter.name in page
+    assert page.count("(0 removes the effect)") == 1
+
+
+def test_the_check_of_an_fmu_names_what_failed() -> None:
+    good = CheckRow("units", 0.0, 0.0, True, "")
+    bad = CheckRow("equations", float("nan"), 1e-9, False, "it stopped")
+    report = CheckReport(Path("x.fmu"), (good, bad), compared=False)
+    assert check_table(report).rows[1] == (
+        "equations",
+        "not finite",
+        "1.00e-9",
+        "FAIL",
+        "it stopped",
+    )
+    assert check_sentence(report).startswith("x.fmu did not pass: equations.")
+    assert "no model" in check_sentence(report)
+    assert "passed all 1 checks" in check_sentence(CheckReport(Path("x.fmu"), (good,), True))
