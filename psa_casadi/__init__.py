@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from psa_casadi.identification.identify import Identification, identify
     from psa_casadi.model.compose import Model, compose
     from psa_casadi.model.model_file import load_model, save_model
-    from psa_casadi.model.stacks import STACKS
+    from psa_casadi.model.stacks import STACKS, stack_model
     from psa_casadi.report.figure import save_figure
     from psa_casadi.report.fit_page import write_fit_report
     from psa_casadi.report.page import write_report
@@ -53,7 +53,10 @@ _HOMES = {
         "COMPONENTS",
     ),
     "psa_casadi.effects": ("EFFECTS",),
-    "psa_casadi.model.stacks": ("STACKS",),
+    "psa_casadi.model.stacks": (
+        "STACKS",
+        "stack_model",
+    ),
     "psa_casadi.model.compose": (
         "Model",
         "compose",
@@ -99,6 +102,7 @@ __all__ = [
     "COMPONENTS",
     "EFFECTS",
     "STACKS",
+    "stack_model",
     "Model",
     "compose",
     "load_model",

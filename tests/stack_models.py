@@ -9,6 +9,8 @@ from psa_casadi.model.stacks import STACKS
 
 FloatArray = NDArray[np.float64]
 
+#: The paper's stacks: the others are identified and have no published stroke.
+PAPER_STACKS = ("P-885.51", "PTBS200", "WYDS0808020")
 #: Values that take the hysteresis out of a stack.
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
 

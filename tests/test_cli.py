@@ -30,6 +30,7 @@ COMMANDS = {
     ("simulate",): "psa simulate",
     ("diagnose",): "psa diagnose",
     ("effects",): "psa effects",
+    ("stacks",): "psa stacks",
     ("export",): "fmu",
     ("export", "fmu"): "psa export fmu",
     ("check",): "psa check",

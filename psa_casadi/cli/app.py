@@ -12,6 +12,7 @@ from psa_casadi.cli.export_fmu import fmu
 from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.simulate import simulate
+from psa_casadi.cli.stacks import stacks
 from psa_casadi.version import __version__
 
 app = typer.Typer(
@@ -54,6 +55,7 @@ app.command(
     epilog="Example: psa diagnose a.csv --holdout b.csv -o extended.json --report report.html"
 )(guarded(diagnose))
 app.command(epilog="Example: psa effects slow_creep")(guarded(effects))
+app.command(epilog="Example: psa stacks P-885.51")(guarded(stacks))
 app.add_typer(export, name="export")
 export.command(epilog="Example: psa export fmu --model extended.json -o stack.fmu")(guarded(fmu))
 app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))

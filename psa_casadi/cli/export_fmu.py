@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, show, tell_written, working
+from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written, working
 
 
 class FmiVersion(StrEnum):
@@ -17,8 +17,9 @@ class FmiVersion(StrEnum):
 
 
 def fmu(
-    model: Annotated[Path, typer.Option(help="MODEL.json to export.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
+    model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
+    stack: StackOption = None,
     fmi: Annotated[FmiVersion, typer.Option(help="Version of the standard.")] = FmiVersion.TWO,
     platforms: Annotated[
         str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
@@ -35,7 +36,6 @@ def fmu(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu import export_fmu
     from psa_casadi.export.platforms import chosen_platforms
-    from psa_casadi.model.model_file import load_model
 
     given = Given()
     if fmi is FmiVersion.THREE:
@@ -43,7 +43,7 @@ def fmu(
     given.outputs({"--output": output}, [model])
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
-    chosen = given.attempt(lambda: load_model(model))
+    chosen = given.model_or_stack(model, stack, any_model=True)
     given.check()
     if chosen is None or targets is None:
         return

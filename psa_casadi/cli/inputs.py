@@ -9,6 +9,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.experiment import Record, read_record
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
+from psa_casadi.model.stacks import stack_model
 
 T = TypeVar("T")
 
@@ -72,6 +73,23 @@ class Given:
             )
             return None
         return model
+
+    def model_or_stack(
+        self, path: Path | None, stack: str | None, *, any_model: bool = False
+    ) -> Model | None:
+        """Read a model or compose a named stack; exactly one of the two must be given.
+
+        With `any_model` the file need not hold a stack.
+        """
+        if path is not None and stack is not None:
+            self.add("--model and --stack are both given; leave one of them out.")
+            return None
+        if stack is not None:
+            return self.attempt(lambda: stack_model(stack))
+        if path is None:
+            self.add("No model is given; add --model MODEL.json, or --stack NAME (`psa stacks`).")
+            return None
+        return self.attempt(lambda: load_model(path)) if any_model else self.model(path)
 
     def stiffness(self, value: float | None) -> None:
         """Demand a positive stiffness, if one is given."""

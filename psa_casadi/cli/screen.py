@@ -18,6 +18,11 @@ Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress and no summary; errors still show.")
 ]
 
+StackOption = Annotated[
+    str | None,
+    typer.Option("--stack", help="Named stack in place of a model; `psa stacks` lists them."),
+]
+
 
 class Origin(StrEnum):
     """What the records are."""

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, show, tell_written, working
+from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written, working
 
 if TYPE_CHECKING:
     from psa_casadi.model.compose import Model
@@ -14,11 +14,12 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    model: Annotated[Path, typer.Option(help="MODEL.json to simulate.")],
     record: Annotated[
         Path, typer.Option("--input", help="CSV with time and voltage, and load_force if any.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
+    model: Annotated[Path | None, typer.Option(help="MODEL.json to simulate.")] = None,
+    stack: StackOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a model on a measured or planned voltage; write every output with its unit."""
@@ -28,7 +29,7 @@ def simulate(
 
     given = Given()
     given.outputs({"--output": output}, [model, record])
-    chosen = given.model(model)
+    chosen = given.model_or_stack(model, stack)
     voltage = given.attempt(lambda: read_record(record, need_displacement=False))
     given.check()
     if chosen is None or voltage is None:

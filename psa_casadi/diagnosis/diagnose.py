@@ -12,7 +12,14 @@ from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.probes import directions
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import Screening, screen
-from psa_casadi.diagnosis.selection import Extension, choose, extend, extend_afresh, leading
+from psa_casadi.diagnosis.selection import (
+    Extension,
+    choose,
+    extend,
+    extend_afresh,
+    leading,
+    polish,
+)
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.record import Record
@@ -29,8 +36,12 @@ FloatArray = npt.NDArray[np.float64]
 MOST_CAUSES = 3
 #: An extension whose residual is within this factor of the noise needs no further starts.
 SETTLED = 1.05
-#: How many of the leading extensions are fitted again from an ordinary loop where structure is left.
-AFRESH = 2
+#: How many extensions are fitted to the end, if their evidence is this share of the best one's.
+FINALISTS, RUNNER_UP = 2, 0.7
+#: Share of the residual's power above the noise from which a further cause is looked for.
+REMAINDER = 0.05
+#: A base fit retried from the extension's parameters counts if its rms falls to this share.
+BETTER_BASE = 0.95
 
 
 @dataclass(eq=False)
@@ -68,9 +79,6 @@ def diagnose(
     )
     base = fit_base(start, experiments, progress=progress)
     rounds = _search(base, experiments, table, progress)
-    retried = _retry_base(rounds, experiments, progress)
-    if retried is not None:
-        rounds = _search(retried, experiments, table, progress)
     progress("judging")
     return conclude(rounds, experiments, table, stiffness is not None)
 
@@ -91,48 +99,59 @@ def _search(
 ) -> list[Round]:
     """Forward selection: add the best effect until the rest is noise or nothing helps."""
     rounds = [_examine(base, tuple(base.predicted(experiments)), experiments, table, progress)]
-    while len(rounds) <= MOST_CAUSES:
+    retried = False
+    while len(rounds) <= MOST_CAUSES and _worth_searching(rounds):
         current = rounds[-1]
-        best = max((s.decrease for s in current.screening.scores), default=0.0)
-        if best < current.screening.threshold:
+        _extend(current, len(rounds), experiments, progress)
+        if current.chosen is None:
             break
-        inflation = correlation_inflation(current.fit.residuals) if len(rounds) > 1 else 1.0
-        for name, scores in leading(current.screening):
-            progress(f"cause {len(rounds)}: fitting {name}")
-            extension = extend(current.fit, experiments, scores, inflation)
-            if extension is not None:
-                current.extensions.append(extension)
-        before = rms(np.concatenate(held_out_residuals(experiments, current.predicted)))
-        floor = high_frequency_noise(current.fit.residuals)
-        _try_afresh(current, experiments, inflation, floor, progress)
-        ranked = choose(current.extensions, before, floor)
-        if not ranked:
-            break
-        current.chosen, current.rivals = ranked[0], ranked[1:]
+        if len(rounds) == 1 and not retried:
+            retried = True
+            better = _retry_base(current, experiments, progress)
+            if better is not None:
+                predicted = tuple(better.predicted(experiments))
+                rounds = [_examine(better, predicted, experiments, table, progress)]
+                continue
         left = [c for c in table if c not in current.chosen.fit.model.components]
         rounds.append(
-            _examine(
-                current.chosen.fit, current.chosen.predicted, experiments, left, progress
-            )
+            _examine(current.chosen.fit, current.chosen.predicted, experiments, left, progress)
         )
     return rounds
 
 
-def _try_afresh(
-    current: Round,
-    experiments: Sequence[Experiment],
-    inflation: float,
-    floor: float,
-    progress: Progress,
+def _worth_searching(rounds: Sequence[Round]) -> bool:
+    """A direction above the threshold; after a first cause also a remainder beyond the noise."""
+    current = rounds[-1]
+    best = max((s.decrease for s in current.screening.scores), default=0.0)
+    if best < current.screening.threshold:
+        return False
+    return len(rounds) == 1 or (current.test.alarm and current.test.excess > REMAINDER)
+
+
+def _extend(
+    current: Round, number: int, experiments: Sequence[Experiment], progress: Progress
 ) -> None:
-    """Where the best extensions leave structure, fit them again from an ordinary loop."""
-    ranked = sorted(current.extensions, key=lambda e: -e.evidence)[:AFRESH]
-    for extension in ranked:
-        if extension.fit.rms < SETTLED * floor:
-            return
-        progress(f"fitting {extension.effect.name} afresh")
-        again = extend_afresh(current.fit, experiments, extension, inflation)
-        current.extensions[current.extensions.index(extension)] = again
+    """Fit the leading effects, the best ones to the end, and choose among them."""
+    inflation = correlation_inflation(current.fit.residuals) if number > 1 else 1.0
+    floor = high_frequency_noise(current.fit.residuals)
+    for name, scores in leading(current.screening):
+        progress(f"cause {number}: fitting {name}")
+        extension = extend(current.fit, experiments, scores, inflation)
+        if extension is not None:
+            current.extensions.append(extension)
+    current.extensions.sort(key=lambda e: -e.evidence)
+    for k, extension in enumerate(current.extensions[:FINALISTS]):
+        if extension.evidence > RUNNER_UP * current.extensions[0].evidence:
+            progress(f"cause {number}: {extension.effect.name} to the end")
+            full = polish(current.fit, extension, experiments, inflation)
+            if full.fit.rms > SETTLED * floor:
+                progress(f"cause {number}: {extension.effect.name} afresh")
+                full = extend_afresh(current.fit, experiments, full, inflation)
+            current.extensions[k] = full
+    before = rms(np.concatenate(held_out_residuals(experiments, current.predicted)))
+    ranked = choose(current.extensions, experiments, current.fit, before, floor)
+    if ranked:
+        current.chosen, current.rivals = ranked[0], ranked[1:]
 
 
 def _examine(
@@ -152,11 +171,8 @@ def _examine(
     return Round(fit, predicted, screening, test)
 
 
-def _retry_base(
-    rounds: Sequence[Round], experiments: Sequence[Experiment], progress: Progress
-) -> Fit | None:
+def _retry_base(first: Round, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
     """Fit the base once more from the best extension's parameters; return it if clearly better."""
-    first = rounds[0]
     if first.chosen is None:
         return None
     progress("base fit, from the extension's parameters")
@@ -164,4 +180,4 @@ def _retry_base(
     values = {n: first.chosen.fit.model.values[n] for n in names}
     moved = replace(first.fit, model=first.fit.model.with_values(values))
     again = refit(moved, experiments, names)
-    return again if again.rms < 0.98 * first.fit.rms else None
+    return again if again.rms < BETTER_BASE * first.fit.rms else None

@@ -77,7 +77,10 @@ def gain_of(
     centre = float(np.log(ratio))
     return Gain(
         100.0 * (1.0 - ratio),
-        (100.0 * (1.0 - float(np.exp(centre + half))), 100.0 * (1.0 - float(np.exp(centre - half)))),
+        (
+            100.0 * (1.0 - float(np.exp(centre + half))),
+            100.0 * (1.0 - float(np.exp(centre - half))),
+        ),
     )
 
 

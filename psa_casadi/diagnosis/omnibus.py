@@ -70,9 +70,7 @@ def _fisher_line(white: FloatArray) -> float:
     return float(min(1.0, count * (1.0 - share) ** (count - 1)))
 
 
-def _features(
-    white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour
-) -> float:
+def _features(white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour) -> float:
     """F test of the residual on u, u^2, u^3, sgn(u'), |u'|, u sgn(u'), a trend and slow waves."""
     u = (voltage - np.mean(voltage)) / (np.ptp(voltage) or 1.0)
     rate = np.gradient(u)

@@ -34,8 +34,14 @@ class Score:
 
     @property
     def start(self) -> float:
-        """Gain to start a fit from: the linear estimate, or the finite step that was tried."""
-        return self.direction.unit_gain if self.direction.finite else self.gain
+        """Gain to start a fit from: the linear estimate, or the finite step that was tried.
+
+        A base fit without a one-sided effect may overshoot in its place, so that the estimate has
+        the wrong sign; the fit then starts from an ordinary size.
+        """
+        if self.direction.finite or (self.direction.one_sided and self.gain <= 0):
+            return self.direction.unit_gain
+        return self.gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +76,7 @@ def screen(fit: Fit, trials: Sequence[Direction], lengths: Sequence[int]) -> Scr
     t = unit.T @ residual / colour.level
     scores = []
     for k, direction in enumerate(trials):
-        allowed = usable[k] and (t[k] > 0 or not (direction.one_sided or direction.finite))
+        allowed = usable[k] and (t[k] > 0 or not direction.finite)
         scores.append(
             Score(
                 direction,

@@ -10,24 +10,25 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.errors_of import held_out_residuals, rms
 from psa_casadi.diagnosis.screening import Score, Screening
 from psa_casadi.errors import PsaError
+from psa_casadi.experiment.drive import at_harmonic
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.identify import FIXED
-from psa_casadi.identification.starting import ordinary_loop
+from psa_casadi.identification.starting import ordinary_values
 
 FloatArray = npt.NDArray[np.float64]
 
 #: How many effects are fitted fully in each round, and how many starts each gets.
 FULL_FITS = 4
-_STARTS = 1
+_STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
-_ITERATIONS = 30
+_QUICK, _ITERATIONS = 8, 30
 #: Tolerance of the stepper while searching; the final fit uses that of every fit.
-_SEARCH_RTOL = 1e-5
+_QUICK_RTOL, _SEARCH_RTOL = 1e-4, 1e-5
 #: Evidence (in units of the log-likelihood) within which two effects cannot be told apart.
 MARGIN = 10.0
-#: Share of the held-out excess power that an effect must remove to be added.
+#: Share of the excess power that an effect must remove to be added.
 WORTHWHILE = 0.25
 #: ... and the held-out rms must fall at least to this share: less is of no use to anybody.
 NOTICEABLE = 0.98
@@ -58,27 +59,36 @@ def leading(screening: Screening) -> list[tuple[str, list[Score]]]:
         if name not in starts or len(starts[name]) >= _STARTS:
             continue
         known = [s.direction.values for s in starts[name]]
-        if score.decrease >= 0.5 * best[name].decrease and (
+        if score.decrease >= 0.3 * best[name].decrease and (
             score.direction.values not in known or score.direction.finite
         ):
             starts[name].append(score)
     return list(starts.items())
 
 
+_Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
+
+
 def extend(
     before: Fit, experiments: Sequence[Experiment], scores: Sequence[Score], inflation: float
 ) -> Extension | None:
-    """Fit the model with one more effect from the best directions; None where every fit fails."""
+    """Fit the model quickly with one more effect from its best directions; None if every fit fails."""
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
-    return _best_of(before, experiments, scores[0].direction.effect, starts, {}, inflation)
+    quick = _quick(before, experiments, scores[0].direction.effect, starts, {})
+    return (
+        None
+        if quick is None
+        else _extension(before, quick, scores[0].direction.effect, experiments, inflation)
+    )
 
 
 def extend_afresh(
     before: Fit, experiments: Sequence[Experiment], first: Extension, inflation: float
 ) -> Extension:
-    """Fit an effect again from an ordinary loop and both signs of its gain; return the better.
+    """Fit an effect again from an ordinary base and both signs of its gain; return the better.
 
-    A base fit without the effect has bent its loop to imitate it, and may hold the search there.
+    A base fit without the effect has bent its loop and its lags to imitate it, and may hold the
+    search there.
     """
     effect = first.effect
     gain = next(p for p in effect.parameters if p.name == effect.gain)
@@ -88,49 +98,73 @@ def extend_afresh(
         for n, grid in effect.probe.items()
     }
     memory = tuple(before.memory(r) for r in range(len(experiments)))
-    starts = [(values, sign * size, memory) for sign in (1.0, -1.0) if sign > 0 or gain.bounds[0] < 0]
-    loop = ordinary_loop(before.model)
-    again = _best_of(before, experiments, effect, starts, loop, inflation)
-    return again if again is not None and again.fit.cost < first.fit.cost else first
+    starts = [
+        (values, sign * size, memory) for sign in (1.0, -1.0) if sign > 0 or gain.bounds[0] < 0
+    ]
+    ordinary = ordinary_values(before.model, min(e.record.sample_time for e in experiments))
+    quick = _quick(before, experiments, effect, starts, ordinary)
+    if quick is None:
+        return first
+    again = polish(
+        before, _extension(before, quick, effect, experiments, inflation), experiments, inflation
+    )
+    return again if again.fit.cost < first.fit.cost else first
+
+
+def polish(
+    before: Fit, extension: Extension, experiments: Sequence[Experiment], inflation: float
+) -> Extension:
+    """Continue an extension's fit until it converges, first loosely, then at the fits' tolerance."""
+    current = extension.fit
+    for rtol, tolerance in ((_SEARCH_RTOL, 1e-3), (FIT_RTOL, 1e-4)):
+        try:
+            current = fit(
+                current.model,
+                experiments,
+                current.unknowns.names,
+                sigma=before.sigma,
+                start_memory=[current.memory(r) for r in range(len(experiments))],
+                evaluations=_ITERATIONS,
+                tolerance=tolerance,
+                rtol=rtol,
+            )
+        except PsaError:
+            return extension
+    return _extension(before, current, extension.effect, experiments, inflation)
 
 
 def _declared(effect: Component, name: str) -> float:
     return next(p.value for p in effect.parameters if p.name == name)
 
 
-_Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
+def _extension(
+    before: Fit,
+    found: Fit,
+    effect: Component,
+    experiments: Sequence[Experiment],
+    inflation: float,
+) -> Extension:
+    predicted = tuple(found.predicted(experiments))
+    return Extension(
+        effect=effect,
+        fit=found,
+        evidence=evidence(before, found, inflation),
+        holdout_rms=rms(np.concatenate(held_out_residuals(experiments, predicted))),
+        predicted=predicted,
+    )
 
 
-def _best_of(
+def _quick(
     before: Fit,
     experiments: Sequence[Experiment],
     effect: Component,
     starts: Sequence[_Start],
-    loop: dict[str, float],
-    inflation: float,
-) -> Extension | None:
-    fits = [_fit_from(before, experiments, effect, start, loop) for start in starts]
+    reset: dict[str, float],
+) -> Fit | None:
+    """A few iterations from every start; the best of them."""
+    fits = [_fit_from(before, experiments, effect, start, reset) for start in starts]
     found = [f for f in fits if f is not None]
-    if not found:
-        return None
-    best = min(found, key=lambda f: f.cost)
-    final = fit(
-        best.model,
-        experiments,
-        best.unknowns.names,
-        sigma=before.sigma,
-        start_memory=[best.memory(r) for r in range(len(experiments))],
-        evaluations=_ITERATIONS,
-        tolerance=1e-4,
-    )
-    predicted = tuple(final.predicted(experiments))
-    return Extension(
-        effect=effect,
-        fit=final,
-        evidence=evidence(before, final, inflation),
-        holdout_rms=rms(np.concatenate(held_out_residuals(experiments, predicted))),
-        predicted=predicted,
-    )
+    return min(found, key=lambda f: f.cost) if found else None
 
 
 def evidence(before: Fit, after: Fit, inflation: float) -> float:
@@ -148,7 +182,7 @@ def _fit_from(
     experiments: Sequence[Experiment],
     effect: Component,
     start: _Start,
-    loop: dict[str, float],
+    reset: dict[str, float],
 ) -> Fit | None:
     values, gain, memory = start
     names = list(before.unknowns.names)
@@ -158,14 +192,14 @@ def _fit_from(
         value = float(np.clip(share * gain, 0.9 * low, 0.9 * high))
         try:
             return fit(
-                before.model.with_effect(effect, {**values, **loop, effect.gain or "": value}),
+                before.model.with_effect(effect, {**values, **reset, effect.gain or "": value}),
                 experiments,
                 names,
                 sigma=before.sigma,
                 start_memory=memory,
-                evaluations=_ITERATIONS,
+                evaluations=_QUICK,
                 tolerance=1e-3,
-                rtol=_SEARCH_RTOL,
+                rtol=_QUICK_RTOL,
             )
         except PsaError:
             continue
@@ -173,21 +207,50 @@ def _fit_from(
 
 
 def choose(
-    extensions: Sequence[Extension], before_holdout: float, floor: float
+    extensions: Sequence[Extension],
+    experiments: Sequence[Experiment],
+    before: Fit,
+    before_holdout: float,
+    floor: float,
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
-    Worth having: evidence, and at least `WORTHWHILE` of the held-out power above the noise `floor`
-    removed. The order is that of the evidence; within the margin the better prediction leads.
+    Worth having: evidence; the effect in character; at least `WORTHWHILE` of the training residual's
+    power above the noise `floor` removed; and held-out data predicted better, to `NOTICEABLE`. The
+    order is that of the evidence; within the margin the better prediction leads.
     """
-    excess = before_holdout**2 - floor**2
+    excess = before.rms**2 - floor**2
     good = [
         e
         for e in extensions
-        if e.evidence > 0 and before_holdout**2 - e.holdout_rms**2 > WORTHWHILE * excess
+        if e.evidence > 0
+        and not out_of_character(e, experiments)
+        and before.rms**2 - e.fit.rms**2 > WORTHWHILE * excess
         and e.holdout_rms < NOTICEABLE * before_holdout
     ]
     good.sort(key=lambda e: -e.evidence)
     close = [e for e in good if good[0].evidence - e.evidence < MARGIN]
     close.sort(key=lambda e: e.holdout_rms)
     return close + [e for e in good if e not in close]
+
+
+def out_of_character(extension: Extension, experiments: Sequence[Experiment]) -> bool:
+    """Whether the data ask for something that is not this effect.
+
+    A parameter pushed to the end of its range, or a tone at a harmonic of the drive.
+    """
+    values = extension.fit.model.values
+    tone = extension.effect.tone
+    if tone is not None and any(at_harmonic(values[tone], e.record) for e in experiments):
+        return True
+    for p in extension.effect.parameters:
+        if p.name in FIXED or p.name == extension.effect.gain:
+            continue
+        low, high = p.bounds
+        margin = 1e-3 * (high - low) if not p.log else 0.0
+        value = values[p.name]
+        if p.log and (value < 1.01 * low or value > high / 1.01):
+            return True
+        if not p.log and (value <= low + margin or value >= high - margin):
+            return True
+    return False

@@ -142,7 +142,7 @@ def _candidates(first: "Round", floor: float) -> tuple[Candidate, ...]:
     rows = []
     for name, score in first.screening.best_by_effect().items():
         if name in fitted:
-            gone = base - float(np.sum(fitted[name].fit.residuals**2))
+            gone = base - float(np.sum(fitted[name].fit.residuals ** 2))
             rows.append(Candidate(name, min(1.0, gone / excess), fitted[name].evidence, True))
         else:
             gone = score.decrease * first.screening.colour.level**2

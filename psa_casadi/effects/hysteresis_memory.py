@@ -7,8 +7,8 @@ from psa_casadi.variables import Parameter, State, Values
 
 #: Exponent of the smooth stop; 2 bends gently, infinity is the ideal stop operator.
 _SHARPNESS = 4.0
-#: Narrowest first threshold, over rated voltage. The memory of a ferroelectric is spread over the loop;
-#: a dwell much narrower than the loop is friction or backlash and not this effect.
+#: Narrowest first threshold, over rated voltage. The memory of a ferroelectric is spread over the
+#: loop; a dwell much narrower than the loop is friction or backlash and not this effect.
 _NARROWEST = 0.025
 #: Thresholds of the elements over the first one.
 _RATIOS = (1.0, 2.0, 4.0)
@@ -80,7 +80,7 @@ HYSTERESIS_MEMORY = Component(
             "memory_threshold",
             0.04,
             "1",
-            (1e-3, 1.0),
+            (_NARROWEST, 1.0),
             "first threshold over rated voltage",
             log=True,
         ),

@@ -26,7 +26,12 @@ RATE_INDEPENDENT_ASYMMETRY = Component(
     parameters=(
         Parameter("delta_r", 0.0, "N/V2", (-1e5, 1e5), "rate-independent asymmetry", scale=_scale),
         Parameter(
-            "asymmetry_bend", 0.0, "1", (-100.0, 100.0), "share that follows the hysteresis force", scale=1.0
+            "asymmetry_bend",
+            0.0,
+            "1",
+            (-100.0, 100.0),
+            "share that follows the hysteresis force",
+            scale=1.0,
         ),
     ),
     equations=_equations,

@@ -1,39 +1,68 @@
 """Sensor delay: the measured displacement arrives late by a fixed time."""
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, State
 
-#: Smallest time constant of the chain [s]; keeps it defined at zero delay.
+#: Smallest time constant of a section [s]; keeps it defined at zero delay.
 _FLOOR = 1e-6
 
 
+def _section(
+    delay: Expression, y: Expression, a: Expression, b: Expression
+) -> tuple[Expression, ...]:
+    """Return (a', b', output) of one second-order Pade section, the identity at zero delay.
+
+    a is y behind 1/(1 + s T/2 + s^2 T^2/12) and b = T a', so that the output y - b is y behind
+    (1 - s T/2 + s^2 T^2/12)/(1 + s T/2 + s^2 T^2/12).
+    """
+    time = delay + _FLOOR
+    return b / time, 12 / time * (y - a - b / 2), y - delay / time * b
+
+
 def _equations(s: Symbols) -> Equations:
-    # each section delays by half: (1 - sT/4)/(1 + sT/4), written so that T = 0 is the identity
-    section = s.sensor_delay / 4 + _FLOOR
-    share = s.sensor_delay / 2 / section
-    first = s.displacement - share * (s.displacement - s.z_d1)
-    total = first - share * (first - s.z_d2)
+    half = s.sensor_delay / 2
+    a1, b1, first = _section(half, s.displacement, s.z_d1, s.r_d1)
+    a2, b2, second = _section(half, first, s.z_d2, s.r_d2)
     return Equations(
-        der={"z_d1": (s.displacement - s.z_d1) / section, "z_d2": (first - s.z_d2) / section},
-        add={"measured_displacement": total - s.displacement},
+        der={"z_d1": a1, "r_d1": b1, "z_d2": a2, "r_d2": b2},
+        add={"measured_displacement": second - s.displacement},
+    )
+
+
+def _states(index: int) -> tuple[State, State]:
+    return (
+        State(
+            f"z_d{index}",
+            "m",
+            f"filtered input of section {index}",
+            stroke_scale,
+            display_unit="um",
+        ),
+        State(
+            f"r_d{index}",
+            "m",
+            "its rate times the section's delay",
+            stroke_scale,
+            display_unit="um",
+        ),
     )
 
 
 SENSOR_DELAY = Component(
     name="sensor_delay",
     description="the measured displacement arrives late by a fixed time",
-    source="Pade approximation of exp(-s T), two first-order sections in series",
+    source="Pade approximation of exp(-s T), two second-order sections in series",
     belongs_to="sensor",
     gain="sensor_delay",
-    equation_text="x_m(t) = x(t - T), as ((1 - s T/4)/(1 + s T/4))^2",
+    finite_step=(0.0, 5.0, 20.0, 60.0),
+    equation_text=(
+        "x_m(t) = x(t - T), as P(s T/2)^2 with P(q) = (1 - q/2 + q^2/12)/(1 + q/2 + q^2/12)"
+    ),
     parameters=(
         Parameter("sensor_delay", 0.0, "s", (0.0, 0.1), "delay of the sensor", "ms", scale=1e-4),
     ),
-    states=(
-        State("z_d1", "m", "first section of the delay", stroke_scale, display_unit="um"),
-        State("z_d2", "m", "second section of the delay", stroke_scale, display_unit="um"),
-    ),
+    states=(*_states(1), *_states(2)),
     equations=_equations,
     looks_like="phase linear in frequency; the residual follows the displacement's rate",
 )

@@ -46,7 +46,7 @@ SLOW_CREEP = Component(
             "creep_gain",
             0.0,
             "1",
-            (-0.2, 0.5),
+            (0.0, 0.5),
             "creep per decade of time over elongation",
             scale=0.01,
         ),

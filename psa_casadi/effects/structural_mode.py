@@ -27,6 +27,7 @@ STRUCTURAL_MODE = Component(
     description="a further resonance, of the mount or the guide",
     source="modal superposition, one second-order mode driven by the output mass",
     gain="mode_gain",
+    tone="mode_frequency",
     equation_text=(
         "q'' + 2 zeta w q' + w^2 q = w^2 x_tip,  x gains mode_gain q,  w = 2 pi mode_frequency"
     ),

@@ -36,10 +36,10 @@ def whole(record: Record) -> Experiment:
 def split(record: Record, share: float = HELD_OUT_SHARE) -> Experiment:
     """Hold out the last `share` of a record, from the voltage reversal nearest to that point on.
 
-    A segment between two reversals is never cut, unless no reversal lies within a tenth of the record
-    around the point.
+    A segment between two reversals is never cut, unless no reversal lies within a tenth of the
+    record around the point.
     """
-    point = int(round((1.0 - share) * record.n))
+    point = round((1.0 - share) * record.n)
     turns = reversals(record.voltage)
     near = turns[np.abs(turns - point) <= 0.1 * record.n]
     if len(near):
@@ -49,7 +49,7 @@ def split(record: Record, share: float = HELD_OUT_SHARE) -> Experiment:
 
 
 def reversals(voltage: FloatArray) -> npt.NDArray[np.int64]:
-    """Indices of the samples at which the voltage turns, plateaus and noise of 1e-4 of its range aside."""
+    """Return the samples at which the voltage turns, noise of 1e-4 of its range aside."""
     threshold = 1e-4 * float(np.ptp(voltage))
     turns, direction, extreme = [], 0, 0
     for k, v in enumerate(voltage):

@@ -1,5 +1,6 @@
 """The check of an FMU: is it valid, does it behave, does it agree with its model."""
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,7 +62,7 @@ class CheckReport:
         return tuple(row for row in self.rows if not row.passed)
 
 
-def check_fmu(path: Path, model: Model | None = None) -> CheckReport:
+def check_fmu(path: str | os.PathLike[str], model: Model | None = None) -> CheckReport:
     """Check an FMU: description, calling sequences, dependencies, derivatives, trajectories.
 
     It is compared with `model`, else with the model it carries (resources/model.json), else with
@@ -70,6 +71,7 @@ def check_fmu(path: Path, model: Model | None = None) -> CheckReport:
 
     Raises InputError if the file is no FMU or has no binary for this machine.
     """
+    path = Path(path)
     with Fmu(path) as fmu:
         rows = [_count("description valid", validate_fmu, str(path))]
         rows.append(_count("functions present", missing_functions, fmu))

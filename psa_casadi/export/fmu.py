@@ -1,5 +1,6 @@
 """An FMU: description, binaries and sources of a model in one archive of fixed bytes."""
 
+import os
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 
 def export_fmu(
     model: Model,
-    path: Path,
+    path: str | os.PathLike[str],
     *,
     name: str | None = None,
     include_sensor: bool = False,
@@ -57,7 +58,7 @@ def export_fmu(
         )
     with atomic_path(path) as temporary:
         write_archive(temporary, entries)
-    return path
+    return Path(path)
 
 
 def write_archive(path: Path, entries: Mapping[str, bytes]) -> None:

@@ -1,0 +1,1 @@
+"""Parameters from records: prediction-error fits, and what the records determine."""

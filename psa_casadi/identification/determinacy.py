@@ -1,7 +1,8 @@
-"""What the data determine: intervals, correlations, and parameters that stay where the prior put them."""
+"""What the data determine: intervals, correlations, and parameters that the prior holds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 import numpy.typing as npt
@@ -12,14 +13,14 @@ from psa_casadi.variables import Interval
 
 FloatArray = npt.NDArray[np.float64]
 
-#: A parameter whose estimate is wider than this, in ordinary changes (or ln units), is undetermined.
+#: A parameter with a standard error above this, in ordinary changes or ln units, is undetermined.
 DETERMINED_WIDTH = 0.5
 _NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
 class Determinacy:
-    """Intervals (95 %), correlation matrix (k, k) in the order of `names`, and what is left open."""
+    """Intervals (95 %), correlations (k, k) in the order of `names`, and what is left open."""
 
     names: tuple[str, ...]
     intervals: Mapping[str, Interval]
@@ -41,7 +42,7 @@ def determinacy(fit: Fit) -> Determinacy:
     covariance = covariance_of(fit)
     slopes = unknowns.slopes(fit.theta)
     of_values = slopes @ covariance[:count, :count] @ slopes.T
-    errors = np.sqrt(np.diag(of_values))
+    errors: FloatArray = np.sqrt(np.diag(of_values))
     intervals, undetermined, on_bound = {}, [], []
     for k, name in enumerate(unknowns.names):
         value, half = fit.model.values[name], _NORMAL_95 * errors[k]
@@ -56,7 +57,7 @@ def determinacy(fit: Fit) -> Determinacy:
             undetermined.append(name)
         if min(value - unknowns.low[k], unknowns.high[k] - value) <= 1e-6 * abs(unknowns.scale[k]):
             on_bound.append(name)
-    scale = np.outer(errors, errors)
+    scale: FloatArray = np.outer(errors, errors)
     return Determinacy(
         names=unknowns.names,
         intervals=intervals,
@@ -72,11 +73,10 @@ def covariance_of(fit: Fit) -> FloatArray:
     weights = residual_weights(fit)
     scaled = fit.jacobian / weights[:, None]
     information = scaled.T @ scaled + np.diag(1.0 / fit.unknowns.prior**2)
-    inverse: FloatArray = np.linalg.pinv(information, hermitian=True)
-    return inverse
+    return np.linalg.pinv(information, hermitian=True).astype(np.float64)
 
 
 def residual_weights(fit: Fit) -> FloatArray:
     """Standard deviation of every residual as the fit left it, inflated for correlation."""
-    level = max(fit.rms, min(fit.sigma)) * np.sqrt(correlation_inflation(fit.residuals))
+    level = max(fit.rms, min(fit.sigma)) * sqrt(correlation_inflation(fit.residuals))
     return np.full(len(fit.residuals), level)

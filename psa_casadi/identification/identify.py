@@ -1,4 +1,4 @@
-"""Identify a stack from measured records: start, several shapes of loop, what can be told besides."""
+"""Identify a stack from records: start, several shapes of loop, what can be told besides."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -113,7 +113,15 @@ def fit_base(
         progress(f"base fit, start {index + 1}")
         try:
             candidates.append(
-                fit(model, experiments, free, sigma=sigma, start=start, evaluations=_QUICK, rtol=1e-4)
+                fit(
+                    model,
+                    experiments,
+                    free,
+                    sigma=sigma,
+                    start=start,
+                    evaluations=_QUICK,
+                    rtol=1e-4,
+                )
             )
         except PsaError:
             continue
@@ -136,9 +144,7 @@ def refit(previous: Fit, experiments: Sequence[Experiment], free: Sequence[str])
     """Continue a fit from where it stands, with the noise level its residuals suggest."""
     sigma = _residual_noise(previous, experiments)
     memory = [previous.memory(r) for r in range(len(experiments))]
-    return fit(
-        previous.model, experiments, free, sigma=sigma, start_memory=memory, evaluations=150
-    )
+    return fit(previous.model, experiments, free, sigma=sigma, start_memory=memory, evaluations=150)
 
 
 def _residual_noise(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
@@ -158,9 +164,7 @@ def _with_fast(best: Fit, experiments: Sequence[Experiment], free: list[str]) ->
         return best
     memory = [best.memory(r) for r in range(len(experiments))]
     try:
-        wider = fit(
-            best.model, experiments, [*free, *told], sigma=best.sigma, start_memory=memory
-        )
+        wider = fit(best.model, experiments, [*free, *told], sigma=best.sigma, start_memory=memory)
     except PsaError:
         return best
     needed = len(told) * np.log(len(best.residuals))
@@ -189,12 +193,14 @@ def _warnings(best: Fit, found: Determinacy) -> tuple[str, ...]:
     sentences = []
     if not best.converged:
         sentences.append("The fit was cut off before it converged; its values are not final.")
-    for name in found.on_bound:
-        sentences.append(f"'{name}' sits on a bound of its range; its interval means nothing.")
-    for name in found.undetermined:
-        sentences.append(f"'{name}' is not determined by these records.")
+    sentences += [
+        f"'{name}' sits on a bound of its range; its interval means nothing."
+        for name in found.on_bound
+    ]
+    sentences += [f"'{name}' is not determined by these records." for name in found.undetermined]
     return tuple(sentences)
 
 
 def version() -> str:
+    """Return the version of the package, which a model file carries."""
     return __version__

@@ -1,12 +1,13 @@
 """Levenberg-Marquardt as a trust region within bounds, with an active set.
 
-scipy's `least_squares` was measured first: its interior method (`trf`) crawls where a parameter sits
-on its bound, as the Bouc-Wen exponent n does on piezo loops, and `dogbox` stops early in the loop's
-curved valley.
+scipy's `least_squares` was measured first: its interior method (`trf`) crawls where a parameter
+sits on its bound, as the Bouc-Wen exponent n does on piezo loops, and `dogbox` stops early in the
+loop's curved valley.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,8 @@ Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 _FIRST_RADIUS = 1.0
 _SMALLEST_RADIUS = 1e-6
 _BISECTIONS = 60
+#: Changes of the active set per coordinate; two or three are ordinary.
+_ACTIVE_SETS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,8 @@ def minimise(
     """Minimise |r(theta)|^2 within bounds; None if the start cannot be evaluated.
 
     Each step minimises |r + J step|^2 within a radius (Levenberg's damping, found by bisection;
-    Moré 1978) and the bounds, and is accepted if the cost falls; the radius follows the ratio of actual to predicted decrease.
+    Moré 1978) and the bounds, and is accepted if the cost falls; the radius follows the ratio of
+    actual to predicted decrease.
     Converged when two steps in a row lower the cost by less than `tolerance` of it, or no radius
     lowers it at all.
     """
@@ -82,21 +86,60 @@ def minimise(
 def _bounded_step(
     gradient: FloatArray, normal: FloatArray, radius: float, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return the step within the radius and between low and high.
+    """Return the step within the radius and between low and high (low <= 0 <= high).
 
-    Coordinates that the step would carry past a bound are set onto it and the others solved again,
-    until none crosses.
+    The damped minimum in the box gets shorter as the damping grows; bisection finds the damping
+    that makes it as long as the radius.
+    """
+    step = _step(gradient, normal, radius)
+    if np.all((step >= low) & (step <= high)):
+        return step
+    identity = np.eye(len(gradient))
+    least = 1e-14 * max(float(np.trace(normal)), 1e-300)
+    step = _in_box(gradient, normal + least * identity, low, high)
+    if np.linalg.norm(step) <= radius:
+        return step
+    small, large = least, float(np.linalg.norm(gradient)) / radius
+    while large > (1.0 + 1e-3) * small:
+        middle = sqrt(small * large)
+        step = _in_box(gradient, normal + middle * identity, low, high)
+        small, large = (middle, large) if np.linalg.norm(step) > radius else (small, middle)
+    return _in_box(gradient, normal + large * identity, low, high)
+
+
+def _in_box(
+    gradient: FloatArray, normal: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Minimise gradient step + step normal step / 2 between low and high, by active sets.
+
+    Walks from 0 towards the minimum over the free coordinates; the first that meets its bound is
+    held there. At that minimum, the held coordinate that pulls inwards most is let go.
     """
     step = np.zeros_like(gradient)
-    free = np.ones(len(gradient), dtype=bool)
-    while True:
-        shifted = gradient + normal[:, ~free] @ step[~free]
-        step[free] = _step(shifted[free], normal[np.ix_(free, free)], radius)
-        crossing = free & ((step < low) | (step > high))
-        if not crossing.any():
-            return step
-        step[crossing] = np.clip(step, low, high)[crossing]
-        free &= ~crossing
+    free = ((low < 0) | (gradient < 0)) & ((high > 0) | (gradient > 0))
+    for _ in range(_ACTIVE_SETS * len(gradient)):
+        target = step.copy()
+        held = normal[np.ix_(free, ~free)] @ step[~free]
+        target[free] = np.linalg.solve(normal[np.ix_(free, free)], -gradient[free] - held)
+        move = target - step
+        edge = np.where(move > 0, high, low)
+        crossing = free & ((target > high) | (target < low))
+        if crossing.any():
+            shares = np.full(len(step), np.inf)
+            shares[crossing] = (edge[crossing] - step[crossing]) / move[crossing]
+            first = int(np.argmin(shares))
+            step = np.clip(step + shares[first] * move, low, high)
+            step[first] = edge[first]
+            free[first] = False
+            continue
+        step = target
+        pull = gradient + normal @ step
+        inward = np.where(step >= high, pull, -pull)
+        inward[free | (low == high)] = 0.0
+        if np.max(inward, initial=0.0) <= 1e-12 * float(np.max(np.abs(gradient), initial=0.0)):
+            break
+        free[int(np.argmax(inward))] = True
+    return step
 
 
 def _step(gradient: FloatArray, normal: FloatArray, radius: float) -> FloatArray:
@@ -107,8 +150,8 @@ def _step(gradient: FloatArray, normal: FloatArray, radius: float) -> FloatArray
     values = np.maximum(values, 1e-14 * max(float(values[-1]), 1e-300))
     along = -(vectors.T @ gradient)
     if np.linalg.norm(along / values) <= radius:
-        solution: FloatArray = vectors @ (along / values)
-        return solution
+        newton: FloatArray = vectors @ (along / values)
+        return newton
     low, high = 0.0, float(np.linalg.norm(along)) / radius
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -116,5 +159,5 @@ def _step(gradient: FloatArray, normal: FloatArray, radius: float) -> FloatArray
             low = middle
         else:
             high = middle
-    solution = vectors @ (along / (values + high))
-    return solution
+    damped: FloatArray = vectors @ (along / (values + high))
+    return damped

@@ -54,7 +54,7 @@ def predict_record(
     stop: int,
     rtol: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacement (n,), its derivatives by `wanted` parameters (n, k), and by memory (n, m)."""
+    """Return displacement (n,), its derivatives by `wanted` (n, k), and by memory (n, m)."""
     structure = model.structure
     t, u = record.time[:stop], inputs_of(model, record, stop)
     memories = [i for i, s in enumerate(structure.states) if s.memory]

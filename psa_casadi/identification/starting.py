@@ -43,17 +43,13 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "k_L": k_l,
         "h_ref": _HYSTERESIS_SHARE * k_l * span,
         "hold_rate": 1e-3 * span,
-        "tau": float(np.clip(0.7 * sample_time, 1e-6, 0.5)),
-        "R_s": 0.3 * sample_time / _CAPACITANCE,
         "C_p": _CAPACITANCE,
         "k_P": k_p,
         "k_B": _BONDING_RATIO * k_p,
-        "c_P": 0.05 * sample_time * k_p,
-        "c_B": 0.05 * sample_time * _BONDING_RATIO * k_p,
         **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
         "n": LOOP_SHAPES[0]["n"],
     }
-    return compose(BASE, values)
+    return compose(BASE, {**values, **_lags(values, sample_time)})
 
 
 def loop_starts(model: Model) -> list[dict[str, float]]:
@@ -65,10 +61,21 @@ def loop_starts(model: Model) -> list[dict[str, float]]:
     ]
 
 
-def ordinary_loop(model: Model) -> dict[str, float]:
-    """Return an ordinary loop of some 12 % width, scaled to the model's k_L."""
+def ordinary_values(model: Model, sample_time: float) -> dict[str, float]:
+    """Return an ordinary loop, some 12 % wide, and lags below the sampling, to the model's size."""
     k_l = model.values["k_L"]
-    return {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
+    loop = {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
+    return {**loop, **_lags(model.values, sample_time)}
+
+
+def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:
+    """Return lags somewhat below the sampling interval; what is much faster cannot be told."""
+    lags = {
+        "tau": float(np.clip(0.7 * sample_time, 1e-6, 0.5)),
+        "R_s": 0.3 * sample_time / values["C_p"],
+    }
+    lags |= {f"c_{m}": 0.05 * sample_time * values[f"k_{m}"] for m in "PB" if f"k_{m}" in values}
+    return lags
 
 
 def _slope(records: Sequence[Record]) -> float:

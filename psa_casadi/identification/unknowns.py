@@ -1,4 +1,4 @@
-"""What a fit searches: parameters, memories and offsets on scales where a unit is an ordinary change."""
+"""What a fit searches: parameters, memories, offsets, on scales where 1 is an ordinary change."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 LOG_PRIOR = 3.0
 LINEAR_PRIOR = 10.0
 MEMORY_PRIOR = 3.0
-#: Lags beside the creep lag are alike in most records: each stays near its start unless told to move.
+#: Lags beside the creep lag are alike in most records: each stays near its start unless told.
 LAG_PRIOR = 1.0
 _LAGS = ("R_s", "c_P", "c_B", "c")
 _LOOP = ("k_L", "A", "beta", "gamma")
@@ -90,10 +90,10 @@ class Unknowns:
     def coordinates(self, values: Mapping[str, float]) -> FloatArray:
         """Return the theta of the parameters (k,) at the given values."""
         value = np.array([values[n] for n in self.names])
-        ratio = np.where(self.log, np.maximum(value, 1e-300), 1.0) / np.where(self.log, self.reference, 1.0)
-        theta: FloatArray = np.where(
-            self.log, np.log(ratio), (value - self.reference) / self.scale
+        ratio = np.where(self.log, np.maximum(value, 1e-300), 1.0) / np.where(
+            self.log, self.reference, 1.0
         )
+        theta: FloatArray = np.where(self.log, np.log(ratio), (value - self.reference) / self.scale)
         if self.loop is not None:
             where = list(self.loop)
             k_l, a, beta, gamma = value[where]
@@ -126,7 +126,9 @@ class Unknowns:
 
     def offset(self, theta: FloatArray, record: int) -> float:
         """Return the sensor's offset in one record [m]."""
-        return float(theta[len(self.names) + (record + 1) * self.per_record - 1]) * self.offset_scale
+        return (
+            float(theta[len(self.names) + (record + 1) * self.per_record - 1]) * self.offset_scale
+        )
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return lower and upper bounds of theta."""
@@ -146,9 +148,7 @@ class Unknowns:
         return np.concatenate([edges[0], -rest]), np.concatenate([edges[1], rest])
 
 
-def unknowns_of(
-    model: Model, free: Sequence[str], records: int, offset_scale: float
-) -> Unknowns:
+def unknowns_of(model: Model, free: Sequence[str], records: int, offset_scale: float) -> Unknowns:
     """Set up the coordinates around a model's values."""
     parameters = [model.parameter(n) for n in free]
     values: Mapping[str, float] = model.values

@@ -1,6 +1,7 @@
 """MODEL.json: a model by the names of its components, with every value, interval and origin."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +70,15 @@ def loads(text: str, source: str = "MODEL.json") -> Model:
     return model.with_values({}, provenance=_provenance(content, given))
 
 
-def save_model(model: Model, path: Path) -> None:
+def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write MODEL.json, whole or not at all."""
     atomic_write(path, dumps(model))
 
 
-def load_model(path: Path) -> Model:
+def load_model(path: str | os.PathLike[str]) -> Model:
     """Read MODEL.json; raises InputError."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"The model file {path} cannot be read ({error}); give a file that `psa identify`"

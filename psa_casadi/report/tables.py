@@ -9,6 +9,7 @@ from psa_casadi.experiment.split import Experiment
 from psa_casadi.export.check import CheckReport, CheckRow
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
+from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.report.phrases import (
     added,
     interval_text,
@@ -129,6 +130,32 @@ def effect_parameter_table(effect: Component) -> Table:
         note = " (0 removes the effect)" if p.name == effect.gain else ""
         rows.append((p.name, p.unit, number(p.value), bounds, p.description + note))
     return _table(("parameter", "unit", "default", "bounds", "meaning"), rows)
+
+
+def stacks_table(stacks: Iterable[Stack]) -> Table:
+    """Return the named stacks with rated voltage and how many of their figures are assumed."""
+    rows = [
+        (
+            s.name,
+            number(s.values["u_rated"].value),
+            f"{len(s.assumed)} of {len(s.values)}",
+            s.description,
+        )
+        for s in stacks
+    ]
+    return _table(("stack", "rated voltage [V]", "assumed figures", "what it is"), rows)
+
+
+def stack_table(stack: Stack) -> Table:
+    """Return every figure of a stack with its unit, whether it is assumed, and its source."""
+    model = stack_model(stack.name)
+    rows = []
+    for name in model.parameter_names:
+        unit, display = shown_in(model, name)
+        figure = stack.values[name]
+        value = number(convert(figure.value, unit, display), 6)
+        rows.append((name, value, display, "assumed" if figure.assumed else "", figure.source))
+    return _table(("parameter", "value", "unit", "", "source"), rows)
 
 
 def check_table(report: CheckReport) -> Table:

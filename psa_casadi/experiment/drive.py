@@ -1,0 +1,43 @@
+"""The periodicity of a drive voltage: its dominant line and harmonics."""
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.experiment.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+
+_DOMINANT = 0.5
+_SIDE_LINES = 5
+_ORDERS = 12
+
+
+def drive_frequency(record: Record) -> float | None:
+    """Return the frequency [Hz] of the line that holds most of the voltage's alternating power.
+
+    None where no line, with five neighbours on each side for a modulated amplitude, holds half of it.
+    """
+    even = np.linspace(record.time[0], record.time[-1], record.n)
+    v = np.interp(even, record.time, record.voltage)
+    power = np.abs(np.fft.rfft((v - np.mean(v)) * np.hanning(record.n))) ** 2
+    power[0] = 0.0
+    total = float(np.sum(power))
+    if total <= 0:
+        return None
+    peak = int(np.argmax(power))
+    low, high = max(1, peak - _SIDE_LINES), peak + _SIDE_LINES + 1
+    share = float(np.sum(power[low:high])) / total
+    return peak / record.duration if share > _DOMINANT and peak > _SIDE_LINES else None
+
+
+def at_harmonic(frequency: float, record: Record) -> bool:
+    """Whether a frequency [Hz] lies on one of the first harmonics of a periodic drive.
+
+    The tolerance is three lines of the record's spectrum, or 5 % of the drive's frequency.
+    """
+    drive = drive_frequency(record)
+    if drive is None:
+        return False
+    order = round(frequency / drive)
+    width = max(3.0 / record.duration, 0.05 * drive)
+    return 1 <= order <= _ORDERS and abs(frequency - order * drive) < width

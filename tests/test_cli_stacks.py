@@ -1,0 +1,106 @@
+"""Named stacks from the command line and from Python."""
+
+import re
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import psa_casadi
+from psa_casadi.cli.app import app
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import read_record, sine, time_grid, write_record
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.simulation.simulate import simulate_record
+
+
+def psa(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+@pytest.fixture
+def planned(tmp_path: Path) -> Path:
+    path, time = tmp_path / "planned.csv", time_grid(0.1, 1e-3)
+    write_record(path, {"time [s]": time, "voltage [V]": sine(time, 0.0, 80.0, 20.0)})
+    return path
+
+
+@pytest.mark.parametrize("name", sorted(STACKS))
+def test_every_figure_of_a_stack_is_shown_with_its_source(name: str) -> None:
+    shown = psa("stacks", name)
+    assert shown.exit_code == 0
+    assert STACKS[name].description in shown.stdout
+    for parameter, figure in STACKS[name].values.items():
+        line = re.search(rf"^{parameter} .*$", shown.stdout, re.MULTILINE)
+        assert line is not None
+        assert line[0].endswith(figure.source)
+        assert (" assumed " in line[0].removesuffix(figure.source)) == figure.assumed
+
+
+def test_stacks_are_listed() -> None:
+    listed = psa("stacks").stdout
+    for name, stack in STACKS.items():
+        line = re.search(rf"^{re.escape(name)} .*$", listed, re.MULTILINE)
+        assert line is not None
+        assert f"{len(stack.assumed)} of 19" in line[0]
+    assert psa("stacks", "--quiet").stdout.split() == list(STACKS)
+    assert psa("stacks", "demo", "--quiet").stdout == "demo\n"
+
+
+def test_simulate_takes_a_stack(planned: Path, tmp_path: Path) -> None:
+    out = tmp_path / "motion.csv"
+    done = psa("simulate", "--stack", "P-885.51", "--input", planned, "-o", out)
+    assert done.exit_code == 0, done.output
+    record = read_record(planned, need_displacement=False)
+    expected = simulate_record(stack_model("P-885.51"), record).displacement
+    found = read_record(out).displacement
+    assert found is not None
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-18)
+    assert 10e-6 < np.ptp(found) < 13e-6
+
+
+def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> None:
+    fmu = tmp_path / "p.fmu"
+    done = psa("export", "fmu", "--stack", "P-885.51", "-o", fmu)
+    assert done.exit_code == 0, done.output
+    description = fmpy.read_model_description(str(fmu))
+    assert description.modelName == "P_885_51"
+    start = {v.name: v.start for v in description.modelVariables}
+    assert float(start["k_B"]) == STACKS["P-885.51"].values["k_B"].value
+    assert psa_casadi.check_fmu(str(fmu), stack_model("P-885.51")).passed
+
+
+def test_model_files_and_fmus_are_also_named_by_text(tmp_path: Path) -> None:
+    path, fmu = str(tmp_path / "model.json"), str(tmp_path / "stack.fmu")
+    psa_casadi.save_model(stack_model("PTBS200"), path)
+    model = psa_casadi.load_model(path)
+    assert model.values == stack_model("PTBS200").values
+    assert "16 of its 19 figures are assumed" in model.provenance.notes[0]
+    assert psa_casadi.export_fmu(model, fmu) == Path(fmu)
+    report = psa_casadi.check_fmu(fmu, model)
+    assert (report.path, report.passed) == (Path(fmu), True)
+
+
+def test_a_wrong_choice_of_model_is_one_sentence(planned: Path, tmp_path: Path) -> None:
+    fmu = tmp_path / "x.fmu"
+    commands = (
+        ("simulate", "--input", planned, "-o", tmp_path / "y.csv"),
+        ("export", "fmu", "-o", fmu),
+    )
+    for command in commands:
+        for choice, expected in (
+            ((), "No model is given; add --model MODEL.json, or --stack NAME"),
+            (("--stack", "p885"), "did you mean P-885.51?"),
+            (("--stack", "xyzzy"), "there are PTBS200, WYDS0808020"),
+            (("--stack", "demo", "--model", tmp_path / "m.json"), "are both given"),
+        ):
+            result = psa(*command, *choice)
+            assert result.exit_code == 2
+            assert expected in result.stderr
+            assert len(result.stderr.splitlines()) == 1
+    assert psa("stacks", "xyzzy").exit_code == 2
+    assert list(tmp_path.iterdir()) == [planned]
+    with pytest.raises(InputError, match="no stack named"):
+        stack_model("PTBS2")

@@ -1,0 +1,177 @@
+"""The parts of a fit: its coordinates, exact derivatives, and the samples that count."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, multisine, time_grid
+from psa_casadi.experiment.split import Experiment, whole
+from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.identify import free_parameters, identify
+from psa_casadi.identification.prediction import predict
+from psa_casadi.identification.unknowns import Unknowns, unknowns_of
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.simulation.simulate import simulate
+
+FloatArray = NDArray[np.float64]
+
+SIGMA = 2e-8
+
+
+def model_with(*effects: str) -> Model:
+    model = stack_model("demo").with_values({"delta": -0.5, "n": 1.3})
+    for name in effects:
+        model = model.with_effect(EFFECTS[name])
+    gains = {"creep_gain": 0.04, "delta_r": 0.02}
+    return model.with_values({k: v for k, v in gains.items() if k in model.values})
+
+
+def record_of(model: Model, seed: int, samples: int = 400) -> Record:
+    time = time_grid(2e-3 * samples, 2e-3)
+    voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
+    x = simulate(model, time, voltage).displacement
+    white = np.random.default_rng(seed).standard_normal(samples)
+    return Record(f"r{seed}", time, voltage, x + 1e-6 * seed + SIGMA * white)
+
+
+def moved(unknowns: Unknowns, seed: int) -> FloatArray:
+    """Return a point some tenths of a unit away from the reference, within the bounds."""
+    theta: FloatArray = 0.3 * np.random.default_rng(seed).standard_normal(unknowns.size)
+    return np.clip(theta, *unknowns.bounds())
+
+
+@pytest.mark.parametrize("effects", [(), ("slow_creep", "rate_independent_asymmetry")])
+@pytest.mark.parametrize("seed", range(3))
+def test_coordinates_invert_values_and_slopes_are_their_derivatives(
+    effects: tuple[str, ...], seed: int
+) -> None:
+    model = model_with(*effects)
+    unknowns = unknowns_of(model, free_parameters(model), 2, 1e-6)
+    count = len(unknowns.names)
+    at_reference = unknowns.values(np.zeros(unknowns.size))
+    for name in unknowns.names:
+        assert at_reference[name] == pytest.approx(model.values[name], rel=1e-14)
+    theta = moved(unknowns, seed)
+    values = unknowns.values(theta)
+    assert unknowns.loop is not None
+    np.testing.assert_allclose(unknowns.coordinates(values), theta[:count], rtol=0, atol=1e-10)
+    slopes = unknowns.slopes(theta)
+    for k in range(count):
+        step = 1e-6 * np.eye(unknowns.size)[k]
+        up, down = (np.array(list(unknowns.values(theta + h).values())) for h in (step, -step))
+        size = np.abs(np.array(list(values.values())))
+        assert np.all(np.abs((up - down) / 2e-6 - slopes[:, k]) <= 1e-7 * (size + 1e-3))
+
+
+def test_without_the_whole_loop_free_each_parameter_is_its_own_coordinate() -> None:
+    model = model_with()
+    unknowns = unknowns_of(model, ["k_L", "A", "tau"], 1, 1e-6)
+    assert unknowns.loop is None
+    theta = np.array([0.2, -0.5, -0.1, 0.0, 0.0])
+    values = unknowns.values(theta)
+    assert values["k_L"] == pytest.approx(model.values["k_L"] * np.exp(0.2), rel=1e-14)
+    assert values["tau"] == pytest.approx(model.values["tau"] * np.exp(-0.1), rel=1e-14)
+    scale = model.parameter("A").typical(model.values)
+    assert values["A"] == pytest.approx(model.values["A"] - 0.5 * scale, rel=1e-14)
+    np.testing.assert_allclose(unknowns.coordinates(values), theta[:3], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("effects", [(), ("slow_creep", "rate_independent_asymmetry")])
+def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, ...]) -> None:
+    """Two runs differ by up to 4e-7 of the range beside the step, for they step differently."""
+    model = model_with(*effects)
+    experiments = [whole(record_of(model, seed, 120)) for seed in (1, 2)]
+    unknowns = unknowns_of(model, free_parameters(model), 2, 1e-6)
+    theta, step = moved(unknowns, 4), 1e-2
+
+    def predicted(point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        parts = predict(model, experiments, unknowns, point, rtol=1e-9)
+        displacement = np.concatenate([p.displacement for p in parts])
+        return displacement, np.vstack([p.jacobian for p in parts])
+
+    x, exact = predicted(theta)
+    assert exact.shape == (240, unknowns.size)
+    for k, h in enumerate(step * np.eye(unknowns.size)):
+        found = (predicted(theta + h)[0] - predicted(theta - h)[0]) / (2 * step)
+        error, size = found - exact[:, k], exact[:, k]
+        assert np.abs(error).max() < 2e-3 * np.abs(size).max() + 1e-6 * np.ptp(x) / step
+        assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(size**2))
+
+
+def test_missing_samples_are_ignored() -> None:
+    """Samples lost to nan count as little as samples that are wild but not used."""
+    model = model_with()
+    record = record_of(model, 1)
+    rng = np.random.default_rng(8)
+    lost = rng.uniform(size=record.n) < 0.3
+    lost[50:80] = True
+    assert record.displacement is not None
+    y = record.displacement
+    as_nan = replace(record, displacement=np.where(lost, np.nan, y))
+    as_wild = replace(record, displacement=np.where(lost, rng.uniform(-1.0, 1.0, record.n), y))
+    none = np.zeros(record.n, dtype=np.bool_)
+    found = [
+        fitted(model, [e]) for e in (whole(as_nan), Experiment(as_wild, ~lost, none), whole(record))
+    ]
+    np.testing.assert_array_equal(found[0].theta, found[1].theta)
+    np.testing.assert_array_equal(found[0].residuals, found[1].residuals)
+    assert len(found[0].residuals) == record.n - np.count_nonzero(lost)
+    assert found[0].rms == pytest.approx(SIGMA, rel=0.1)
+    for name in ("k_L", "A"):
+        assert found[0].model.values[name] == pytest.approx(found[2].model.values[name], rel=0.02)
+    assert found[0].model.values["k_L"] != found[2].model.values["k_L"]
+
+
+def test_identify_takes_a_record_with_gaps() -> None:
+    record = record_of(model_with(), 2)
+    y = np.array(record.displacement)
+    y[::7] = np.nan
+    y[100:140] = np.nan
+    found = identify([replace(record, displacement=y)])
+    assert found.fit.rms == pytest.approx(SIGMA, rel=0.1)
+    assert len(found.fit.residuals) == np.count_nonzero(np.isfinite(y))
+    predicted = found.fit.predicted(found.experiments)[0]
+    assert predicted.shape == (record.n,)
+    whole_record = np.asarray(record.displacement)
+    assert np.std(predicted - whole_record) == pytest.approx(SIGMA, rel=0.15)
+
+
+def fitted(model: Model, experiments: list[Experiment]) -> Fit:
+    start = {"k_L": 1.05 * model.values["k_L"], "tau": 1.5 * model.values["tau"]}
+    free = free_parameters(model)
+    return fit(model, experiments, free, sigma=[SIGMA] * len(experiments), start=start)
+
+
+def test_the_parts_of_a_fit_belong_together() -> None:
+    model = model_with()
+    experiments = [whole(record_of(model, seed)) for seed in (1, 2)]
+    found = fitted(model, experiments)
+    assert found.converged
+    assert found.sigma == (SIGMA, SIGMA)
+    measured = np.concatenate([np.asarray(e.record.displacement) for e in experiments])
+    predicted = np.concatenate(found.predicted(experiments))
+    np.testing.assert_allclose(found.residuals, measured - predicted, rtol=0, atol=1e-3 * SIGMA)
+    priors = found.theta / found.unknowns.prior
+    cost = np.sum((found.residuals / SIGMA) ** 2) + np.sum(priors**2)
+    assert found.cost == pytest.approx(cost, rel=1e-12)
+    gradient = -found.jacobian.T @ found.residuals / SIGMA**2 + priors / found.unknowns.prior
+    size = np.linalg.norm(found.jacobian / SIGMA, axis=0)
+    assert np.all(np.abs(gradient) < 0.05 * size)
+    assert found.offset(1) - found.offset(0) == pytest.approx(1e-6, abs=SIGMA)
+    assert abs(found.memory(0)["f_H"]) < 3.0
+
+
+def test_a_fit_without_samples_is_refused() -> None:
+    record = record_of(model_with(), 1)
+    none = np.zeros(record.n, dtype=np.bool_)
+    with pytest.raises(InputError, match="No sample with a displacement is left to fit"):
+        fit(model_with(), [Experiment(record, none, none)], ["k_L"], sigma=[SIGMA])
+    bare = replace(record, displacement=None)
+    with pytest.raises(InputError, match="has no displacement"):
+        fit(compose(BASE), [Experiment(bare, ~none, none)], ["k_L"], sigma=[SIGMA])

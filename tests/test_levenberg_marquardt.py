@@ -1,0 +1,99 @@
+"""The minimiser against problems whose answers are known."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from psa_casadi.identification.levenberg_marquardt import Minimum, minimise
+
+FloatArray = NDArray[np.float64]
+Pair = tuple[FloatArray, FloatArray]
+
+OPEN = (np.full(2, -np.inf), np.full(2, np.inf))
+
+
+def rosenbrock(x: FloatArray) -> Pair:
+    residual = np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]])
+    return residual, np.array([[-20.0 * x[0], 10.0], [-1.0, 0.0]])
+
+
+def solved(found: Minimum | None) -> Minimum:
+    assert found is not None
+    assert found.converged
+    return found
+
+
+@pytest.mark.parametrize("start", [(-1.2, 1.0), (5.0, -30.0), (0.0, 0.0)])
+def test_rosenbrocks_valley(start: tuple[float, float]) -> None:
+    found = solved(minimise(rosenbrock, np.array(start), OPEN, tolerance=1e-10, evaluations=200))
+    np.testing.assert_allclose(found.theta, [1.0, 1.0], atol=1e-8)
+    assert found.cost < 1e-16
+    assert found.evaluations < 60
+
+
+def test_rosenbrocks_valley_behind_a_bound() -> None:
+    """With x <= 0.5 the minimum lies on the bound, at y = x^2."""
+    bounds = (np.array([-2.0, -2.0]), np.array([0.5, 2.0]))
+    start = np.array([-1.2, 1.0])
+    found = solved(minimise(rosenbrock, start, bounds, tolerance=1e-10, evaluations=200))
+    assert found.theta[0] == 0.5
+    assert found.theta[1] == pytest.approx(0.25, abs=1e-6)
+    assert found.cost == pytest.approx(0.25, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_linear_problems_in_a_box(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = rng.standard_normal((20, 6)), rng.standard_normal(20)
+    a[:, 1] = a[:, 0] + 1e-2 * a[:, 1]  # a narrow valley
+    bounds = (np.full(6, -0.15), np.full(6, 0.2))
+
+    def evaluate(x: FloatArray) -> Pair:
+        return a @ x - b, a
+
+    found = solved(minimise(evaluate, np.zeros(6), bounds, tolerance=1e-12, evaluations=300))
+    true = lsq_linear(a, b, bounds, tol=1e-14, max_iter=1000)
+    assert np.count_nonzero(np.abs(true.active_mask)) > 0
+    np.testing.assert_allclose(found.theta, true.x, atol=1e-5)
+    assert found.cost == pytest.approx(2.0 * true.cost, rel=1e-9)
+    np.testing.assert_array_equal((found.theta == 0.2).astype(int) - (found.theta == -0.15),
+                                  np.sign(true.active_mask))  # fmt: skip
+
+
+def test_a_start_outside_the_box_is_moved_into_it() -> None:
+    seen: list[FloatArray] = []
+
+    def evaluate(x: FloatArray) -> Pair:
+        seen.append(x)
+        return x - 0.5, np.eye(2)
+
+    box = (np.zeros(2), np.ones(2))
+    found = solved(minimise(evaluate, np.array([9.0, -9.0]), box, tolerance=1e-9, evaluations=50))
+    np.testing.assert_allclose(found.theta, 0.5, atol=1e-9)
+    assert all(np.all((x >= 0) & (x <= 1)) for x in seen)
+
+
+def test_what_cannot_be_evaluated() -> None:
+    def nowhere(_: FloatArray) -> Pair | None:
+        return None
+
+    def left_of_one(x: FloatArray) -> Pair | None:
+        return (np.exp(x) - np.exp(0.98), np.diag(np.exp(x))) if np.all(x < 1.0) else None
+
+    start = np.array([-2.0, 0.0])
+    assert minimise(nowhere, start, OPEN, tolerance=1e-9, evaluations=50) is None
+    found = solved(minimise(left_of_one, start, OPEN, tolerance=1e-9, evaluations=100))
+    np.testing.assert_allclose(found.theta, 0.98, atol=1e-6)
+
+
+def test_an_iteration_that_is_cut_off_says_so() -> None:
+    start = np.array([-1.2, 1.0])
+    found = minimise(rosenbrock, start, OPEN, tolerance=1e-10, evaluations=4)
+    assert found is not None
+    assert (found.converged, found.evaluations) == (False, 4)
+    residual, jacobian = rosenbrock(found.theta)
+    np.testing.assert_array_equal(found.residual, residual)
+    np.testing.assert_array_equal(found.jacobian, jacobian)
+    assert found.cost == residual @ residual
+    assert found.cost < 24.2

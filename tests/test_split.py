@@ -1,0 +1,123 @@
+"""What is held out of a record, where its voltage turns, and how much noise it holds."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi.experiment import Record
+from psa_casadi.experiment.split import reversals, split, whole
+from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
+
+FloatArray = NDArray[np.float64]
+
+
+def record(voltage: FloatArray) -> Record:
+    return Record(
+        "r", np.linspace(0.0, 1e-3 * (len(voltage) - 1), len(voltage)), voltage, 1e-7 * voltage
+    )
+
+
+def triangle(samples: int, period: int) -> FloatArray:
+    phase = np.arange(samples) / period % 1.0
+    voltage: FloatArray = 50.0 * (1.0 - np.abs(2.0 * phase - 1.0))
+    return voltage
+
+
+def test_reversals_of_a_triangle() -> None:
+    np.testing.assert_array_equal(reversals(triangle(1000, 200)), np.arange(100, 1000, 100))
+
+
+def test_reversals_of_plateaus_and_steps() -> None:
+    levels = np.repeat([0.0, 3.0, 5.0, 5.0, 2.0, 1.0, 4.0], 10)
+    turns = reversals(levels)
+    assert len(turns) == 2
+    assert 20 <= turns[0] < 40  # somewhere on the plateau at the top
+    assert 50 <= turns[1] < 60
+    assert len(reversals(np.full(10, 3.0))) == 0
+    assert len(reversals(np.linspace(0.0, 5.0, 100))) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_reversals_see_through_noise_of_a_converter(seed: int) -> None:
+    clean = triangle(1000, 200)
+    noise = 1e-5 * 50.0 * np.random.default_rng(seed).uniform(-1.0, 1.0, 1000)
+    plateau = np.repeat(clean, 3)  # every sample held for three
+    np.testing.assert_allclose(reversals(clean + noise), np.arange(100, 1000, 100), atol=1)
+    np.testing.assert_allclose(
+        reversals(plateau + np.repeat(noise, 3)), 3 * np.arange(100, 1000, 100), atol=3
+    )
+
+
+def test_the_last_quarter_is_held_out_from_the_nearest_reversal_on() -> None:
+    e = split(record(triangle(2000, 170)))
+    first = int(np.flatnonzero(e.held_out)[0])
+    turns = np.arange(85, 2000, 85)
+    assert first == turns[np.argmin(np.abs(turns - 1500))] == e.stop
+    np.testing.assert_array_equal(e.held_out, np.arange(2000) >= first)
+    np.testing.assert_array_equal(e.used, ~e.held_out)
+
+
+def test_without_a_reversal_nearby_the_last_quarter_is_cut_off() -> None:
+    e = split(record(triangle(1000, 1000)))
+    assert (e.stop, int(e.held_out.sum())) == (750, 250)
+    assert split(record(triangle(1000, 1000)), 0.1).stop == 900
+
+
+def test_missing_samples_are_neither_fitted_nor_held_out() -> None:
+    r = record(triangle(1000, 100))
+    assert r.displacement is not None
+    y = r.displacement.copy()
+    y[::10] = np.nan
+    e = split(Record("r", r.time, r.voltage, y))
+    assert not (e.used | e.held_out)[::10].any()
+    assert int((e.used | e.held_out).sum()) == 900
+    assert not (e.used & e.held_out).any()
+    all_of_it = whole(e.record)
+    np.testing.assert_array_equal(all_of_it.used, np.isfinite(y))
+    assert not all_of_it.held_out.any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("quantum", [0.0, 0.5, 1.0])
+def test_white_noise_on_a_motion_is_found(seed: int, quantum: float) -> None:
+    """Rounding to a count q adds q^2/12 to the variance, which is white too."""
+    t = np.arange(6000) * 1e-3
+    motion = 200.0 * np.sin(2 * np.pi * 3.0 * t) + 80.0 * np.sin(2 * np.pi * 7.0 * t)
+    y = motion + np.random.default_rng(seed).standard_normal(6000)
+    if quantum:
+        y = quantum * np.round(y / quantum)
+    true = np.hypot(1.0, quantum / np.sqrt(12.0))
+    assert high_frequency_noise(y) == pytest.approx(true, rel=0.05)
+
+
+def test_steps_do_not_count_as_noise() -> None:
+    rng = np.random.default_rng(1)
+    y = rng.standard_normal(6000) + np.repeat(rng.uniform(0.0, 500.0, 60), 100)
+    assert high_frequency_noise(y) == pytest.approx(1.0, rel=0.07)
+
+
+def test_smooth_signals_have_almost_none_and_few_samples_count_whole() -> None:
+    t = np.linspace(0.0, 1.0, 500)
+    smooth = np.sin(2 * np.pi * 2.0 * t)
+    assert 0 < high_frequency_noise(smooth) < 1e-4 * np.std(smooth)
+    few = np.array([1.0, -1.0, 1.0, 3.0])
+    assert high_frequency_noise(few) == np.std(few)
+    alternating = np.tile([1.0, -1.0], 50)
+    assert high_frequency_noise(alternating) == pytest.approx(1.0)
+    coarse = np.round(5.0 * t)  # most third differences vanish: the whole spread is the bound
+    assert high_frequency_noise(coarse) == np.std(coarse)
+
+
+@pytest.mark.parametrize("r", [0.0, 0.5, 0.9])
+def test_correlation_inflates_as_in_a_first_order_autoregression(r: float) -> None:
+    rng = np.random.default_rng(3)
+    e = rng.standard_normal(200_000)
+    x = np.empty_like(e)
+    x[0] = e[0]
+    for k in range(1, len(e)):
+        x[k] = r * x[k - 1] + e[k]
+    blocks = x.reshape(-1, 2000).mean(axis=1)
+    measured = float(np.var(blocks) * 2000 / np.var(x))  # how much worse a mean of 2000 is known
+    assert correlation_inflation(x) == pytest.approx((1 + r) / (1 - r), rel=0.06)
+    assert measured == pytest.approx((1 + r) / (1 - r), rel=0.5)
+    assert correlation_inflation(np.zeros(10)) == 1.0
