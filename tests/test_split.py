@@ -48,19 +48,32 @@ def test_reversals_see_through_noise_of_a_converter(seed: int) -> None:
     )
 
 
-def test_the_last_quarter_is_held_out_from_the_nearest_reversal_on() -> None:
-    e = split(record(triangle(2000, 170)))
-    first = int(np.flatnonzero(e.held_out)[0])
-    turns = np.arange(85, 2000, 85)
-    assert first == turns[np.argmin(np.abs(turns - 1500))] == e.stop
-    np.testing.assert_array_equal(e.held_out, np.arange(2000) >= first)
+def borders(held_out: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the samples at which fitting turns into holding out or back."""
+    return np.flatnonzero(np.diff(held_out.astype(int))) + 1
+
+
+@pytest.mark.parametrize("period", [34, 60, 170, 230])
+def test_every_fourth_block_is_held_out_and_no_segment_is_cut(period: int) -> None:
+    """Sixteen blocks of some 125 samples, the ends moved to the nearest reversal."""
+    e = split(record(triangle(2000, period)))
+    edges = borders(e.held_out)
+    turns = reversals(e.record.voltage)
+    assert len(edges) == 7
+    assert set(edges) <= set(turns)
+    wanted = 2000 / 16 * np.array([3, 4, 7, 8, 11, 12, 15])
+    for edge, point in zip(edges, wanted, strict=True):
+        assert abs(edge - point) == np.abs(turns - point).min()
+    assert e.held_out[-1]
+    assert e.stop == edges[-1]
+    assert abs(np.mean(e.held_out) - 0.25) < period / 2000  # ends move by a quarter period at most
     np.testing.assert_array_equal(e.used, ~e.held_out)
 
 
-def test_without_a_reversal_nearby_the_last_quarter_is_cut_off() -> None:
-    e = split(record(triangle(1000, 1000)))
-    assert (e.stop, int(e.held_out.sum())) == (750, 250)
-    assert split(record(triangle(1000, 1000)), 0.1).stop == 900
+def test_without_a_reversal_nearby_the_blocks_are_cut_where_they_end() -> None:
+    e = split(record(np.linspace(0.0, 5.0, 1600)))
+    np.testing.assert_array_equal(borders(e.held_out), 100 * np.array([3, 4, 7, 8, 11, 12, 15]))
+    assert (e.stop, int(e.held_out.sum())) == (1500, 400)
 
 
 def test_missing_samples_are_neither_fitted_nor_held_out() -> None:

@@ -37,16 +37,16 @@ MOST_CAUSES = 3
 #: An extension whose residual is within this factor of the noise needs no further starts.
 SETTLED = 1.05
 #: How many extensions are fitted to the end, if their evidence is this share of the best one's.
-FINALISTS, RUNNER_UP = 2, 0.7
+FINALISTS, RUNNER_UP = 2, 0.8
 #: Share of the residual's power above the noise from which a further cause is looked for.
-REMAINDER = 0.05
+REMAINDER = 0.35
 #: A base fit retried from the extension's parameters counts if its rms falls to this share.
 BETTER_BASE = 0.95
 
 
 @dataclass(eq=False)
 class Round:
-    """One step of the search: the model so far, its screening, the rest test, the extensions tried."""
+    """One step of the search: the model so far, its screening and test, the extensions tried."""
 
     fit: Fit
     predicted: tuple[FloatArray, ...]
@@ -116,6 +116,22 @@ def _search(
         rounds.append(
             _examine(current.chosen.fit, current.chosen.predicted, experiments, left, progress)
         )
+    return _settle(rounds, experiments, progress)
+
+
+def _settle(
+    rounds: list[Round], experiments: Sequence[Experiment], progress: Progress
+) -> list[Round]:
+    """Where two causes or more leave structure, fit all their parameters together once more."""
+    last = rounds[-1]
+    if len(rounds) < 3 or not last.test.alarm:
+        return rounds
+    progress("all causes together, to the end")
+    again = refit(last.fit, experiments, last.fit.unknowns.names)
+    predicted = tuple(again.predicted(experiments))
+    before = rms(np.concatenate(held_out_residuals(experiments, last.predicted)))
+    if rms(np.concatenate(held_out_residuals(experiments, predicted))) < before:
+        rounds[-1] = replace(last, fit=again, predicted=predicted)
     return rounds
 
 
@@ -140,14 +156,14 @@ def _extend(
         if extension is not None:
             current.extensions.append(extension)
     current.extensions.sort(key=lambda e: -e.evidence)
+    if current.extensions and current.extensions[0].fit.rms > SETTLED * floor:
+        progress(f"cause {number}: {current.extensions[0].effect.name} afresh")
+        again = extend_afresh(current.fit, experiments, current.extensions[0], inflation)
+        current.extensions[0] = again
     for k, extension in enumerate(current.extensions[:FINALISTS]):
         if extension.evidence > RUNNER_UP * current.extensions[0].evidence:
             progress(f"cause {number}: {extension.effect.name} to the end")
-            full = polish(current.fit, extension, experiments, inflation)
-            if full.fit.rms > SETTLED * floor:
-                progress(f"cause {number}: {extension.effect.name} afresh")
-                full = extend_afresh(current.fit, experiments, full, inflation)
-            current.extensions[k] = full
+            current.extensions[k] = polish(current.fit, extension, experiments, inflation)
     before = rms(np.concatenate(held_out_residuals(experiments, current.predicted)))
     ranked = choose(current.extensions, experiments, current.fit, before, floor)
     if ranked:

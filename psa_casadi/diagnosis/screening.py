@@ -1,8 +1,8 @@
 """Screening: which effects would lower the residual, the base parameters being free to follow.
 
-Every direction is prewhitened, the fitted parameters' directions are projected out, and the decrease
-of the sum of squares is compared with one threshold for the maximum over all directions, drawn from
-Gaussian noise along the actual directions (family-wise; Davies 1987, Hansen 1996).
+Every direction is prewhitened, the fitted parameters' directions are projected out, and the
+decrease of the sum of squares is compared with one threshold for the maximum over all directions,
+drawn from Gaussian noise along the actual directions (family-wise; Davies 1987, Hansen 1996).
 """
 
 from collections.abc import Sequence

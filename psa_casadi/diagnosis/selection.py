@@ -19,13 +19,14 @@ from psa_casadi.identification.starting import ordinary_values
 FloatArray = npt.NDArray[np.float64]
 
 #: How many effects are fitted fully in each round, and how many starts each gets.
-FULL_FITS = 4
+FULL_FITS = 3
 _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
-_QUICK, _ITERATIONS = 8, 30
-#: Tolerance of the stepper while searching; the final fit uses that of every fit.
-_QUICK_RTOL, _SEARCH_RTOL = 1e-4, 1e-5
+_QUICK = 8
+#: Tolerance of the stepper in quick fits, then of stepper and fit, and evaluations, to the end.
+_QUICK_RTOL = 1e-4
+_POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
 #: Evidence (in units of the log-likelihood) within which two effects cannot be told apart.
 MARGIN = 10.0
 #: Share of the excess power that an effect must remove to be added.
@@ -36,7 +37,7 @@ NOTICEABLE = 0.98
 
 @dataclass(frozen=True, eq=False)
 class Extension:
-    """One more effect, fully fitted: its fit, evidence over the model before it, held-out rms [m]."""
+    """One more effect, fitted: its fit, evidence over the model before, held-out rms [m]."""
 
     effect: Component
     fit: Fit
@@ -72,7 +73,7 @@ _Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
 def extend(
     before: Fit, experiments: Sequence[Experiment], scores: Sequence[Score], inflation: float
 ) -> Extension | None:
-    """Fit the model quickly with one more effect from its best directions; None if every fit fails."""
+    """Fit quickly with one more effect from its best directions; None if every fit fails."""
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
     quick = _quick(before, experiments, scores[0].direction.effect, starts, {})
     return (
@@ -103,20 +104,17 @@ def extend_afresh(
     ]
     ordinary = ordinary_values(before.model, min(e.record.sample_time for e in experiments))
     quick = _quick(before, experiments, effect, starts, ordinary)
-    if quick is None:
+    if quick is None or quick.cost >= first.fit.cost:
         return first
-    again = polish(
-        before, _extension(before, quick, effect, experiments, inflation), experiments, inflation
-    )
-    return again if again.fit.cost < first.fit.cost else first
+    return _extension(before, quick, effect, experiments, inflation)
 
 
 def polish(
     before: Fit, extension: Extension, experiments: Sequence[Experiment], inflation: float
 ) -> Extension:
-    """Continue an extension's fit until it converges, first loosely, then at the fits' tolerance."""
+    """Continue an extension's fit until it converges, loosely first, then at full tolerance."""
     current = extension.fit
-    for rtol, tolerance in ((_SEARCH_RTOL, 1e-3), (FIT_RTOL, 1e-4)):
+    for rtol, tolerance, evaluations in _POLISHING:
         try:
             current = fit(
                 current.model,
@@ -124,7 +122,7 @@ def polish(
                 current.unknowns.names,
                 sigma=before.sigma,
                 start_memory=[current.memory(r) for r in range(len(experiments))],
-                evaluations=_ITERATIONS,
+                evaluations=evaluations,
                 tolerance=tolerance,
                 rtol=rtol,
             )
@@ -170,7 +168,7 @@ def _quick(
 def evidence(before: Fit, after: Fit, inflation: float) -> float:
     """Return the gain in log-likelihood less Schwarz' penalty for the unknowns added.
 
-    n/2 ln(S_before/S_after) - k/2 ln n, with n samples divided by the inflation for correlated noise.
+    n/2 ln(S_before/S_after) - k/2 ln n, n being divided by the inflation for correlated noise.
     """
     n = len(before.residuals) / inflation
     added = after.unknowns.size - before.unknowns.size
@@ -215,9 +213,9 @@ def choose(
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
-    Worth having: evidence; the effect in character; at least `WORTHWHILE` of the training residual's
-    power above the noise `floor` removed; and held-out data predicted better, to `NOTICEABLE`. The
-    order is that of the evidence; within the margin the better prediction leads.
+    Worth having: evidence; the effect in character; at least `WORTHWHILE` of the training
+    residual's power above the noise `floor` removed; and held-out data predicted better, to
+    `NOTICEABLE`. The order is that of the evidence; within the margin the better prediction leads.
     """
     excess = before.rms**2 - floor**2
     good = [

@@ -135,7 +135,7 @@ def _cause(r: "Round", final: Fit, share: float) -> Cause:
 
 
 def _candidates(first: "Round", floor: float) -> tuple[Candidate, ...]:
-    """Every effect tried, by explained share of the training excess; linear estimate if not fitted."""
+    """Every effect tried, with its share of the training excess; estimated if not fitted."""
     base = float(np.sum(first.fit.residuals**2))
     excess = max(base - len(first.fit.residuals) * floor**2, 1e-300)
     fitted = {e.effect.name: e for e in first.extensions}
@@ -178,7 +178,7 @@ def _blind_spots(final: "Round", table: Sequence[Component]) -> tuple[BlindSpot,
 
 def _where(r: "Round") -> str:
     if r.test.alarm:
-        return f"{r.test.where} {100 * r.test.excess:.0f} % of the residual's power is above the noise."
+        return f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
     return "What remains cannot be told from noise."
 
 

@@ -15,7 +15,7 @@ _ORDERS = 12
 def drive_frequency(record: Record) -> float | None:
     """Return the frequency [Hz] of the line that holds most of the voltage's alternating power.
 
-    None where no line, with five neighbours on each side for a modulated amplitude, holds half of it.
+    None where no line, with five neighbours on each side for modulation, holds half of it.
     """
     even = np.linspace(record.time[0], record.time[-1], record.n)
     v = np.interp(even, record.time, record.voltage)

@@ -144,7 +144,7 @@ def refit(previous: Fit, experiments: Sequence[Experiment], free: Sequence[str])
     """Continue a fit from where it stands, with the noise level its residuals suggest."""
     sigma = _residual_noise(previous, experiments)
     memory = [previous.memory(r) for r in range(len(experiments))]
-    return fit(previous.model, experiments, free, sigma=sigma, start_memory=memory, evaluations=150)
+    return fit(previous.model, experiments, free, sigma=sigma, start_memory=memory, evaluations=60)
 
 
 def _residual_noise(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:

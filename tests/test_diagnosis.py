@@ -1,0 +1,138 @@
+"""The parts of a diagnosis: noise colour, omnibus, drive harmonics, choice, blind spots, JSON."""
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.diagnosis.colour import colour_of
+from psa_casadi.diagnosis.errors_of import gain_of
+from psa_casadi.diagnosis.omnibus import omnibus
+from psa_casadi.experiment.drive import at_harmonic, drive_frequency
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.units import FloatArray
+from tests.plants.make import make_record
+
+N = 4000
+
+
+def grid(step: float) -> FloatArray:
+    return np.linspace(0.0, (N - 1) * step, N)
+
+
+def ar1(correlation: float, rng: np.random.Generator) -> FloatArray:
+    white = rng.standard_normal(N)
+    out = np.zeros(N)
+    for k in range(1, N):
+        out[k] = correlation * out[k - 1] + white[k]
+    return out
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.7])
+def test_colour_is_estimated_and_removed(correlation: float) -> None:
+    noise = ar1(correlation, np.random.default_rng(3))
+    colour = colour_of(noise, [N])
+    assert colour.correlation == pytest.approx(correlation, abs=0.05)
+    assert colour.level == pytest.approx(1.0, rel=0.05)
+    white = colour.whiten(noise)
+    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.05
+
+
+def _test(residual: FloatArray) -> float:
+    time = grid(1e-3)
+    voltage = 50 * (1 - np.cos(2 * np.pi * time))
+    colour = colour_of(residual, [N])
+    return omnibus(residual, voltage, time, colour, 1.0).p_value
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_omnibus_is_quiet_on_noise(correlation: float) -> None:
+    values = [_test(ar1(correlation, np.random.default_rng(s))) for s in range(20)]
+    assert min(values) > 1e-4
+    assert np.median(values) > 0.1
+
+
+@pytest.mark.parametrize(
+    "structure",
+    [
+        lambda t: 0.3 * np.sin(2 * np.pi * 57.9 * t),
+        lambda t: 0.5 * t / t[-1],
+        lambda t: 0.3 * np.cos(2 * np.pi * t) ** 2,
+    ],
+    ids=["tone", "drift", "function of voltage"],
+)
+def test_omnibus_sees_structure(structure: Callable[[FloatArray], FloatArray]) -> None:
+    time = grid(1e-3)
+    assert _test(np.random.default_rng(1).standard_normal(N) + structure(time)) < 1e-3
+
+
+def test_harmonics_of_a_periodic_drive_are_known_and_those_of_noise_are_not() -> None:
+    time = grid(5e-3)
+    sine = Record("sine", time, 1.8 - 1.8 * np.cos(2 * np.pi * time))
+    assert drive_frequency(sine) == pytest.approx(1.0, rel=0.02)
+    assert at_harmonic(2.02, sine)
+    assert not at_harmonic(57.9, sine)
+    noise = Record("noise", time, np.random.default_rng(0).standard_normal(N))
+    assert drive_frequency(noise) is None
+    assert not at_harmonic(2.0, noise)
+
+
+def test_gain_is_the_reduction_of_the_held_out_rms() -> None:
+    time = grid(1e-3)
+    rng = np.random.default_rng(5)
+    truth = np.sin(2 * np.pi * time)
+    held = np.arange(N) >= 3000
+    record = Record("r", time, truth, truth + 0.01 * rng.standard_normal(N))
+    experiment = Experiment(record, ~held, held)
+    base = truth + 0.1 * rng.standard_normal(N)
+    gain = gain_of([experiment], [base], [truth])
+    assert gain.holdout_rms_reduction_percent == pytest.approx(90, abs=1.5)
+    assert gain.interval[0] < gain.holdout_rms_reduction_percent < gain.interval[1]
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> psa.Diagnosis:
+    path = tmp_path_factory.mktemp("clean") / "clean.csv"
+    make_record(None, 11, path)
+    return psa.diagnose([psa.read_record(path)])
+
+
+def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> None:
+    content = json.loads(clean.to_json())
+    assert content["format"] == "psa_casadi.diagnosis/1"
+    assert {"verdict", "causes", "candidates", "errors", "gain", "blind_to", "remaining"} <= set(
+        content
+    )
+    assert set(content["errors"]["base"]) == {
+        "train_rms_m",
+        "holdout_rms_m",
+        "holdout_max_m",
+        "holdout_nrmse_percent",
+    }
+    assert {c["effect"] for c in content["candidates"]} == set(psa.EFFECTS)
+    assert content["next_experiment"]["why"]
+
+
+def test_held_out_samples_are_never_used(clean: psa.Diagnosis) -> None:
+    experiment = clean.experiments[0]
+    assert not np.any(experiment.used & experiment.held_out)
+    assert 0.15 < np.mean(experiment.held_out) < 0.35
+
+
+def test_a_single_slow_triangle_is_said_to_be_blind_to_fast_effects(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    path = tmp_path_factory.mktemp("blind") / "r.csv"
+    truth = make_record(None, 3, path)
+    record = psa.read_record(path)
+    time = np.linspace(0.0, 1499 * 0.02, 1500)
+    voltage = 40 * (1 - np.abs(1 - (time / 15) % 2))
+    slow = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
+    noisy = slow + truth.sigma * np.random.default_rng(0).standard_normal(len(slow))
+    found = psa.diagnose([Record("slow", time, voltage, noisy)])
+    assert record.n > 0
+    assert "sensor_delay" in {b.effect for b in found.blind_to}
+    assert found.verdict in ("adequate", "ambiguous")
