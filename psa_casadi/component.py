@@ -81,9 +81,9 @@ class Component:
     `probe` holds trial values of parameters that have no influence while the gain is 0;
     `finite_step` is the size of the gain, as a share of its scale, at which the effect is looked
     for when its derivative vanishes at 0. `looks_like` is the signature an engineer sees.
-    `tone` names a parameter that is the frequency of a tone: at a harmonic of a periodic drive it
-    is distortion and not this effect. `belongs_to` is plant, drive, sensor or environment; the last
-    two stay out of exported plants.
+    `tone` names a parameter that is the frequency of a tone: among the harmonics of a periodic
+    drive it cannot be told from distortion. `belongs_to` is plant, drive, sensor or environment;
+    the last two stay out of exported plants.
     """
 
     name: str

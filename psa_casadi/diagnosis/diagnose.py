@@ -13,6 +13,8 @@ from psa_casadi.diagnosis.probes import directions
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import Screening, screen
 from psa_casadi.diagnosis.selection import (
+    FURTHER,
+    NOTICEABLE,
     Extension,
     choose,
     extend,
@@ -165,7 +167,14 @@ def _extend(
             progress(f"cause {number}: {extension.effect.name} to the end")
             current.extensions[k] = polish(current.fit, extension, experiments, inflation)
     before = rms(np.concatenate(held_out_residuals(experiments, current.predicted)))
-    ranked = choose(current.extensions, experiments, current.fit, before, floor)
+    ranked = choose(
+        current.extensions,
+        experiments,
+        current.fit,
+        before,
+        floor,
+        NOTICEABLE if number == 1 else FURTHER,
+    )
     if ranked:
         current.chosen, current.rivals = ranked[0], ranked[1:]
 

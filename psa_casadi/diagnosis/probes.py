@@ -10,7 +10,7 @@ from scipy.signal import find_peaks
 
 from psa_casadi.component import RECORD_DURATION, SPECTRAL_PEAKS, Component
 from psa_casadi.errors import PsaError
-from psa_casadi.experiment.drive import at_harmonic
+from psa_casadi.experiment.drive import among_harmonics
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit
 from psa_casadi.identification.prediction import measured, predict_record
@@ -56,7 +56,7 @@ def directions(
 def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
     """Frequencies [Hz] of the highest peaks in the spectrum of the first record's residual.
 
-    Harmonics of a periodic drive are left out: they are distortion.
+    The range of a periodic drive's harmonics is left out: it may be distortion.
     """
     experiment = experiments[0]
     count = int(experiment.used.sum())
@@ -66,7 +66,7 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     lowest = max(8, count // 200)
     where, _ = find_peaks(power[lowest:], distance=max(3, count // 200))
     order = where[np.argsort(power[lowest:][where])[::-1]] + lowest
-    tones = [k for k in order[: 5 * _PEAKS] if not at_harmonic(frequency[k], experiment.record)]
+    tones = [k for k in order[: 5 * _PEAKS] if not among_harmonics(frequency[k], experiment.record)]
     strongest = np.array(tones[:_PEAKS], dtype=int)
     return tuple(float(f) for f in np.sort(frequency[strongest])) or (
         0.1 / experiment.record.sample_time,

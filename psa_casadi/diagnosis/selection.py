@@ -10,7 +10,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.errors_of import held_out_residuals, rms
 from psa_casadi.diagnosis.screening import Score, Screening
 from psa_casadi.errors import PsaError
-from psa_casadi.experiment.drive import at_harmonic
+from psa_casadi.experiment.drive import among_harmonics
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.identify import FIXED
@@ -33,6 +33,8 @@ MARGIN = 10.0
 WORTHWHILE = 0.25
 #: ... and the held-out rms must fall at least to this share: less is of no use to anybody.
 NOTICEABLE = 0.98
+#: ... and for a second or third cause to this share: small gains invite wrong names.
+FURTHER = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,12 +212,14 @@ def choose(
     before: Fit,
     before_holdout: float,
     floor: float,
+    noticeable: float,
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
     Worth having: evidence; the effect in character; at least `WORTHWHILE` of the training
-    residual's power above the noise `floor` removed; and held-out data predicted better, to
-    `NOTICEABLE`. The order is that of the evidence; within the margin the better prediction leads.
+    residual's power above the noise `floor` removed; and held-out data predicted better, to the
+    share `noticeable`. The order is that of the evidence; within the margin the better prediction
+    leads.
     """
     excess = before.rms**2 - floor**2
     good = [
@@ -224,7 +228,7 @@ def choose(
         if e.evidence > 0
         and not out_of_character(e, experiments)
         and before.rms**2 - e.fit.rms**2 > WORTHWHILE * excess
-        and e.holdout_rms < NOTICEABLE * before_holdout
+        and e.holdout_rms < noticeable * before_holdout
     ]
     good.sort(key=lambda e: -e.evidence)
     close = [e for e in good if good[0].evidence - e.evidence < MARGIN]
@@ -235,11 +239,11 @@ def choose(
 def out_of_character(extension: Extension, experiments: Sequence[Experiment]) -> bool:
     """Whether the data ask for something that is not this effect.
 
-    A parameter pushed to the end of its range, or a tone at a harmonic of the drive.
+    A parameter pushed to the end of its range, or a tone among the harmonics of a periodic drive.
     """
     values = extension.fit.model.values
     tone = extension.effect.tone
-    if tone is not None and any(at_harmonic(values[tone], e.record) for e in experiments):
+    if tone is not None and any(among_harmonics(values[tone], e.record) for e in experiments):
         return True
     for p in extension.effect.parameters:
         if p.name in FIXED or p.name == extension.effect.gain:

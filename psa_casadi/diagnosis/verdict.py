@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 PARTLY = 0.8
 #: A second effect within this factor of the winner's held-out rms is as good on held-out data.
 _AS_GOOD = 1.02
+#: A cause that removes less than this share of what was left is named with less confidence.
+_CLEAR = 0.5
 
 
 def conclude(
@@ -61,7 +63,10 @@ def conclude(
         verdict = "ambiguous"
     named = chosen if verdict in ("cause_named", "partly_explained", "ambiguous") else []
     final = last if named else first
-    causes = tuple(_cause(r, last.fit, share) for r in named)
+    causes = tuple(
+        _cause(r, last.fit, share, _explained_share(experiments, r, after, floor))
+        for r, after in zip(named, rounds[1:], strict=False)
+    )
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -110,7 +115,8 @@ def _told_from(r: "Round") -> tuple[str, ...]:
     )
 
 
-def _cause(r: "Round", final: Fit, share: float) -> Cause:
+def _cause(r: "Round", final: Fit, share: float, own: float) -> Cause:
+    """State a cause: `share` is what all causes explain, `own` what this one did of its round's."""
     chosen: Extension = r.chosen  # type: ignore[assignment]
     found = determinacy(final)
     estimates = {
@@ -127,10 +133,10 @@ def _cause(r: "Round", final: Fit, share: float) -> Cause:
     return Cause(
         effect=chosen.effect.name,
         belongs_to=chosen.effect.belongs_to,
-        confidence=float(min(0.99, share) / (1.0 + sum(weights))),
+        confidence=float(min(0.99, share) * min(1.0, own / _CLEAR) / (1.0 + sum(weights))),
         parameters=estimates,
         cannot_be_told_from=_told_from(r),
-        explained_share=share,
+        explained_share=own,
     )
 
 

@@ -30,14 +30,11 @@ def drive_frequency(record: Record) -> float | None:
     return peak / record.duration if share > _DOMINANT and peak > _SIDE_LINES else None
 
 
-def at_harmonic(frequency: float, record: Record) -> bool:
-    """Whether a frequency [Hz] lies on one of the first harmonics of a periodic drive.
+def among_harmonics(frequency: float, record: Record) -> bool:
+    """Whether a frequency [Hz] lies in the range of a periodic drive's first twelve harmonics.
 
-    The tolerance is three lines of the record's spectrum, or 5 % of the drive's frequency.
+    A resonance answers a periodic drive at the drive's harmonics only, and so does distortion: in
+    that range such a record cannot tell the two apart.
     """
     drive = drive_frequency(record)
-    if drive is None:
-        return False
-    order = round(frequency / drive)
-    width = max(3.0 / record.duration, 0.05 * drive)
-    return 1 <= order <= _ORDERS and abs(frequency - order * drive) < width
+    return drive is not None and frequency < (_ORDERS + 0.5) * drive

@@ -139,11 +139,10 @@ def verdict_sentence(d: Diagnosis) -> str:
             f" {listing([plain(n) for n in rivals], 'or')}; with {plain(d.causes[0].effect)},"
             f" {gain_sentence(d)}."
         )
+    are = "cause is" if len(d.causes) == 1 else "causes are"
     if d.verdict == "partly_explained":
-        return (
-            f"The closest known cause is {causes}: {gain_sentence(d)}, but more than noise remains."
-        )
-    return f"The cause is {causes}: {gain_sentence(d)}."
+        return f"The closest known {are} {causes}: {gain_sentence(d)}, but more than noise remains."
+    return f"The {are} {causes}: {gain_sentence(d)}."
 
 
 def _cause(cause: Cause) -> str:
