@@ -20,7 +20,7 @@ def diagnose(
         list[Path] | None,
         typer.Option(
             help="Record kept for judging only (repeat the option for several); without it, the"
-            " last quarter of every record."
+            " a quarter of every record, in blocks."
         ),
     ] = None,
     model: Annotated[

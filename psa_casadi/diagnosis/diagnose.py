@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.errors_of import held_out_residuals, rms
+from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.probes import directions
 from psa_casadi.diagnosis.result import Diagnosis
@@ -70,9 +70,10 @@ def diagnose(
 ) -> Diagnosis:
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
-    Held-out data are the records `holdout`, else the last quarter of every record; they choose
-    nothing but whether an extension may stay. `model` is where the base fit starts; `stiffness`
-    [N/m] fixes the force scale; `effects` is the table to search. Raises InputError.
+    Held-out data are the records `holdout`, else a quarter of every record in blocks (see
+    `split`); they choose nothing but whether an extension may stay. `model` is where the base fit
+    starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search. Raises
+    InputError.
     """
     table = list(effects if effects is not None else EFFECTS.values())
     experiments = _experiments(records, holdout)
@@ -131,8 +132,8 @@ def _settle(
     progress("all causes together, to the end")
     again = refit(last.fit, experiments, last.fit.unknowns.names)
     predicted = tuple(again.predicted(experiments))
-    before = rms(np.concatenate(held_out_residuals(experiments, last.predicted)))
-    if rms(np.concatenate(held_out_residuals(experiments, predicted))) < before:
+    before = held_out_rms(experiments, last.predicted)
+    if held_out_rms(experiments, predicted) < before:
         rounds[-1] = replace(last, fit=again, predicted=predicted)
     return rounds
 
@@ -166,7 +167,7 @@ def _extend(
         if extension.evidence > RUNNER_UP * current.extensions[0].evidence:
             progress(f"cause {number}: {extension.effect.name} to the end")
             current.extensions[k] = polish(current.fit, extension, experiments, inflation)
-    before = rms(np.concatenate(held_out_residuals(experiments, current.predicted)))
+    before = held_out_rms(experiments, current.predicted)
     ranked = choose(
         current.extensions,
         experiments,

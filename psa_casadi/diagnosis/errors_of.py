@@ -16,14 +16,18 @@ _BLOCKS = 8
 
 
 def held_out_residuals(
-    experiments: Sequence[Experiment], predicted: Sequence[FloatArray], offsets_free: bool = False
+    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
 ) -> list[FloatArray]:
     """Return measured minus predicted over the held-out samples of every experiment [m]."""
     parts = []
     for e, y in zip(experiments, predicted, strict=True):
-        residual = (measured(e.record) - y)[e.held_out]
-        parts.append(residual - np.mean(residual) if offsets_free and len(residual) else residual)
+        parts.append((measured(e.record) - y)[e.held_out])
     return parts
+
+
+def held_out_rms(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> float:
+    """Return the root mean square over all held-out samples [m]."""
+    return rms(np.concatenate(held_out_residuals(experiments, predicted)))
 
 
 def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> Errors:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.errors_of import held_out_residuals, rms
+from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.screening import Score, Screening
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.drive import among_harmonics
@@ -149,7 +149,7 @@ def _extension(
         effect=effect,
         fit=found,
         evidence=evidence(before, found, inflation),
-        holdout_rms=rms(np.concatenate(held_out_residuals(experiments, predicted))),
+        holdout_rms=held_out_rms(experiments, predicted),
         predicted=predicted,
     )
 

@@ -1,13 +1,12 @@
 """From the rounds of the search to verdict, confidence, blind spots and what to do next."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.errors_of import errors_of, gain_of, held_out_residuals, rms
+from psa_casadi.diagnosis.errors_of import errors_of, gain_of, held_out_rms
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
@@ -22,10 +21,9 @@ from psa_casadi.diagnosis.selection import MARGIN, Extension
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.identify import FORCE_NOTE, version
+from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
 from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
-from psa_casadi.model.compose import Model
-from psa_casadi.variables import Provenance, nominal_value
+from psa_casadi.variables import nominal_value
 
 if TYPE_CHECKING:
     from psa_casadi.diagnosis.diagnose import Round
@@ -49,7 +47,7 @@ def conclude(
     chosen = [r for r in rounds if r.chosen is not None]
     floor = high_frequency_noise(last.fit.residuals)
     share = _explained_share(experiments, first, last, floor)
-    missing = first.test.alarm or _exceeds(first)
+    missing = first.test.alarm or first.chosen is not None
     verdict: Verdict
     if not missing:
         verdict = "adequate"
@@ -84,20 +82,21 @@ def conclude(
         extended_fit=final.fit,
         base=first.predicted,
         extended=final.predicted,
-        model=_with_provenance(final.fit, experiments, stiffness_given),
+        model=with_provenance(
+            final.fit.model,
+            determinacy(final.fit),
+            [e.record for e in experiments],
+            stiffness_given,
+        ),
     )
-
-
-def _exceeds(r: "Round") -> bool:
-    return r.chosen is not None
 
 
 def _explained_share(
     experiments: Sequence[Experiment], first: "Round", last: "Round", floor: float
 ) -> float:
     """Share of the held-out excess power that the extension removes, between 0 and 1."""
-    before = rms(np.concatenate(held_out_residuals(experiments, first.predicted)))
-    after = rms(np.concatenate(held_out_residuals(experiments, last.predicted)))
+    before = held_out_rms(experiments, first.predicted)
+    after = held_out_rms(experiments, last.predicted)
     excess = before**2 - floor**2
     return float(np.clip((before**2 - after**2) / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
@@ -202,16 +201,3 @@ def _next_experiment(causes: Sequence[Cause], verdict: Verdict) -> NextExperimen
     if verdict in ("unexplained", "partly_explained"):
         return NextExperiment(None, (), _ADVICE)
     return NextExperiment(None, (), "None is needed for this verdict.")
-
-
-def _with_provenance(fit: Fit, experiments: Sequence[Experiment], given: bool) -> Model:
-    found = determinacy(fit)
-    provenance = Provenance(
-        identified_from=tuple((e.record.name, e.record.sha256) for e in experiments),
-        package_version=version(),
-        free=found.names,
-        intervals=found.intervals,
-        force_scale="given" if given else "assumed",
-        notes=() if given else (FORCE_NOTE,),
-    )
-    return replace(fit.model, provenance=provenance)

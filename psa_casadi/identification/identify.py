@@ -56,21 +56,28 @@ def identify(
     best = fit_base(start, experiments, progress=progress)
     found = determinacy(best)
     given = stiffness is not None or (model is not None and model.provenance.force_scale == "given")
-    provenance = Provenance(
-        identified_from=tuple((r.name, r.sha256) for r in records),
-        package_version=version(),
-        free=found.names,
-        intervals=found.intervals,
-        force_scale="given" if given else "assumed",
-        notes=() if given else (FORCE_NOTE,),
-    )
     return Identification(
-        model=replace(best.model, provenance=provenance),
+        model=with_provenance(best.model, found, records, given),
         fit=best,
         determinacy=found,
         experiments=experiments,
         warnings=_warnings(best, found),
     )
+
+
+def with_provenance(
+    model: Model, found: Determinacy, records: Sequence[Record], stiffness_given: bool
+) -> Model:
+    """Return a fitted model that says from which records it comes and how sure its values are."""
+    provenance = Provenance(
+        identified_from=tuple((r.name, r.sha256) for r in records),
+        package_version=version(),
+        free=found.names,
+        intervals=found.intervals,
+        force_scale="given" if stiffness_given else "assumed",
+        notes=() if stiffness_given else (FORCE_NOTE,),
+    )
+    return replace(model, provenance=provenance)
 
 
 FORCE_NOTE = (
