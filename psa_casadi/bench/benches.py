@@ -1,0 +1,40 @@
+"""The table of benchmarks: each is loaded when it is run."""
+
+from importlib import import_module
+
+from psa_casadi.bench.outcome import Bench, Outcome, Progress
+
+
+def _later(module: str, name: str, description: str) -> Bench:
+    def run(progress: Progress, quick: bool) -> Outcome:
+        found: Outcome = import_module(f"psa_casadi.bench.{module}").run(progress, quick)
+        return found
+
+    return Bench(name, description, run)
+
+
+BENCHES: dict[str, Bench] = {
+    bench.name: bench
+    for bench in (
+        _later(
+            "speed",
+            "identify",
+            "identification against scipy's least_squares with solve_ivp, and how it grows",
+        ),
+        _later(
+            "coverage",
+            "coverage",
+            "identified parameters and their intervals against the truth, over seeds and stacks",
+        ),
+        _later(
+            "paper_method",
+            "paper",
+            "the paper's identification beside the prediction-error fit, against noise and window",
+        ),
+        _later(
+            "verification",
+            "verification",
+            "the paper's figures 6 to 10 (loops, steps, other voltages), and three mechanics",
+        ),
+    )
+}
