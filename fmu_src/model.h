@@ -11,6 +11,8 @@ int psa_model_ode(double t, const double *x, const double *u, const double *p, d
 int psa_model_jacobian(double t, const double *x, const double *u, const double *p, double *jac);
 /* y = g(t, x, u, p) */
 int psa_model_outputs(double t, const double *x, const double *u, const double *p, double *y);
+/* z, PSA_NZ values: f has a kink where one of them is zero */
+int psa_model_switches(double t, const double *x, const double *u, const double *p, double *z);
 
 #ifdef PSA_WITH_SENSITIVITIES
 /* df/dx and df/dp, column-major */

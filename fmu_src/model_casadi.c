@@ -12,7 +12,7 @@
 
 typedef int casadi_function(const casadi_real **, casadi_real **, casadi_int *, casadi_real *, int);
 
-casadi_function psa_ode, psa_jacobian, psa_outputs;
+casadi_function psa_ode, psa_jacobian, psa_outputs, psa_switches;
 
 static int call(casadi_function *function, double t, const double *x, const double *u,
                 const double *p, double *first, double *second) {
@@ -39,6 +39,10 @@ int psa_model_jacobian(double t, const double *x, const double *u, const double 
 
 int psa_model_outputs(double t, const double *x, const double *u, const double *p, double *y) {
     return call(psa_outputs, t, x, u, p, y, NULL);
+}
+
+int psa_model_switches(double t, const double *x, const double *u, const double *p, double *z) {
+    return call(psa_switches, t, x, u, p, z, NULL);
 }
 
 #ifdef PSA_WITH_SENSITIVITIES

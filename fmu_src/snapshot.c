@@ -4,7 +4,7 @@
 #include "instance.h"
 
 /* Raise it whenever psa_state or psa_solver changes its meaning. */
-#define SNAPSHOT_VERSION 1u
+#define SNAPSHOT_VERSION 2u
 
 /* In front of the bytes of a psa_state: who wrote them, and whether they arrived whole. A machine of
    another byte order or struct layout fails the comparison of version or size. */

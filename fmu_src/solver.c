@@ -9,6 +9,9 @@
 #define NEWTON_LIMIT 8
 #define NEWTON_TOLERANCE 0.02 /* share of the step's error tolerance */
 #define SAFETY 0.9
+#define KINK_ITERATIONS 12
+#define KINK_RESOLUTION 1e-3 /* of the step in which a kink is located */
+#define KINK_RESTART 0.05    /* first step after a kink over the one that ended there */
 
 static const double C[PSA_STAGES] = {0.0, 1.0 / 2.0, 83.0 / 250.0, 31.0 / 50.0, 17.0 / 20.0, 1.0};
 static const double A[PSA_STAGES][PSA_STAGES] = {
@@ -43,6 +46,7 @@ void psa_solver_start(psa_solver *solver, double t, const double *x, const doubl
 
 void psa_solver_invalidate(psa_solver *solver) {
     solver->slope_valid = 0;
+    solver->landed = 0;
     solver->lu_factor_h = 0.0;
 }
 
@@ -211,6 +215,57 @@ static int step_sensitivities(psa_solver *solver, double h, const psa_input *inp
 }
 #endif
 
+/* x at t + theta h of the step just tried: cubic Hermite interpolation. */
+static void interpolate(const psa_solver *solver, double h, double theta, double *x) {
+    const double *x1 = solver->stage_x[PSA_STAGES - 1], *k1 = solver->stage_k[PSA_STAGES - 1];
+    for (int i = 0; i < PSA_NX; ++i) {
+        const double x0 = solver->x[i], change = x1[i] - x0;
+        x[i] = x0 + theta * change +
+               theta * (theta - 1.0) *
+                   ((1.0 - 2.0 * theta) * change + (theta - 1.0) * h * solver->slope[i] +
+                    theta * h * k1[i]);
+    }
+}
+
+static int switches_at(const psa_solver *solver, double h, double theta, const psa_input *input,
+                       const double *p, double *z) {
+    double x[PSA_NX], u[PSA_NU + 1];
+    const double t = solver->t + theta * h;
+    interpolate(solver, h, theta, x);
+    psa_input_at(input, t, u);
+    return psa_model_switches(t, x, u, p, z);
+}
+
+/* Share of the step just tried after which the first switch has changed its sign; 1 if none does.
+   Illinois's variant of the secant method on the interpolated states. */
+static double first_kink(const psa_solver *solver, double h, const psa_input *input,
+                         const double *p) {
+    double first = 1.0, low[PSA_NZ + 1], high[PSA_NZ + 1], z[PSA_NZ + 1];
+    if (PSA_NZ == 0 || switches_at(solver, h, 0.0, input, p, low) ||
+        switches_at(solver, h, 1.0, input, p, high))
+        return 1.0;
+    for (int s = 0; s < PSA_NZ; ++s) {
+        double a = 0.0, b = 1.0, za = low[s], zb = high[s];
+        if (!(za * zb < 0.0)) continue;
+        for (int i = 0; i < KINK_ITERATIONS && b - a > KINK_RESOLUTION; ++i) {
+            const double margin = 0.01 * (b - a), secant = b - zb * (b - a) / (zb - za);
+            const double theta = fmin(fmax(secant, a + margin), b - margin);
+            if (switches_at(solver, h, theta, input, p, z)) return 1.0;
+            if (z[s] * zb > 0.0) {
+                b = theta;
+                zb = z[s];
+                za *= 0.5;
+            } else {
+                a = theta;
+                za = z[s];
+                zb *= 0.5;
+            }
+        }
+        if (b < first) first = b;
+    }
+    return first;
+}
+
 static psa_status accept(psa_solver *solver, double t_new, double h, const psa_input *input,
                          const double *p, psa_sensitivities *sens) {
     if (sens && step_sensitivities(solver, h, input, p, sens)) return PSA_NOT_FINITE;
@@ -242,20 +297,30 @@ psa_status psa_solver_advance(psa_solver *solver, double t_end, const psa_input 
         set_weights(solver);
         if (psa_model_jacobian(solver->t, solver->x, u, p, solver->jac)) return PSA_NOT_FINITE;
         solver->lu_factor_h = 0.0;
+        double aimed = 0.0; /* length of the step that ends at a kink; 0: no kink is in sight */
         for (int accepted = 0; !accepted;) {
             double h = solver->max_step > 0.0 ? fmin(solver->step, solver->max_step) : solver->step;
             const double left = t_end - solver->t;
-            const int last = h * 1.01 >= left;
-            if (last) h = left;
+            const int last = h * 1.01 >= left && aimed == 0.0;
+            if (aimed > 0.0) h = fmin(h, aimed);
+            else if (last) h = left;
             else if (2.0 * h > left) h = 0.5 * left;
             if (!(h > smallest) && !last) return PSA_STEP_TOO_SMALL;
             if (++taken > limit) return PSA_TOO_MANY_STEPS;
             const double error = try_step(solver, h, input, p);
-            if (error >= 0.0 && error <= 1.0) {
+            const int good = error >= 0.0 && error <= 1.0;
+            const double kink =
+                good && !solver->landed && aimed == 0.0 ? first_kink(solver, h, input, p) : 1.0;
+            if (kink < 1.0 && kink * h > smallest) {
+                aimed = kink * h;
+                solver->rejected++;
+            } else if (good) {
                 const double factor = fmin(5.0, fmax(0.2, SAFETY * pow(fmax(error, 1e-10), -0.25)));
                 const psa_status status = accept(solver, last ? t_end : solver->t + h, h, input, p, sens);
                 if (status != PSA_OK) return status;
-                solver->step = h < solver->step ? fmax(solver->step, h * factor) : h * factor;
+                solver->landed = aimed > 0.0 && h >= aimed;
+                if (solver->landed) solver->step = KINK_RESTART * h;
+                else solver->step = h < solver->step ? fmax(solver->step, h * factor) : h * factor;
                 accepted = 1;
             } else {
                 solver->rejected++;

@@ -28,6 +28,7 @@ typedef struct {
     double slope[PSA_NX];    /* x' at t */
     double last_input[PSA_NU + 1]; /* input that `slope` belongs to */
     int slope_valid;
+    int landed;              /* the last step ended at a kink */
     long steps, rejected, evaluations;
     long steps_limit;        /* of one call of psa_solver_advance; 0: 10 million */
     int culprit;             /* index of the state that failed */

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
+    from psa_casadi import datasets
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
     from psa_casadi.diagnosis.diagnose import diagnose
     from psa_casadi.diagnosis.result import Diagnosis
@@ -123,12 +124,15 @@ __all__ = [
     "check_fmu",
     "InputError",
     "PsaError",
+    "datasets",
     "__version__",
 ]
 
 
 def __getattr__(name: str) -> Any:
     """Load a public name from where it lives."""
+    if name == "datasets":
+        return import_module("psa_casadi.datasets")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'psa_casadi' has no attribute '{name}'")
     value = getattr(import_module(_HOME_OF[name]), name)

@@ -39,6 +39,7 @@ BALANCES: dict[str, Balance] = {
         Balance("hysteresis_rate", "N/s", "rate of the hysteresis force"),
         Balance("free_force", "N", "force the wafers generate before the creep lag"),
         Balance("wafer_force", "N", "force that accelerates and strains the wafers"),
+        Balance("transmitted_force", "N", "force the wafers pass on to the output mass"),
         Balance("tip_force", "N", "force on the output mass from outside the stack"),
         Balance("tip_displacement", "m", "displacement of the output mass"),
         Balance("displacement", "m", "output displacement, with creep and further modes"),
@@ -50,11 +51,16 @@ BALANCES: dict[str, Balance] = {
 
 @dataclass(frozen=True)
 class Equations:
-    """What a component contributes: state derivatives, terms of balances, outputs."""
+    """What a component contributes: state derivatives, terms of balances, outputs.
+
+    `switches` names expressions at whose zeros its equations have a kink or a jump; the solver ends
+    a step there. Components that kink at the same expression give it the same name.
+    """
 
     der: Mapping[str, Expression] = field(default_factory=dict)
     add: Mapping[str, Expression] = field(default_factory=dict)
     out: Mapping[str, Expression] = field(default_factory=dict)
+    switches: Mapping[str, Expression] = field(default_factory=dict)
 
 
 class Symbols:
@@ -83,7 +89,8 @@ class Component:
     for when its derivative vanishes at 0. `looks_like` is the signature an engineer sees.
     `tone` names a parameter that is the frequency of a tone: among the harmonics of a periodic
     drive it cannot be told from distortion. `belongs_to` is plant, drive, sensor or environment;
-    the last two stay out of exported plants.
+    the last two stay out of exported plants. `needs` names components without which this one
+    means nothing.
     """
 
     name: str
@@ -101,3 +108,4 @@ class Component:
     looks_like: str = ""
     equation_text: str = ""
     belongs_to: str = "plant"
+    needs: tuple[str, ...] = ()

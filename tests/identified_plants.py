@@ -1,7 +1,7 @@
 """Records of plants whose truth is known, identified; each once per process."""
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.experiment import Record, read_record
+from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import Identification, identify
@@ -68,11 +69,13 @@ def combinations(p: Mapping[str, float]) -> dict[str, float]:
     }
 
 
-def standard_errors(found: Fit, extra: Mapping[str, float]) -> dict[str, float]:
+def standard_errors(
+    found: Fit, experiments: Sequence[Experiment], extra: Mapping[str, float]
+) -> dict[str, float]:
     """Return the standard errors of the combinations, from the fit's covariance."""
     count = len(found.unknowns.names)
     slopes = found.unknowns.slopes(found.theta)
-    covariance = slopes @ covariance_of(found)[:count, :count] @ slopes.T
+    covariance = slopes @ covariance_of(found, experiments)[:count, :count] @ slopes.T
     p = {**found.model.values, **extra}
     gradients: dict[str, list[float]] = {}
     for name in found.unknowns.names:

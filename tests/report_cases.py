@@ -1,4 +1,4 @@
-"""Diagnoses with chosen findings on a simulated record: what a report must be able to show."""
+"""Diagnoses with chosen findings, and a fit, on simulated records: what a report must show."""
 
 from dataclasses import replace
 from functools import cache
@@ -20,10 +20,12 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment import Record, multisine, time_grid
-from psa_casadi.experiment.split import Experiment, split
+from psa_casadi.experiment.split import Experiment, split, whole
 from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.unknowns import unknowns_of
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.report.series import Curve, Series
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval, Provenance
@@ -47,8 +49,8 @@ def experiment(name: str, samples: int) -> tuple[Experiment, FloatArray, FloatAr
 def _fit(model: Model) -> Fit:
     free = ("k_L", "tau")
     empty = np.zeros((0, 2))
-    return Fit(model, unknowns_of(model, free, 1, 1e-6), np.zeros(3), np.zeros(0), empty,
-               (NOISE,), 0.0, True, 1)  # fmt: skip
+    return Fit(model, unknowns_of(model, free, [{}], [0.0], 1e-6), np.zeros(3), np.zeros(0), empty,
+               (NOISE,), 0.0, True, False, 1)  # fmt: skip
 
 
 def diagnosis(
@@ -92,3 +94,33 @@ def diagnosis(
         extended=tuple(p[2] for p in parts) if added else base,
         model=model,
     )
+
+
+@cache
+def identification() -> Identification:
+    """Return the fit of the base model to two short records that drift."""
+    return identify(
+        [experiment(name, n)[0].record for name, n in (("rig_a", 1500), ("rig_b", 800))]
+    )
+
+
+def long_fit(records: int, samples: int) -> tuple[Identification, tuple[Series, ...]]:
+    """Return a fit that claims to come from long records of loops, and their curves.
+
+    Every record has one sample that is 3 um off, and one missing stretch of a fiftieth.
+    """
+    experiments, rows = [], []
+    for k in range(records):
+        rng = np.random.default_rng(k)
+        time = np.arange(samples) / 100_000.0
+        voltage = 50.0 - 40.0 * np.cos(200.0 * time) * np.exp(-time / time[-1])
+        model = 1e-7 * voltage + 1e-6 * np.sin(200.0 * time)
+        measured = model + NOISE * rng.standard_normal(samples)
+        measured[int((0.05 + 0.4 * k / records) * samples)] += 3e-6
+        measured[samples // 2 : samples // 2 + samples // 50] = np.nan
+        record = Record(f"long_{k + 1}", time, voltage, measured)
+        experiments.append(whole(record))
+        curve = Curve("model", "#0072b2", model)
+        held = np.zeros(samples, dtype=bool)
+        rows.append(Series(record.name, time, voltage, measured, (curve,), held, NOISE, False))
+    return replace(identification(), experiments=tuple(experiments)), tuple(rows)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from psa_casadi.component import RECORD_DURATION, SPECTRAL_PEAKS, Component
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.simulation.codegen import functions_of, generate_c
 from psa_casadi.simulation.compiler import shared_library
@@ -40,6 +41,7 @@ _EXPORTS = """\
 FACE(ode)(POINT, double *a) { return psa_model_ode(t, x, u, p, a); }
 FACE(jacobian)(POINT, double *a) { return psa_model_jacobian(t, x, u, p, a); }
 FACE(outputs)(POINT, double *a) { return psa_model_outputs(t, x, u, p, a); }
+FACE(switches)(POINT, double *a) { return psa_model_switches(t, x, u, p, a); }
 FACE(sensitivity)(POINT, double *a, double *b) { return psa_model_sensitivity(t, x, u, p, a, b); }
 FACE(output_sensitivity)(POINT, double *a, double *b) {
     return psa_model_output_sensitivity(t, x, u, p, a, b);
@@ -100,7 +102,7 @@ def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
     t, u = drive(10001, 1e-7, 0.0)
     extended = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
     plain = run(base, t, u, np.zeros(len(base.state_names)), rtol=1e-8)
-    assert extended.steps == plain.steps == len(t) - 1
+    assert len(t) - 1 <= plain.steps == extended.steps <= 1.01 * len(t)  # one a sample, and turns
     assert np.ptp(plain.y[:, 0]) > 1e-6
     for ours, base_values in ((extended.x, plain.x), (extended.y, plain.y)):
         ranges = np.abs(base_values).max(axis=0)
@@ -143,6 +145,18 @@ def test_declaration_is_complete(effect: Component) -> None:
         else:
             assert values
             assert all(low <= v <= high for v in values)
+
+
+@every_effect
+@pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
+def test_an_effect_composes_where_what_it_needs_is_there(
+    effect: Component, base: tuple[Component, ...]
+) -> None:
+    if set(effect.needs) <= {c.name for c in base}:
+        assert compose((*base, effect)).effects == (effect,)
+        return
+    with pytest.raises(InputError, match=f"'{effect.name}' cannot be composed"):
+        compose((*base, effect))
 
 
 @pytest.mark.parametrize("component", [*COMPONENTS.values(), *ALL], ids=lambda c: c.name)
@@ -220,6 +234,7 @@ def test_generated_jacobians_are_the_slopes_of_the_model(effect: Component) -> N
 
 @every_effect
 def test_sensitivities_are_differences_of_runs(effect: Component) -> None:
+    """Steps that end at a reversal move with the parameters; their lengths count as constant."""
     model = random_model((effect,), np.random.default_rng(6), gains=True)
     unknowns = [*(p.name for p in effect.parameters), "k_L", "A", "beta", "gamma", "tau", "k_B"]
     t, u = drive(4001, 5e-7, 5.0)
@@ -233,4 +248,4 @@ def test_sensitivities_are_differences_of_runs(effect: Component) -> None:
         found = (ends[0][:, -1] - ends[1][:, -1]) / (2 * step)
         size = np.abs(exact[:, column]).max()
         assert size > 0.0, name
-        np.testing.assert_allclose(found, exact[:, column], rtol=0, atol=2e-4 * size, err_msg=name)
+        np.testing.assert_allclose(found, exact[:, column], rtol=0, atol=5e-4 * size, err_msg=name)

@@ -18,7 +18,8 @@ from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import load_model, save_model
 from psa_casadi.report.text import identification_text
 from psa_casadi.simulation.simulate import simulate_record
-from tests.test_report import Page, png_size
+from tests.html_page import Page, figures
+from tests.test_report import png_size
 
 #: The demo takes half a minute: with pytest-xdist's loadgroup it runs once, else once per process.
 pytestmark = pytest.mark.xdist_group("demo")
@@ -131,7 +132,7 @@ def test_the_demos_report_is_whole_and_calls_its_data_synthetic(demo: Demo) -> N
     page = Page(text)
     assert page.loaded == []
     assert len(text) < 8e6
-    assert text.count("Plotly.newPlot(") >= 4
+    assert len(figures(text)) >= 4
     assert "synthetic data" in page.text
     assert "measured" not in page.text.replace("measured minus model", "")
     for part in ("The cause is slow creep", "Every effect", "What remains", "could not have shown",

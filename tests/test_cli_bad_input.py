@@ -194,13 +194,18 @@ def test_outputs_that_collide(tmp_path: Path) -> None:
     assert good.read_text(encoding="utf-8").startswith(HEADER)
 
 
-def test_what_is_not_available_yet_says_so(tmp_path: Path) -> None:
+def test_the_papers_method_takes_no_model(tmp_path: Path) -> None:
     good = write(tmp_path / "good.csv", HEADER, *ROWS)
     model = write(tmp_path / "model.json", MODEL)
     said = refused(
-        "identify", good, "--method", "paper", "-o", tmp_path / "m.json", outputs=tmp_path
-    )
-    assert "not available yet" in said
+        "identify", good, "--method", "paper", "--model", model, "-o", tmp_path / "m.json",
+        outputs=tmp_path,
+    )  # fmt: skip
+    assert "--method paper starts from no model" in said
+
+
+def test_what_is_not_available_yet_says_so(tmp_path: Path) -> None:
+    model = write(tmp_path / "model.json", MODEL)
     fmu = ("export", "fmu", "--model", model, "-o", tmp_path / "x.fmu")
     assert "not available yet" in refused(*fmu, "--fmi", "3", outputs=tmp_path)
     assert "'vax' is not known" in refused(*fmu, "--platforms", "vax", outputs=tmp_path)

@@ -10,7 +10,7 @@ from psa_casadi.components import BASE
 from psa_casadi.experiment import Record, multisine, read_record, time_grid
 from psa_casadi.experiment.split import whole
 from psa_casadi.identification.fit import fit
-from psa_casadi.identification.identify import free_parameters, identify
+from psa_casadi.identification.identify import identify
 from psa_casadi.identification.prediction import predict_record
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
@@ -56,7 +56,7 @@ def test_intervals_cover_the_truth() -> None:
         true, values = (
             combinations(p) for p in (values_of(stack), {**found.model.values, **rated})
         )
-        errors = standard_errors(found.fit, rated)
+        errors = standard_errors(found.fit, found.experiments, rated)
         deviations += [(values[name] - true[name]) / errors[name] for name in true]
     z = np.abs(deviations)
     assert np.count_nonzero(z > 1.96) <= 3
@@ -70,8 +70,8 @@ def test_what_is_not_determined_is_listed(seed: int) -> None:
     found = identified(seed).determinacy
     assert {"c_P", "c_B"} & set(found.undetermined)
     assert not {"k_L", "A", "n", "tau"} & set(found.undetermined)
-    for name in found.undetermined:
-        assert f"'{name}' is not determined by these records." in identified(seed).warnings
+    said = next(w for w in identified(seed).warnings if "not determined by these records" in w)
+    assert all(f"'{name}'" in said for name in found.undetermined)
     assert np.all(np.abs(found.correlations) < 1.0 + 1e-9)
     np.testing.assert_allclose(np.diag(found.correlations), 1.0)
     for name, interval in found.intervals.items():
@@ -86,7 +86,7 @@ def test_a_given_stiffness_scales_the_forces() -> None:
     assert given.model.provenance.force_scale == "given"
     assert given.model.provenance.notes == ()
     p = given.model.values
-    assert 1 / (1 / p["k_P"] + 1 / p["k_B"]) == pytest.approx(1e7, rel=1e-12)
+    assert p["k_B"] == 1e7  # what a load on the output meets
     for name in ("k_L", "A"):
         assert p[name] == pytest.approx(assumed.model.values[name] / 5.0, rel=1e-2)
     pair = [combinations(f.model.values) for f in (assumed, given)]
@@ -107,7 +107,7 @@ def test_two_records_have_their_own_offsets_and_memories() -> None:
     assert found.fit.offset(0) == pytest.approx(1e-6, abs=noise(truth))
     assert found.fit.offset(1) == pytest.approx(-4e-6, abs=3.0 * noise(truth))
     assert found.fit.rms == pytest.approx(noise(truth), rel=0.05)
-    assert found.fit.memory(0).keys() == found.fit.memory(1).keys() == {"f_H"}
+    assert found.fit.start(0).keys() == found.fit.start(1).keys() == {"f_H"}
     one = combinations(identified(4).model.values)
     two = combinations(found.model.values)
     assert two["slope"] == pytest.approx(one["slope"], rel=2e-3)
@@ -161,12 +161,7 @@ def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
 def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any("cut off" in w for w in identified(2).warnings)
     record = plant(2)[1].slice(0, 600)
-    monkeypatch.setattr(
-        "psa_casadi.identification.identify.fit_base",
-        lambda model, experiments, progress: fit(
-            model, experiments, free_parameters(model), sigma=[1e-8], evaluations=3
-        ),
-    )
+    monkeypatch.setattr("psa_casadi.identification.search._POLISH", 3)
     found = identify([record])
     assert found.warnings[0].startswith("The fit was cut off before it converged")
 
@@ -194,6 +189,6 @@ def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
     y: FloatArray = np.asarray(record.displacement)
     found = fit(model, [whole(record)], [], sigma=[rms])
     assert found.rms == pytest.approx(rms, rel=1e-3)
-    x, _, _ = predict_record(model, record, np.array([found.memory(0)["f_H"]]), [],
+    x, _, _ = predict_record(model, record, found.start(0), [],
                              stop=record.n, rtol=1e-8)  # fmt: skip
     assert np.std(x - y) == pytest.approx(rms, rel=2e-3)

@@ -7,9 +7,9 @@ from psa_casadi.experiment import read_record, read_records
 from tests.record_files import HEADER, ROWS, write
 
 
-def problems_of(path: Path, **needs: bool) -> tuple[str, ...]:
+def problems_of(path: Path, *, need_excitation: bool = False) -> tuple[str, ...]:
     with pytest.raises(InputError) as caught:
-        read_record(path, **needs)
+        read_record(path, need_excitation=need_excitation)
     assert all(problem.startswith((str(path), "... and")) for problem in caught.value.problems)
     return caught.value.problems
 
@@ -66,10 +66,24 @@ def test_mistakes_of_a_row(tmp_path: Path, row: str, expected: str) -> None:
     assert ";" in problems[0]
 
 
-def test_a_decimal_comma_is_recognised(tmp_path: Path) -> None:
+def test_one_file_has_one_decimal_sign(tmp_path: Path) -> None:
     rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
-    problems = problems_of(write(tmp_path / "a.csv", HEADER.replace(",", ";"), *rows))
-    assert "decimal point instead of a decimal comma" in problems[0]
+    rows[4] = "0.004;4;0,4"
+    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER.replace(",", ";"), *rows))
+    assert "line 6, column 'time': found '0.004'" in problem
+    assert "other numbers of this file have a decimal comma, write this one so too" in problem
+    rows = [row.replace(",", ";") for row in ROWS]
+    rows[4] = "0,004;4;0.4"
+    (problem,) = problems_of(write(tmp_path / "b.csv", HEADER.replace(",", ";"), *rows))
+    assert "line 6, column 'time': found '0,004'" in problem
+    assert "have a decimal point, write this one so too" in problem
+
+
+def test_decimal_commas_between_commas_are_told_from_a_row_too_long(tmp_path: Path) -> None:
+    rows = [f"0,00{k},1,5,0,{k}" for k in range(9)]
+    problems = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
+    assert "line 2: found 6 cells, expected 3 as in the header; where numbers have" in problems[0]
+    assert "separate the cells by semicolons" in problems[0]
 
 
 def test_line_numbers_count_comments_and_blank_lines(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_fast_resonance_costs_no_more_steps_than_a_slow_stack(form: str) -> No
     assert -light.real / np.abs(light) < 0.04
     steps = [simulate(model, t, voltage).steps for model in (ringing, slow)]
     assert steps[0] < 1.2 * steps[1]
-    assert steps[0] < 3.0 * len(t)
+    assert steps[0] < 3.3 * len(t)  # a step ends at every reversal, two in 40 samples at 5 Hz
     if form in ("sine 1 Hz", "triangle"):
         assert steps[0] > 0.8 * steps[1]
 
@@ -100,9 +100,9 @@ def test_error_falls_with_the_tolerance(name: str) -> None:
     for rtol in (1e-3, 1e-5, 1e-7, 1e-9):
         found = simulate(model, t, v, rtol=rtol).displacement
         errors.append(np.abs(found - best).max() / np.ptp(best))
-    assert errors[0] < 0.02
+    assert errors[0] < 3e-3
     assert errors[-1] < 1e-6
-    assert all(finer < 0.3 * error for error, finer in pairwise(errors))
+    assert all(finer < 0.5 * error for error, finer in pairwise(errors))
 
 
 def test_a_step_far_longer_than_the_drive_does_not_ring() -> None:

@@ -6,6 +6,7 @@ import typer
 
 from psa_casadi.cli.bench import bench
 from psa_casadi.cli.check import check
+from psa_casadi.cli.datasets import datasets
 from psa_casadi.cli.demo import demo
 from psa_casadi.cli.diagnose import diagnose
 from psa_casadi.cli.effects import effects
@@ -60,6 +61,7 @@ app.command(epilog="Example: psa stacks P-885.51")(guarded(stacks))
 app.add_typer(export, name="export")
 export.command(epilog="Example: psa export fmu --model extended.json -o stack.fmu")(guarded(fmu))
 app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))
+app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(datasets))
 app.command(epilog="Example: psa bench identify --quick")(guarded(bench))
 
 

@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Origin, OriginOption, Quiet, show, tell_written, width, working
+from psa_casadi.cli.screen import (
+    ColumnsOption,
+    Origin,
+    OriginOption,
+    Quiet,
+    show,
+    tell_written,
+    width,
+    working,
+)
 
 if TYPE_CHECKING:
     from psa_casadi.diagnosis.result import Diagnosis
@@ -14,7 +23,10 @@ if TYPE_CHECKING:
 
 def diagnose(
     records: Annotated[
-        list[Path], typer.Argument(help="Records of one device: CSV files.", show_default=False)
+        list[Path],
+        typer.Argument(
+            help="Records of one device: CSV, MATLAB or Parquet files.", show_default=False
+        ),
     ],
     holdout: Annotated[
         list[Path] | None,
@@ -35,6 +47,7 @@ def diagnose(
     json: Annotated[Path | None, typer.Option(help="DIAGNOSIS.json to write.")] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     figure: Annotated[Path | None, typer.Option(help="PNG picture to write.")] = None,
+    columns: ColumnsOption = None,
     origin: OriginOption = Origin.MEASURED,
     quiet: Quiet = False,
 ) -> None:
@@ -50,7 +63,7 @@ def diagnose(
     given.stiffness(stiffness)
     outputs = {"--output": output, "--json": json, "--report": report, "--figure": figure}
     given.outputs(outputs, [*records, *held, model])
-    found = given.records(records, held_out=held)
+    found = given.records(records, held_out=held, columns=columns)
     start = given.model(model)
     given.check()
     count = len(records)

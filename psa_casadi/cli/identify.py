@@ -6,7 +6,16 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Origin, OriginOption, Quiet, show, tell_written, width, working
+from psa_casadi.cli.screen import (
+    ColumnsOption,
+    Origin,
+    OriginOption,
+    Quiet,
+    show,
+    tell_written,
+    width,
+    working,
+)
 
 
 class Method(StrEnum):
@@ -18,7 +27,10 @@ class Method(StrEnum):
 
 def identify(
     records: Annotated[
-        list[Path], typer.Argument(help="Records of one device: CSV files.", show_default=False)
+        list[Path],
+        typer.Argument(
+            help="Records of one device: CSV, MATLAB or Parquet files.", show_default=False
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="MODEL.json to write.")],
     model: Annotated[
@@ -31,29 +43,31 @@ def identify(
         Method, typer.Option(help="How the parameters are found.")
     ] = Method.PREDICTION_ERROR,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
+    columns: ColumnsOption = None,
     origin: OriginOption = Origin.MEASURED,
     quiet: Quiet = False,
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.identification.identify import identify as run
+    from psa_casadi.identification.paper.method import identify_by_paper as by_paper
     from psa_casadi.model.model_file import save_model
     from psa_casadi.report.fit_page import write_fit_report
     from psa_casadi.report.text import identification_text
 
     given = Given()
-    if method is Method.PAPER:
-        given.add(
-            "--method paper: the paper's own procedure is not available yet; leave --method out,"
-            " or give prediction-error."
-        )
+    if method is Method.PAPER and model is not None:
+        given.add("--method paper starts from no model; leave --model or --method out.")
     given.stiffness(stiffness)
     given.outputs({"--output": output, "--report": report}, [*records, model])
-    measured = given.records(records)
+    measured = given.records(records, columns=columns)
     start = given.model(model)
     given.check()
     with working("identifying", quiet) as progress:
-        found = run(measured, model=start, stiffness=stiffness, progress=progress)
+        if method is Method.PAPER:
+            found = by_paper(measured, stiffness=stiffness, progress=progress)
+        else:
+            found = run(measured, model=start, stiffness=stiffness, progress=progress)
         save_model(found.model, output)
         if report is not None:
             progress("writing the report")

@@ -7,6 +7,8 @@ from typing import TypeVar
 
 from psa_casadi.errors import InputError
 from psa_casadi.experiment import Record, read_record
+from psa_casadi.experiment.column_map import parse_columns
+from psa_casadi.experiment.columns import ColumnMap
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.stacks import stack_model
@@ -37,16 +39,28 @@ class Given:
         if self._problems:
             raise InputError(self._problems)
 
-    def records(self, paths: Sequence[Path], *, held_out: Sequence[Path] = ()) -> list[Record]:
+    def records(
+        self,
+        paths: Sequence[Path],
+        *,
+        held_out: Sequence[Path] = (),
+        columns: str | None = None,
+    ) -> list[Record]:
         """Read records to fit, then those held out; no record may be given twice.
 
-        A record to fit must have a voltage that changes, all must have a displacement.
+        A record to fit must have a voltage that changes, all must have a displacement. `columns` is
+        what --columns says. Nothing is read where that is not understood.
         """
+        wanted = self.columns(columns)
+        if wanted is None:
+            return []
         found: list[Record] = []
         for path in (*paths, *held_out):
             fitted = path in paths
             record = self.attempt(
-                lambda p=path, f=fitted: read_record(p, need_excitation=f)  # type: ignore[misc]
+                lambda p=path, f=fitted: read_record(  # type: ignore[misc]
+                    p, need_excitation=f, columns=wanted
+                )
             )
             if record is None:
                 continue
@@ -58,6 +72,17 @@ class Given:
                 )
             found.append(record)
         return found
+
+    def voltage(self, path: Path, *, columns: str | None = None) -> Record | None:
+        """Read a record whose voltage is to be applied; it need not have a displacement."""
+        wanted = self.columns(columns)
+        if wanted is None:
+            return None
+        return self.attempt(lambda: read_record(path, need_displacement=False, columns=wanted))
+
+    def columns(self, text: str | None) -> ColumnMap | None:
+        """Return what --columns says, nothing where it is left out; None where it is wrong."""
+        return self.attempt(lambda: parse_columns(text)) if text is not None else {}
 
     def model(self, path: Path | None) -> Model | None:
         """Read a model that turns a voltage into a displacement; None where no file is named."""

@@ -23,6 +23,15 @@ StackOption = Annotated[
     typer.Option("--stack", help="Named stack in place of a model; `psa stacks` lists them."),
 ]
 
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--columns",
+        help="Arrays of the files that are the columns, where their names differ:"
+        " time=t:ms,voltage=log.u,displacement=m.2:um",
+    ),
+]
+
 
 class Origin(StrEnum):
     """What the records are."""

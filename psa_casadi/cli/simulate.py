@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written, working
+from psa_casadi.cli.screen import ColumnsOption, Quiet, StackOption, show, tell_written, working
 
 if TYPE_CHECKING:
     from psa_casadi.model.compose import Model
@@ -15,31 +15,32 @@ if TYPE_CHECKING:
 
 def simulate(
     record: Annotated[
-        Path, typer.Option("--input", help="CSV with time and voltage, and load_force if any.")
+        Path, typer.Option("--input", help="Record with time and voltage, and load_force if any.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json to simulate.")] = None,
     stack: StackOption = None,
+    columns: ColumnsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a model on a measured or planned voltage; write every output with its unit."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.experiment import read_record, write_record
+    from psa_casadi.experiment import write_record
     from psa_casadi.simulation.simulate import simulate_record
 
     given = Given()
     given.outputs({"--output": output}, [model, record])
     chosen = given.model_or_stack(model, stack)
-    voltage = given.attempt(lambda: read_record(record, need_displacement=False))
+    voltage = given.voltage(record, columns=columns)
     given.check()
     if chosen is None or voltage is None:
         return
     with working("simulating", quiet):
         found = simulate_record(chosen, voltage)
-        columns = output_columns(chosen, found)
-        write_record(output, columns)
+        written = output_columns(chosen, found)
+        write_record(output, written)
     show(f"{voltage.n} samples over {voltage.duration:.6g} s in {found.steps} steps", quiet)
-    show(f"columns: {', '.join(columns)}", quiet)
+    show(f"columns: {', '.join(written)}", quiet)
     tell_written(output, quiet=quiet)
 
 

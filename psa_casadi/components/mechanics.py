@@ -32,20 +32,21 @@ def _stiffness(name: str, value: float, what: str) -> Parameter:
 
 
 def _cascade(s: Symbols) -> Equations:
-    transmitted = s.c_P * s.v_y + s.k_P * s.y
+    elastic = s.c_P * s.v_y + s.k_P * s.y
+    pull = s.c_B * (s.v_x - s.v_y) + s.k_B * (s.x - s.y)
     return Equations(
         der={
             "y": s.v_y,
-            "v_y": (s.wafer_force - transmitted) / s.m_P,
+            "v_y": (s.wafer_force - elastic) / s.m_P,
             "x": s.v_x,
-            "v_x": (transmitted + s.tip_force - s.c_B * (s.v_x - s.v_y) - s.k_B * (s.x - s.y))
-            / s.m_B,
+            "v_x": (s.transmitted_force + s.tip_force - pull) / s.m_B,
         },
         add={
+            "transmitted_force": elastic,
             "tip_force": s.load_force,
             "tip_displacement": s.x,
             "displacement": s.tip_displacement,
-            "blocked_force": transmitted + s.c_B * s.v_y + s.k_B * s.y,
+            "blocked_force": s.transmitted_force + s.c_B * s.v_y + s.k_B * s.y,
         },
         out={"displacement": s.displacement, "blocked_force": s.blocked_force},
     )

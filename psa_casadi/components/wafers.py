@@ -24,7 +24,9 @@ def _bouc_wen(s: Symbols) -> Equations:
         + s.delta * s.u * direction(s)
     )
     return Equations(
-        der={"f_H": s.hysteresis_rate}, add={"hysteresis_rate": rate, "free_force": s.f_H}
+        der={"f_H": s.hysteresis_rate},
+        add={"hysteresis_rate": rate, "free_force": s.f_H},
+        switches={"voltage_reversal": s.voltage_rate},
     )
 
 

@@ -26,9 +26,10 @@ from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment, split, whole
+from psa_casadi.experiment.suspects import cleaned
 from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.identify import Progress, fit_base, refit
 from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
+from psa_casadi.identification.search import Progress, fit_base, refit
 from psa_casadi.identification.starting import starting_model
 from psa_casadi.model.compose import Model
 
@@ -76,7 +77,7 @@ def diagnose(
     InputError.
     """
     table = list(effects if effects is not None else EFFECTS.values())
-    experiments = _experiments(records, holdout)
+    experiments = _experiments([cleaned(r) for r in records], [cleaned(r) for r in holdout])
     start = (model or starting_model(records, stiffness)).without(
         c.name for c in table if c.gain is not None
     )

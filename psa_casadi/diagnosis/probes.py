@@ -114,7 +114,7 @@ def _histories(
     fit: Fit, experiments: Sequence[Experiment], effect: Component, model: Model
 ) -> list[tuple[dict[str, float], ...]]:
     """The effect's memories at rest, and for settling ones also as after long cycling."""
-    known = [fit.memory(r) for r in range(len(experiments))]
+    known = [fit.start(r) for r in range(len(experiments))]
     settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
     variants = [tuple(known)]
     if settling:
@@ -140,9 +140,9 @@ def _column(
     parts: list[FloatArray] = []
     first = 0
     for e, start in zip(experiments, memory, strict=True):
-        deviation = np.array([start.get(n, 0.0) for n in names])
+        states = dict.fromkeys(names, 0.0) | start
         y, by_gain, _ = predict_record(
-            changed, e.record, deviation, [gain], stop=e.stop, rtol=FIT_RTOL if step else _RTOL
+            changed, e.record, states, [gain], stop=e.stop, rtol=FIT_RTOL if step else _RTOL
         )
         used = e.used[: e.stop]
         count = int(used.sum())

@@ -13,7 +13,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.experiment.drive import among_harmonics
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
-from psa_casadi.identification.identify import FIXED
+from psa_casadi.identification.search import FIXED
 from psa_casadi.identification.starting import ordinary_values
 
 FloatArray = npt.NDArray[np.float64]
@@ -100,7 +100,7 @@ def extend_afresh(
         n: first.fit.model.values[n] if isinstance(grid, str) else _declared(effect, n)
         for n, grid in effect.probe.items()
     }
-    memory = tuple(before.memory(r) for r in range(len(experiments)))
+    memory = tuple(before.start(r) for r in range(len(experiments)))
     starts = [
         (values, sign * size, memory) for sign in (1.0, -1.0) if sign > 0 or gain.bounds[0] < 0
     ]
@@ -123,7 +123,7 @@ def polish(
                 experiments,
                 current.unknowns.names,
                 sigma=before.sigma,
-                start_memory=[current.memory(r) for r in range(len(experiments))],
+                start_states=[current.start(r) for r in range(len(experiments))],
                 evaluations=evaluations,
                 tolerance=tolerance,
                 rtol=rtol,
@@ -196,7 +196,7 @@ def _fit_from(
                 experiments,
                 names,
                 sigma=before.sigma,
-                start_memory=memory,
+                start_states=memory,
                 evaluations=_QUICK,
                 tolerance=1e-3,
                 rtol=_QUICK_RTOL,

@@ -19,7 +19,7 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.selection import MARGIN, Extension
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
 from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
@@ -61,8 +61,9 @@ def conclude(
         verdict = "ambiguous"
     named = chosen if verdict in ("cause_named", "partly_explained", "ambiguous") else []
     final = last if named else first
+    found = determinacy(final.fit, experiments)
     causes = tuple(
-        _cause(r, last.fit, share, _explained_share(experiments, r, after, floor))
+        _cause(r, last.fit, found, share, _explained_share(experiments, r, after, floor))
         for r, after in zip(named, rounds[1:], strict=False)
     )
     return Diagnosis(
@@ -84,7 +85,7 @@ def conclude(
         extended=final.predicted,
         model=with_provenance(
             final.fit.model,
-            determinacy(final.fit),
+            found,
             [e.record for e in experiments],
             stiffness_given,
         ),
@@ -114,10 +115,9 @@ def _told_from(r: "Round") -> tuple[str, ...]:
     )
 
 
-def _cause(r: "Round", final: Fit, share: float, own: float) -> Cause:
+def _cause(r: "Round", final: Fit, found: Determinacy, share: float, own: float) -> Cause:
     """State a cause: `share` is what all causes explain, `own` what this one did of its round's."""
     chosen: Extension = r.chosen  # type: ignore[assignment]
-    found = determinacy(final)
     estimates = {
         p.name: Estimate(
             final.model.values[p.name],

@@ -11,7 +11,7 @@ from psa_casadi.experiment.excitation import (
     time_grid,
     triangle,
 )
-from psa_casadi.experiment.read_csv import read_record, read_records
+from psa_casadi.experiment.reading import read_record, read_records
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.write_csv import write_record
 

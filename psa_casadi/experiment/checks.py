@@ -17,20 +17,28 @@ LISTED = 20
 
 @dataclass(frozen=True)
 class Located:
-    """One column's values, the lines they stand in, and which of them were reported already."""
+    """One column's values, where they stand, and which of them were reported already.
+
+    Value k stands in `place` number `lines[k]` of the file: a "line" of text, a "row" of a table.
+    """
 
     path: str
     name: str
     values: FloatArray
     lines: NDArray[np.int64]
     reported: NDArray[np.bool_]
+    place: str = "line"
 
     def complain(self, at: NDArray[np.bool_], sentence: str, problems: Problems) -> None:
-        """Add `sentence`, in which {value} is the value found, for every sample that `at` marks."""
+        """Add `sentence` for every sample that `at` marks.
+
+        In the sentence {value} is the value found and {place} what holds it.
+        """
         rows = np.flatnonzero(at & ~self.reported)
         for row in rows[:LISTED]:
-            found = sentence.format(value=f"{self.values[row]:.6g}")
-            problems.add(f"{self.path}: line {self.lines[row]}, column '{self.name}': {found}")
+            found = sentence.format(value=f"{self.values[row]:.6g}", place=self.place)
+            where = f"{self.path}: {self.place} {self.lines[row]}, column '{self.name}'"
+            problems.add(f"{where}: {found}")
         problems.add_uncounted(max(0, rows.size - LISTED))
 
 
@@ -53,9 +61,10 @@ def check_time(time: Located, problems: Problems) -> None:
         now, last = time.values[row], time.values[before]
         what = "stands still" if now == last else "goes back"
         problems.add(
-            f"{time.path}: line {time.lines[row]}, column 'time': time {what} (from {last:.9g} in "
-            f"line {time.lines[before]} to {now:.9g}), expected a later instant in every line; "
-            f"remove repeated lines or split the file where a new record begins."
+            f"{time.path}: {time.place} {time.lines[row]}, column 'time': time {what} (from "
+            f"{last:.9g} in {time.place} {time.lines[before]} to {now:.9g}), expected a later "
+            f"instant in every {time.place}; remove repeated {time.place}s or split the file where "
+            f"a new record begins."
         )
 
 
@@ -63,7 +72,7 @@ def check_complete(column: Located, problems: Problems) -> None:
     """Demand a finite number in every row."""
     column.complain(
         np.isnan(column.values),
-        "found no value, expected a number; fill the cell or remove the line.",
+        "found no value, expected a number; fill the cell or remove the {place}.",
         problems,
     )
     _check_finite(column, problems)
@@ -94,6 +103,6 @@ def check_excitation(column: Located, problems: Problems) -> None:
 def _check_finite(column: Located, problems: Problems) -> None:
     column.complain(
         np.isinf(column.values),
-        "found {value}, expected a finite number; correct the cell or remove the line.",
+        "found {value}, expected a finite number; correct the cell or remove the {place}.",
         problems,
     )

@@ -40,18 +40,37 @@ class Field:
     unit: str
 
 
+@dataclass(frozen=True)
+class Source:
+    """The array that holds a column, and its unit; None where the file or the column says it."""
+
+    array: str
+    unit: str | None
+
+
+#: Which array of a file is which column: sources by the name of the column.
+ColumnMap = Mapping[str, Source]
+
+#: Where nobody names a unit, a column is taken to be in this one; a displacement never is.
+SI_UNITS = {"time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K"}
+
 _HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 
 
 def parse_header(
-    texts: Sequence[str], required: Sequence[str], where: str, problems: Problems
+    texts: Sequence[str],
+    required: Sequence[str],
+    where: str,
+    problems: Problems,
+    wanted: ColumnMap | None = None,
 ) -> Mapping[str, Field]:
     """Return the columns that a header line `name [unit],name [unit],...` names.
 
-    `where` (file and line) begins every sentence added to `problems`: no header, a required column
-    missing or misspelled, one that stands twice, a unit that is missing, unknown or of another
-    quantity.
+    `wanted` says which name stands for which column where the header does not use the columns'
+    own names. `where` (file and line) begins every sentence added to `problems`: no header, a
+    column missing, misspelled or there twice, a unit that is missing or wrong.
     """
+    wanted = wanted or {}
     if all(_is_number(text) for text in texts):
         problems.add(
             f"{where}: found '{','.join(texts)[:60]}', expected a header; write a first line such "
@@ -62,22 +81,77 @@ def parse_header(
     strangers: list[str] = []
     for index, text in enumerate(texts):
         match = _HEADER.fullmatch(text.strip())
-        name = re.sub(r"\s+", "_", match["name"].strip().lower()) if match else text
+        own = match["name"].strip() if match else text
+        name = _column_of(own, wanted)
         if match is None or name not in COLUMNS:
-            strangers.append(name)
+            strangers.append(own)
         elif name in fields:
             problems.add(
                 f"{where}, column {index + 1}: '{name}' stands twice in the header (first as "
                 f"column {fields[name].index + 1}); rename or remove one of the two."
             )
         else:
-            _check_unit(COLUMNS[name], match["unit"], f"{where}, column '{name}'", problems)
-            fields[name] = Field(index, match["unit"] or "")
-    _report_missing(fields, strangers, required, where, problems)
+            place = f"{where}, column '{own if name in wanted else name}'"
+            unit = _agreed_unit(name, match["unit"], wanted, place, problems)
+            fields[name] = Field(index, unit)
+    _report_absent(fields, strangers, wanted, where, problems)
+    _report_missing(fields, strangers, [r for r in required if r not in wanted], where, problems)
     return fields
 
 
-def _check_unit(column: Column, unit: str | None, where: str, problems: Problems) -> None:
+def _plain(name: str) -> str:
+    return re.sub(r"\s+", "_", name.strip().lower())
+
+
+def _column_of(own: str, wanted: ColumnMap) -> str:
+    """Return the column that a name in a header stands for, or the name itself."""
+    for name, source in wanted.items():
+        if _plain(source.array) == _plain(own):
+            return name
+    return "" if _plain(own) in wanted else _plain(own)
+
+
+def _agreed_unit(
+    name: str, own: str | None, wanted: ColumnMap, where: str, problems: Problems
+) -> str:
+    """Return the unit that the header or `wanted` gives; the two must not disagree."""
+    given = wanted[name].unit if name in wanted else None
+    unit = own or given or (SI_UNITS.get(name) if name in wanted else None)
+    check_unit(COLUMNS[name], unit, where, problems)
+    if own and given and not _same_unit(own, given):
+        problems.add(
+            f"{where}: the header gives the unit '{own}', --columns gives '{given}'; leave the one "
+            f"in --columns out, or correct it."
+        )
+    return unit or ""
+
+
+def _same_unit(one: str, other: str) -> bool:
+    try:
+        return parse_unit(one).name == parse_unit(other).name
+    except InputError:
+        return True  # the unknown one was told already
+
+
+def _report_absent(
+    fields: Mapping[str, Field],
+    strangers: Sequence[str],
+    wanted: ColumnMap,
+    where: str,
+    problems: Problems,
+) -> None:
+    """Complain of names in `wanted` that the header does not have."""
+    for name, source in wanted.items():
+        if name not in fields:
+            found = ", ".join(filter(None, [*fields, *strangers])) or "nothing"
+            problems.add(
+                f"{where}: '{source.array}', which --columns names for '{name}', is not in the "
+                f"header (found: {found[:120]}); correct --columns."
+            )
+
+
+def check_unit(column: Column, unit: str | None, where: str, problems: Problems) -> None:
+    """Demand a unit that measures what the column holds."""
     accepted = ", ".join(name for q in column.quantities for name in units_of(q))
     if unit is None or not unit.strip():
         problems.add(
@@ -106,9 +180,9 @@ def _report_missing(
 ) -> None:
     absent = [name for name in COLUMNS if name not in fields]
     meant = {
-        near[0]: name
+        near[0]: _plain(name)
         for name in strangers
-        if (near := difflib.get_close_matches(name, absent, n=1, cutoff=0.8))
+        if (near := difflib.get_close_matches(_plain(name), absent, n=1, cutoff=0.8))
     }
     for name in absent:
         if name in meant:

@@ -6,14 +6,14 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.experiment.columns import Field
+from psa_casadi.experiment.file_bytes import read_bytes
 from psa_casadi.units import FloatArray
 
 
@@ -22,6 +22,7 @@ class CsvText:
     """The text of a file, split into its header and the rows below it.
 
     `rows` are the lines after the header; `first_line` is the line number of the first of them.
+    Numbers have a decimal `point`, or a decimal comma where spreadsheets of that custom wrote them.
     """
 
     path: str
@@ -30,6 +31,7 @@ class CsvText:
     delimiter: str
     rows: tuple[str, ...]
     first_line: int
+    point: str = "."
 
     @property
     def where_header(self) -> str:
@@ -58,7 +60,7 @@ def load_text(path: str | os.PathLike[str]) -> CsvText:
     Raises:
         InputError: the file is missing, a directory, empty, unreadable, not text, or only comments.
     """
-    data = _read_bytes(path)
+    data = read_bytes(path)
     text = _decode(data, str(path)).replace("\r\n", "\n").replace("\r", "\n")
     lines = text.split("\n")
     start = 0
@@ -72,24 +74,6 @@ def load_text(path: str | os.PathLike[str]) -> CsvText:
     return CsvText(
         str(path), digest, tuple(header), delimiter, tuple(lines[start + 1 :]), start + 2
     )
-
-
-def _read_bytes(path: str | os.PathLike[str]) -> bytes:
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: there is no such file; check the name and the directory it is in."
-        ) from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a directory; name the CSV files in it.") from None
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check that you may read it."
-        ) from error
-    if not data.strip():
-        raise InputError(f"{path}: the file is empty; export the record again.")
-    return data
 
 
 def _decode(data: bytes, path: str) -> str:
@@ -108,15 +92,44 @@ def _decode(data: bytes, path: str) -> str:
 def parse_numbers(text: CsvText, fields: Mapping[str, Field], problems: Problems) -> Numbers:
     """Return the values of the columns in `fields`, in their order and in the units of the file.
 
-    An empty cell is nan, as is the word. Adds to `problems` each row with a wrong number of cells
-    and each cell that is not a number, with line and column.
+    An empty cell is nan, as is the word. The first cell with a point or a comma between digits
+    decides which of them the whole file has for its decimals. Adds to `problems` each row with a
+    wrong number of cells and each cell that is not a number, with line and column.
     """
+    text = replace(text, point=_decimal_point(text, fields))
     quick = _parse_at_once(text, [field.index for field in fields.values()])
     return quick if quick is not None else _parse_by_cell(text, fields, problems)
 
 
+_DECIMAL = re.compile(r"\s*[+-]?\d*([.,])\d*([eE][+-]?\d+)?\s*")
+_SWAPPED = str.maketrans(".,", ",.")
+
+
+def _decimal_point(text: CsvText, fields: Mapping[str, Field]) -> str:
+    """Return the decimal sign of the first wanted cell that has one."""
+    for row in text.rows:
+        if "." not in row and "," not in row:
+            continue
+        cells = _cells(text, row)
+        for field in fields.values():
+            found = _DECIMAL.fullmatch(cells[field.index]) if field.index < len(cells) else None
+            if found:
+                return found[1]
+    return "."
+
+
+def _cells(text: CsvText, row: str) -> list[str]:
+    if '"' in row:
+        return next(csv.reader([row], delimiter=text.delimiter))
+    return row.split(text.delimiter)
+
+
 def _parse_at_once(text: CsvText, indices: Sequence[int]) -> Numbers | None:
     """Let NumPy read all rows; None if any of them needs a closer look."""
+    if text.point == ",":
+        if text.delimiter == ",":
+            return None
+        text = replace(text, rows=tuple("\n".join(text.rows).translate(_SWAPPED).split("\n")))
     filled = [row for row in text.rows if row]
     body = "\n".join(filled)
     mark = text.delimiter
@@ -137,22 +150,17 @@ def _parse_at_once(text: CsvText, indices: Sequence[int]) -> Numbers | None:
 
 
 def _parse_by_cell(text: CsvText, fields: Mapping[str, Field], problems: Problems) -> Numbers:
-    mark = text.delimiter
     values: list[list[float]] = []
     lines: list[int] = []
     reported: list[list[bool]] = []
     for line, row in enumerate(text.rows, text.first_line):
         if not row.strip():
             continue
-        quoted = '"' in row
-        cells = next(csv.reader([row], delimiter=mark)) if quoted else row.split(mark)
+        cells = _cells(text, row)
         if len(cells) != len(text.header):
-            problems.add(
-                f"{text.path}: line {line}: found {len(cells)} cells, expected {len(text.header)} "
-                f"as in the header; complete or remove the line."
-            )
+            problems.add(_wrong_count(text, line, len(cells)))
             continue
-        numbers = [_number(cells[field.index]) for field in fields.values()]
+        numbers = [_number(cells[field.index], text.point) for field in fields.values()]
         if None in numbers:
             for (name, field), number in zip(fields.items(), numbers, strict=True):
                 if number is None:
@@ -168,8 +176,21 @@ def _parse_by_cell(text: CsvText, fields: Mapping[str, Field], problems: Problem
     )
 
 
-def _number(cell: str) -> float | None:
+def _wrong_count(text: CsvText, line: int, found: int) -> str:
+    expected = len(text.header)
+    hint = "complete or remove the line"
+    if text.delimiter == "," and found == 2 * expected:
+        hint = "where numbers have decimal commas, separate the cells by semicolons"
+    return (
+        f"{text.path}: line {line}: found {found} cells, expected {expected} as in the header; "
+        f"{hint}."
+    )
+
+
+def _number(cell: str, point: str) -> float | None:
     content = cell.strip()
+    if point == ",":
+        content = content.translate(_SWAPPED)
     if not content:
         return math.nan
     try:
@@ -182,8 +203,9 @@ def _not_a_number(text: CsvText, line: int, name: str, cell: str) -> str:
     hint = "correct it, or leave the cell empty where the sample is missing"
     if name in ("time", "voltage"):
         hint = "correct it or remove the line"
-    if re.fullmatch(r"\s*[+-]?\d+,\d+([eE][+-]?\d+)?\s*", cell):
-        hint = "export with a decimal point instead of a decimal comma"
+    if (decimal := _DECIMAL.fullmatch(cell)) and decimal[1] != text.point:
+        other = "comma" if text.point == "," else "point"
+        hint = f"other numbers of this file have a decimal {other}, write this one so too"
     return (
         f"{text.path}: line {line}, column '{name}': found '{cell.strip()[:40]}', expected "
         f"a number; {hint}."

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.levenberg_marquardt import Evaluate, minimise
-from psa_casadi.identification.prediction import measured, predict
-from psa_casadi.identification.unknowns import Unknowns, unknowns_of
+from psa_casadi.identification.prediction import measured, motions_of, predict
+from psa_casadi.identification.unknowns import Unknowns, static_compliance, unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.stepper import SimulationError
 
@@ -27,7 +27,8 @@ class Fit:
     `model` carries the estimates; `residuals` (used samples of every record, stacked) [m] are
     measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
-    the priors. `converged` is False when the iteration was cut off.
+    the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
+    keyboard interrupt did that.
     """
 
     model: Model
@@ -38,17 +39,22 @@ class Fit:
     sigma: tuple[float, ...]
     cost: float
     converged: bool
+    interrupted: bool
     evaluations: int
+
+    def of_record(self, experiments: Sequence[Experiment], record: int) -> slice:
+        """Where the used samples of one record stand in `residuals` and `jacobian`."""
+        counts = [int(e.used.sum()) for e in experiments[: record + 1]]
+        return slice(sum(counts[:-1]), sum(counts))
 
     @property
     def rms(self) -> float:
         """Root mean square of the residuals [m]."""
         return float(np.sqrt(np.mean(self.residuals**2)))
 
-    def memory(self, record: int) -> dict[str, float]:
-        """Memory deviations at the start of one record."""
-        values = self.unknowns.memory(self.theta, record)
-        return dict(zip(self.unknowns.memories, values.tolist(), strict=True))
+    def start(self, record: int) -> dict[str, float]:
+        """Deviations of one record's initial state from where its voltage and rate put it."""
+        return self.unknowns.start(self.theta, record)
 
     def offset(self, record: int) -> float:
         """Sensor offset of one record [m]."""
@@ -69,12 +75,12 @@ def fit(
     *,
     sigma: Sequence[float],
     start: Mapping[str, float] | None = None,
-    start_memory: Sequence[Mapping[str, float]] | None = None,
+    start_states: Sequence[Mapping[str, float]] | None = None,
     evaluations: int = 40,
     tolerance: float = 1e-5,
     rtol: float = FIT_RTOL,
 ) -> Fit:
-    """Fit the free parameters, every record's memory and offset to the used samples.
+    """Fit the free parameters, every record's initial state and offset to the used samples.
 
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
@@ -84,12 +90,15 @@ def fit(
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
     scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
-    unknowns = unknowns_of(model, free, len(experiments), 30.0 * max(scale, 1e-12))
-    theta = _starting_point(model, experiments, unknowns, start or {}, start_memory)
+    placed = model.with_values(start or {})
+    motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
+    first = [float(e.record.voltage[0]) for e in experiments]
+    unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
+    theta = _starting_point(model, experiments, unknowns, start or {}, start_states)
     weights = np.concatenate(
         [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
     )
-    evaluate = _objective(model, experiments, unknowns, weights, rtol)
+    evaluate = objective(model, experiments, unknowns, weights, rtol)
     minimum = minimise(
         evaluate, theta, unknowns.bounds(), tolerance=tolerance, evaluations=evaluations
     )
@@ -106,11 +115,12 @@ def fit(
         sigma=tuple(sigma),
         cost=minimum.cost,
         converged=minimum.converged,
+        interrupted=minimum.interrupted,
         evaluations=minimum.evaluations,
     )
 
 
-def _objective(
+def objective(
     model: Model,
     experiments: Sequence[Experiment],
     unknowns: Unknowns,
@@ -142,28 +152,14 @@ def _starting_point(
     experiments: Sequence[Experiment],
     unknowns: Unknowns,
     start: Mapping[str, float],
-    start_memory: Sequence[Mapping[str, float]] | None,
+    start_states: Sequence[Mapping[str, float]] | None,
 ) -> FloatArray:
+    values = {**model.values, **start}
     theta = np.zeros(unknowns.size)
-    theta[: len(unknowns.names)] = unknowns.coordinates({**model.values, **start})
+    theta[: len(unknowns.names)] = unknowns.coordinates(values)
     for r, experiment in enumerate(experiments):
-        first = len(unknowns.names) + r * unknowns.per_record
-        for m, name in enumerate(unknowns.memories):
-            given = start_memory[r].get(name, 0.0) if start_memory else 0.0
-            theta[first + m] = given / unknowns.memory_scale[m]
-        record = experiment.record
-        y = measured(record)[experiment.used]
-        slope = _static_slope(model, {**model.values, **start})
-        mean = float(np.mean(y)) - slope * float(np.mean(record.voltage[experiment.used]))
-        theta[first + unknowns.per_record - 1] = mean / unknowns.offset_scale
+        given = start_states[r] if start_states else {}
+        y, v = measured(experiment.record)[experiment.used], experiment.record.voltage
+        slope = values["G"] * values["k_L"] * static_compliance(values)
+        unknowns.place(theta, r, given, float(np.mean(y) - slope * np.mean(v[experiment.used])))
     return theta
-
-
-def _static_slope(model: Model, values: Mapping[str, float]) -> float:
-    """Displacement per volt of the linear force at rest [m/V], hysteresis aside."""
-    stiffness = (
-        values["k_P"] * values["k_B"] / (values["k_P"] + values["k_B"])
-        if "k_B" in values
-        else values["k"]
-    )
-    return values["G"] * values["k_L"] / stiffness

@@ -25,13 +25,17 @@ _ACTIVE_SETS = 20
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the iteration ended, with residual and Jacobian there, and whether it converged."""
+    """Where the iteration ended, with residual and Jacobian there, and how it ended.
+
+    Neither `converged` nor `interrupted`: the evaluations were used up.
+    """
 
     theta: FloatArray
     residual: FloatArray
     jacobian: FloatArray
     cost: float
     converged: bool
+    interrupted: bool
     evaluations: int
 
 
@@ -49,7 +53,7 @@ def minimise(
     Moré 1978) and the bounds, and is accepted if the cost falls; the radius follows the ratio of
     actual to predicted decrease.
     Converged when two steps in a row lower the cost by less than `tolerance` of it, or no radius
-    lowers it at all.
+    lowers it at all. A keyboard interrupt ends the iteration at the best point so far.
     """
     low, high = bounds
     theta = np.clip(theta, low, high)
@@ -58,7 +62,7 @@ def minimise(
         return None
     residual, jacobian = start
     cost, radius = float(residual @ residual), _FIRST_RADIUS
-    count, quiet, converged = 1, 0, False
+    count, quiet, converged, interrupted = 1, 0, False, False
     while count < evaluations and not converged:
         gradient, normal = jacobian.T @ residual, jacobian.T @ jacobian
         move = _bounded_step(gradient, normal, radius, low - theta, high - theta)
@@ -67,7 +71,11 @@ def minimise(
         if predicted <= 1e-2 * tolerance * cost:
             converged = True
             break
-        found = evaluate(trial)
+        try:
+            found = evaluate(trial)
+        except KeyboardInterrupt:
+            interrupted = True
+            break
         count += 1
         new = float(found[0] @ found[0]) if found is not None else np.inf
         ratio = (cost - new) / predicted
@@ -80,7 +88,7 @@ def minimise(
             theta, (residual, jacobian), cost = trial, found, new
             converged = quiet == 2
         converged = converged or radius < _SMALLEST_RADIUS
-    return Minimum(theta, residual, jacobian, cost, converged, count)
+    return Minimum(theta, residual, jacobian, cost, converged, interrupted, count)
 
 
 def _bounded_step(

@@ -1,6 +1,8 @@
 """Predictions of a model for a set of experiments, and their exact derivatives."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +13,12 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.unknowns import Unknowns
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.start import (
+    initial_slope,
+    memory_names,
+    settling_time,
+    start_state,
+)
 from psa_casadi.simulation.stepper import run
 
 FloatArray = npt.NDArray[np.float64]
@@ -48,32 +55,74 @@ def inputs_of(model: Model, record: Record, stop: int) -> FloatArray:
 def predict_record(
     model: Model,
     record: Record,
-    memory: FloatArray,
+    start: Mapping[str, float],
     wanted: Sequence[str],
     *,
     stop: int,
     rtol: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacement (n,), its derivatives by `wanted` (n, k), and by memory (n, m)."""
-    structure = model.structure
+    """Return displacement (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
+
+    `start` holds deviations of the initial states from where the first inputs and their rates put
+    them, in the states' units.
+    """
+    names = model.state_names
     t, u = record.time[:stop], inputs_of(model, record, stop)
-    memories = [i for i, s in enumerate(structure.states) if s.memory]
-    names = [structure.states[i].name for i in memories]
     rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
-    start = start_state(
-        model, list(u[0]), rates, dict(zip(names, memory.tolist(), strict=True)), float(t[0])
+    memories = memory_names(model.structure)
+    found = start_state(
+        model, list(u[0]), rates, {n: start.get(n, 0.0) for n in memories}, float(t[0])
     )
+    x0, searched = found.x.copy(), [names.index(n) for n in start]
+    by_start = np.zeros((len(names), len(start)))
+    for column, name in enumerate(start):
+        if name in memories:
+            by_start[:, column] = found.by_memory[:, memories.index(name)]
+        else:
+            x0[searched[column]] += start[name]
+            by_start[searched[column], column] = 1.0
     columns = [model.parameter_names.index(n) for n in wanted]
-    s0 = np.hstack([start.by_parameter[:, columns], start.by_memory])
-    unknowns: list[str | int] = [*wanted, *memories]
+    s0 = np.hstack([found.by_parameter[:, columns], by_start])
+    unknowns: list[str | int] = [*wanted, *searched]
     steps = run(
-        model, t, u, start.x, rtol=rtol, steps_limit=_STEPS, unknowns=unknowns, s0=s0, output=OUTPUT
+        model, t, u, x0, rtol=rtol, steps_limit=_STEPS, unknowns=unknowns, s0=s0, output=OUTPUT
     )
     displacement = steps.y[:, model.output_names.index(OUTPUT)]
     sensitivity = steps.sensitivity
     if sensitivity is None:
         sensitivity = np.zeros((stop, 0))
     return displacement, sensitivity[:, : len(wanted)], sensitivity[:, len(wanted) :]
+
+
+def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
+    """Return the states beside the memories whose start a record leaves open, with their size.
+
+    A record starts where its first voltage and rate put the stack. That is wrong for one that
+    starts amid motion which changes within the stack's settling time T by more than the noise [m]:
+    gain |v(t+T) - 2 v(t) + v(t-T)| > 3 noise. Sizes are what a steady motion at the record's rms
+    rate changes, in the states' units. Empty for a record that starts at rest or changes slowly.
+    """
+    u = inputs_of(model, record, record.n)
+    v, column = record.voltage, model.input_names.index("voltage")
+    settling = settling_time(model)
+    lag = int(settling / record.sample_time)
+    if lag < 2 or 2 * lag >= record.n or initial_slope(record.time, v) == 0.0:
+        return {}
+    bend = v[2 * lag :] - 2.0 * v[lag:-lag] + v[: -2 * lag]
+    rest = start_state(model, list(u[0]))
+    rates = np.zeros(u.shape[1])
+    rates[column] = float(np.sqrt(np.mean((np.diff(v) / np.diff(record.time)) ** 2)))
+    moving = start_state(model, list(u[0]), rates.tolist())
+    gain = float(np.nanstd(measured(record))) / max(float(np.std(v)), 1e-300)
+    if not gain * float(np.sqrt(np.mean(bend**2))) > 3.0 * noise:
+        return {}
+    memories = memory_names(model.structure)
+    nominal = model.state_nominals()
+    return {
+        name: max(abs(float(moving.x[i] - rest.x[i])), 1e-6 * float(nominal[i]))
+        for i, name in enumerate(model.state_names)
+        if name not in memories
+    }
 
 
 def predict(
@@ -85,25 +134,31 @@ def predict(
     rtol: float,
     everything: bool = False,
 ) -> list[Prediction]:
-    """Predict every experiment at theta, up to its last used sample, or in full (`everything`)."""
+    """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
+
+    Records are simulated side by side: the stepper does not hold Python's lock.
+    """
     current = model.with_values(unknowns.values(theta))
     slopes = unknowns.slopes(theta)
-    predictions = []
-    for index, experiment in enumerate(experiments):
+
+    def one(index: int) -> Prediction:
+        experiment = experiments[index]
         stop = experiment.record.n if everything else experiment.stop
-        y, by_parameter, by_memory = predict_record(
+        y, by_parameter, by_start = predict_record(
             current,
             experiment.record,
-            unknowns.memory(theta, index),
+            unknowns.start(theta, index),
             unknowns.names,
             stop=stop,
             rtol=rtol,
         )
-        jacobian = np.zeros((stop, unknowns.size))
-        jacobian[:, : len(unknowns.names)] = by_parameter @ slopes
-        first = len(unknowns.names) + index * unknowns.per_record
-        last = first + len(unknowns.memories)
-        jacobian[:, first:last] = by_memory * unknowns.memory_scale
-        jacobian[:, last] = unknowns.offset_scale
-        predictions.append(Prediction(y + unknowns.offset(theta, index), jacobian))
-    return predictions
+        start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
+        jacobian = by_start @ start_slopes
+        jacobian[:, : len(unknowns.names)] += by_parameter @ slopes
+        jacobian += offset_slopes
+        return Prediction(y + unknowns.offset(theta, index), jacobian)
+
+    if len(experiments) == 1:
+        return [one(0)]
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        return list(pool.map(one, range(len(experiments))))

@@ -11,8 +11,8 @@ from psa_casadi.model.compose import Model, compose
 
 #: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
 ASSUMED_STIFFNESS = 5e7
-#: Stiffness of the bonding layers over that of the wafers, assumed.
-_BONDING_RATIO = 5.0
+#: Stiffness of the wafers over that of the bonding layers, assumed.
+_WAFER_RATIO = 5.0
 #: Capacitance assumed [F]: only R_s C_p shows in a record of voltage and displacement.
 _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
@@ -29,15 +29,17 @@ LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
 def starting_model(records: Sequence[Record], stiffness: float | None = None) -> Model:
     """Return the base model scaled to the records' voltage span, stroke and sampling.
 
-    k_L follows from the regression of displacement on voltage and the stiffness [N/m], which is
-    `ASSUMED_STIFFNESS` where none is given: voltage and displacement do not determine forces.
+    In the one-way cascade a load meets the bonding layers only, so the stiffness [N/m] that a data
+    sheet measures is k_B; it is `ASSUMED_STIFFNESS` where none is given, since voltage and
+    displacement do not determine forces. k_P = 5 k_B is assumed; k_L (1/k_P + 1/k_B) is the
+    regression slope of displacement on voltage (paper, eq. 14).
     """
-    total = stiffness or ASSUMED_STIFFNESS
+    k_b = stiffness or ASSUMED_STIFFNESS
+    k_p = _WAFER_RATIO * k_b
     span = max(float(np.ptp(r.voltage)) for r in records)
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     sample_time = min(r.sample_time for r in records)
-    k_l = max(abs(_slope(records)), 1e-12) * total
-    k_p = total * (1 + _BONDING_RATIO) / _BONDING_RATIO
+    k_l = max(abs(static_slope(records)), 1e-12) / (1.0 / k_p + 1.0 / k_b)
     values = {
         "u_rated": max(span, top),
         "k_L": k_l,
@@ -45,7 +47,7 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "hold_rate": 1e-3 * span,
         "C_p": _CAPACITANCE,
         "k_P": k_p,
-        "k_B": _BONDING_RATIO * k_p,
+        "k_B": k_b,
         **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
         "n": LOOP_SHAPES[0]["n"],
     }
@@ -78,7 +80,7 @@ def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:
     return lags
 
 
-def _slope(records: Sequence[Record]) -> float:
+def static_slope(records: Sequence[Record]) -> float:
     """Regression slope of displacement on voltage, records centred each [m/V]."""
     top = bottom = 0.0
     for record in records:

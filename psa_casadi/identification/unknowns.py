@@ -16,10 +16,14 @@ FloatArray = npt.NDArray[np.float64]
 LOG_PRIOR = 3.0
 LINEAR_PRIOR = 10.0
 MEMORY_PRIOR = 3.0
+#: Initial states other than memories, in what a steady motion at the record's rates would change.
+MOTION_PRIOR = 30.0
 #: Lags beside the creep lag are alike in most records: each stays near its start unless told.
 LAG_PRIOR = 1.0
 _LAGS = ("R_s", "c_P", "c_B", "c")
+_CARRIED = "f_H"
 _LOOP = ("k_L", "A", "beta", "gamma")
+_STEEPEST = 10.0  # |A| over k_L + A, beyond which the loop no longer changes
 _BEND_STEP = 0.2  # an ordinary change of beta A / s, in units of 0.1 k_L
 
 
@@ -27,37 +31,47 @@ _BEND_STEP = 0.2  # an ordinary change of beta A / s, in units of 0.1 k_L
 class Unknowns:
     """The search coordinates of one fit.
 
-    theta = [parameters, then per record: memories and the sensor's offset]. A parameter that spans
-    decades is ln(value / reference), any other (value - reference) / scale. The shape of the loop
+    theta = [parameters, then per record: initial states and the sensor's offset]. A parameter that
+    spans decades is ln(value / reference), any other (value - reference) / scale. The loop's shape
     (k_L, A, beta, gamma) has coordinates of its own where all four are free: with s = k_L + A, the
-    slope just after a reversal, they are ln s, ln |A|, beta A / s and gamma A / s. A loop with weak
-    bends fixes s and the two products, and hardly A itself; so its valley is straight here.
+    slope just after a reversal, they are ln s, A_ref / A - 1, beta A / s and gamma A / s. A loop
+    with weak bends fixes s and the two products, and hardly A itself; so its valley is straight
+    here, and A without bound (Rayleigh's quadratic loop) lies at a finite distance.
+    `started` names, per record, the states whose start is searched, as deviations from where the
+    record's first voltage and rate put them. Where the loop has its own coordinates, those of a
+    record's memory and offset are q_0 = f_H(0) / A and the offset plus C A (q_0 - v_0), with the
+    first voltage v_0 and the static compliance C [m/N]: what follows keeps its place when A moves.
     `prior` holds the standard deviation of every coordinate's weak prior (infinite for offsets),
     centred at 0.
     """
 
     names: tuple[str, ...]
-    memories: tuple[str, ...]
-    records: int
+    started: tuple[tuple[str, ...], ...]
     reference: FloatArray
     scale: FloatArray
     log: npt.NDArray[np.bool_]
     low: FloatArray
     high: FloatArray
-    memory_scale: FloatArray
+    start_scale: tuple[FloatArray, ...]
+    first_voltage: tuple[float, ...]
+    compliance: float
     offset_scale: float
     prior: FloatArray
     loop: tuple[int, ...] | None = None
 
     @property
-    def per_record(self) -> int:
-        """Number of coordinates that each record adds: its memories and its offset."""
-        return len(self.memories) + 1
+    def records(self) -> int:
+        """Number of records."""
+        return len(self.started)
+
+    def first(self, record: int) -> int:
+        """Index of the first coordinate of one record: its initial states, then its offset."""
+        return len(self.names) + sum(len(s) + 1 for s in self.started[:record])
 
     @property
     def size(self) -> int:
         """Number of coordinates."""
-        return len(self.names) + self.records * self.per_record
+        return self.first(self.records)
 
     def values(self, theta: FloatArray) -> dict[str, float]:
         """Return the parameter values at theta, clipped to their bounds against rounding."""
@@ -77,12 +91,13 @@ class Unknowns:
             where = list(self.loop)
             k_l, a, beta, gamma = value[where]
             s, step = k_l + a, _BEND_STEP * (k_l + a) / a
+            by_second = -a * a / float(self.reference[where[1]])
             matrix[np.ix_(where, where)] = np.array(
                 [
-                    [s, -a, 0.0, 0.0],
-                    [0.0, a, 0.0, 0.0],
-                    [beta, -beta, step * self._bend, 0.0],
-                    [gamma, -gamma, 0.0, step * self._bend],
+                    [s, -by_second, 0.0, 0.0],
+                    [0.0, by_second, 0.0, 0.0],
+                    [beta, -beta * by_second / a, step * self._bend, 0.0],
+                    [gamma, -gamma * by_second / a, 0.0, step * self._bend],
                 ]
             )
         return matrix
@@ -101,7 +116,7 @@ class Unknowns:
             now, then = a / (k_l + a), r_a / (r_k + r_a)
             theta[where] = [
                 np.log((k_l + a) / (r_k + r_a)),
-                np.log(a / r_a),
+                r_a / a - 1.0,
                 (beta * now - r_beta * then) / (_BEND_STEP * self._bend),
                 (gamma * now - r_gamma * then) / (_BEND_STEP * self._bend),
             ]
@@ -114,21 +129,66 @@ class Unknowns:
 
     def _loop_values(self, theta: FloatArray) -> list[float]:
         k_l, a, beta, gamma = self.reference[list(self.loop or ())]
-        s_new, a_new = (k_l + a) * np.exp(theta[0]), a * np.exp(theta[1])
+        s_new, a_new = (k_l + a) * np.exp(theta[0]), a / (1.0 + theta[1])
         bends = [q * a / (k_l + a) for q in (beta, gamma)]
         moved = [b + _BEND_STEP * self._bend * t for b, t in zip(bends, theta[2:], strict=True)]
         return [s_new - a_new, a_new, *(m * s_new / a_new for m in moved)]
 
-    def memory(self, theta: FloatArray, record: int) -> FloatArray:
-        """Return the memory deviations of one record, in the states' units."""
-        first = len(self.names) + record * self.per_record
-        return theta[first : first + len(self.memories)] * self.memory_scale
+    def start(self, theta: FloatArray, record: int) -> dict[str, float]:
+        """Return the deviations of one record's initial state, in the states' units."""
+        first, names = self.first(record), self.started[record]
+        deviations = theta[first : first + len(names)] * self.start_scale[record]
+        found = dict(zip(names, deviations.tolist(), strict=True))
+        if self._carries(record):
+            found[_CARRIED] *= self.values(theta)["A"] / self._a_ref
+        return found
+
+    def place(
+        self, theta: FloatArray, record: int, states: Mapping[str, float], offset: float
+    ) -> None:
+        """Write the coordinates of a record's initial state and offset [m] into theta.
+
+        The parameters' coordinates must stand in theta.
+        """
+        first, last = self.first(record), self.first(record + 1) - 1
+        found = {n: states.get(n, 0.0) for n in self.started[record]}
+        if self._carries(record):
+            a = self.values(theta)["A"]
+            offset += self.compliance * (found[_CARRIED] - a * self.first_voltage[record])
+            found[_CARRIED] *= self._a_ref / a
+        theta[first:last] = np.array(list(found.values())) / self.start_scale[record]
+        theta[last] = offset / self.offset_scale
+
+    def place_slopes(self, theta: FloatArray, record: int) -> tuple[FloatArray, FloatArray]:
+        """Return d start / d theta, shape (started, size), and d offset / d theta (size,)."""
+        first, last = self.first(record), self.first(record + 1) - 1
+        start, offset = np.zeros((last - first, self.size)), np.zeros(self.size)
+        start[:, first:last] = np.diag(self.start_scale[record])
+        offset[last] = self.offset_scale
+        if self.loop is not None and self._carries(record):
+            row, count = self.started[record].index(_CARRIED), len(self.names)
+            a, by_a = self.values(theta)["A"], self.slopes(theta)[self.loop[1]]
+            q = self.start(theta, record)[_CARRIED] / a
+            start[row, first + row] *= a / self._a_ref
+            start[row, :count] = q * by_a
+            offset[first + row] = -self.compliance * start[row, first + row]
+            offset[:count] = -self.compliance * (q - self.first_voltage[record]) * by_a
+        return start, offset
+
+    def _carries(self, record: int) -> bool:
+        return self.loop is not None and _CARRIED in self.started[record]
+
+    @property
+    def _a_ref(self) -> float:
+        return float(self.reference[self.loop[1]]) if self.loop is not None else 1.0
 
     def offset(self, theta: FloatArray, record: int) -> float:
         """Return the sensor's offset in one record [m]."""
-        return (
-            float(theta[len(self.names) + (record + 1) * self.per_record - 1]) * self.offset_scale
-        )
+        offset = float(theta[self.first(record + 1) - 1]) * self.offset_scale
+        if self._carries(record):
+            bent = self.values(theta)["A"] * self.first_voltage[record]
+            offset -= self.compliance * (self.start(theta, record)[_CARRIED] - bent)
+        return offset
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return lower and upper bounds of theta."""
@@ -142,18 +202,28 @@ class Unknowns:
             for edge in (self.low, self.high)
         ]
         if self.loop is not None:
-            for edge, sign in zip(edges, (-1.0, 1.0), strict=True):
-                edge[list(self.loop)] = sign * np.array([10.0, 10.0, 1e3, 1e3])
+            k_l, a, *_ = self.reference[list(self.loop)]
+            edges[0][list(self.loop)] = [-10.0, abs(a) / (_STEEPEST * (k_l + a)) - 1.0, -1e3, -1e3]
+            edges[1][list(self.loop)] = [10.0, 1e3, 1e3, 1e3]
         rest = np.full(self.size - len(self.names), np.inf)
         return np.concatenate([edges[0], -rest]), np.concatenate([edges[1], rest])
 
 
-def unknowns_of(model: Model, free: Sequence[str], records: int, offset_scale: float) -> Unknowns:
-    """Set up the coordinates around a model's values."""
+def unknowns_of(
+    model: Model,
+    free: Sequence[str],
+    motions: Sequence[Mapping[str, float]],
+    first_voltage: Sequence[float],
+    offset_scale: float,
+) -> Unknowns:
+    """Set up the coordinates around a model's values.
+
+    `motions` names for every record the states beside the memories whose start is searched, each
+    with the size of an ordinary deviation, in the state's unit; `first_voltage` [V] is where each
+    record starts.
+    """
     parameters = [model.parameter(n) for n in free]
     values: Mapping[str, float] = model.values
-    states = {s.name: s for s in model.structure.states}
-    memories = memory_names(model.structure)
     log = np.array([p.log for p in parameters], dtype=bool)
     prior = np.where(log, LOG_PRIOR, LINEAR_PRIOR)
     prior = np.where([n in _LAGS for n in free], LAG_PRIOR, prior)
@@ -163,18 +233,34 @@ def unknowns_of(model: Model, free: Sequence[str], records: int, offset_scale: f
         loop = tuple(list(free).index(n) for n in _LOOP)
         log[list(loop)] = False
         prior[list(loop)] = [LOG_PRIOR, LOG_PRIOR, LINEAR_PRIOR, LINEAR_PRIOR]
-    each = np.array([MEMORY_PRIOR] * len(memories) + [np.inf])
+    sizes = _memory_sizes(model)
+    each = [[MEMORY_PRIOR] * len(sizes) + [MOTION_PRIOR] * len(m) + [np.inf] for m in motions]
     return Unknowns(
         names=tuple(free),
-        memories=memories,
-        records=records,
+        started=tuple((*sizes, *motion) for motion in motions),
         reference=np.array([values[n] for n in free]),
         scale=np.array([p.typical(values) for p in parameters]),
         log=log,
         low=np.array([p.bounds[0] for p in parameters]),
         high=np.array([p.bounds[1] for p in parameters]),
-        memory_scale=np.array([nominal_value(states[m].nominal, values) for m in memories]),
+        start_scale=tuple(np.array([*sizes.values(), *motion.values()]) for motion in motions),
+        first_voltage=tuple(first_voltage),
+        compliance=static_compliance(values),
         offset_scale=offset_scale,
-        prior=np.concatenate([prior, np.tile(each, records)]),
+        prior=np.concatenate([prior, *each]),
         loop=loop,
     )
+
+
+def static_compliance(values: Mapping[str, float]) -> float:
+    """Return the displacement that a force of the wafers causes at rest [m/N], eq. (14)."""
+    if "k_B" in values:
+        return 1.0 / values["k_P"] + 1.0 / values["k_B"]
+    return 1.0 / values["k"]
+
+
+def _memory_sizes(model: Model) -> dict[str, float]:
+    """Return the nominal size of every state with a memory."""
+    states = {s.name: s for s in model.structure.states}
+    names = memory_names(model.structure)
+    return {n: nominal_value(states[n].nominal, model.values) for n in names}

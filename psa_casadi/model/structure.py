@@ -17,7 +17,8 @@ class Structure:
 
     `time`, `x`, `u`, `p` are the symbols (columns, in the order of the variable tables);
     `balances` maps each balance to its terms' sum with balances kept as symbols (for people);
-    `xdot` and `y` have everything substituted (for machines).
+    `xdot`, `y` and `switches` (zero where xdot has a kink) have everything substituted (for
+    machines).
     """
 
     components: tuple[Component, ...]
@@ -35,6 +36,7 @@ class Structure:
     out: Mapping[str, Expression]
     xdot: Expression
     y: Expression
+    switches: Mapping[str, Expression]
 
     @cached_property
     def f(self) -> ca.Function:
@@ -67,6 +69,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     balances = _sum_terms(parts, components)
     der = {k: v for e in parts for k, v in e.der.items()}
     out = {k: v for e in parts for k, v in e.out.items()}
+    switches = {k: v for e in parts for k, v in e.switches.items()}
     full = _substitute_in_order(balances, sums)
 
     def resolve(expression: Expression) -> Expression:
@@ -93,6 +96,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
         out=out,
         xdot=xdot,
         y=ca.vertcat(*[resolve(out[o.name]) for o in outputs]),
+        switches={name: resolve(expression) for name, expression in switches.items()},
     )
 
 

@@ -1,4 +1,4 @@
-"""Plotly pictures of the HTML reports: time and residual, loop, spectrum, evidence."""
+"""Plots of the HTML pages that show one record: time, loop, window, and its residual."""
 
 from typing import Any
 
@@ -6,158 +6,188 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.report.phrases import plain, share_text
+from psa_casadi.report.residuals import (
+    autocorrelation,
+    distribution,
+    noise_density,
+    shown_lines,
+    spectrum,
+    white_band,
+)
 from psa_casadi.report.series import (
     HELD_OUT_COLOUR,
     MEASURED_COLOUR,
     NOISE_COLOUR,
+    FloatArray,
     Series,
-    bar_colour,
+    compact,
     kept,
-    noise_density,
     spans,
-    spectrum,
     telling_window,
 )
+from psa_casadi.report.theme import INK, Plot, logarithmic, styled
 
-#: Points of a part of a record, measured samples shown one by one.
-_ZOOM_POINTS = 1500
-
-#: A picture without type: plotly ships no type information.
-Plot = Any
+#: Points of a part of a record, measured samples shown one by one, and of a spectrum.
+_ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
+_FULL, _HALF = 500, 330
 
 
 def time_plot(s: Series, origin: str, limit: int) -> Plot:
     """Displacement over time above the residual over the same time, held-out part shaded."""
     plot = make_subplots(
-        rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.07, row_heights=[0.6, 0.4]
+        rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.6, 0.4]
     )
     residuals = [s.residual(c) for c in s.curves]
     shown = kept([s.measured, *residuals], limit)
-    scale, small = s.scale, s.residual_scale
-    time = s.time[shown]
+    scale, small, clock = s.scale, s.residual_scale, s.time_scale
+    time = compact(clock.factor * s.time[shown])
 
-    def line(row: int, values: Any, colour: str, name: str, width: float, legend: bool) -> None:
+    def line(row: int, values: FloatArray, look: dict[str, Any], name: str, legend: bool) -> None:
         trace = go.Scatter(
-            x=time, y=np.float32(values[shown]), mode="lines", name=name, legendgroup=name,
-            showlegend=legend, line={"color": colour, "width": width},
+            x=time, y=compact(values[shown]), mode="lines", name=name, legendgroup=name,
+            showlegend=legend, line=look,
         )  # fmt: skip
         plot.add_trace(trace, row=row, col=1)
 
-    line(1, scale.factor * s.measured, MEASURED_COLOUR, origin, 3.0, True)
+    line(1, scale.factor * s.measured, {"color": MEASURED_COLOUR, "width": 3.0}, origin, True)
     for curve, residual in zip(s.curves, residuals, strict=True):
-        line(1, scale.factor * curve.values, curve.colour, curve.label, 1.4, True)
-        line(2, small.factor * residual, curve.colour, curve.label, 1.0, False)
+        look = {"color": curve.colour, "width": 1.4}
+        line(1, scale.factor * curve.values, look, curve.label, True)
+        line(2, small.factor * residual, {**look, "width": 1.0}, curve.label, False)
     for edge in (-2.0, 2.0):
         y = edge * s.noise * small.factor
-        plot.add_hline(y, row=2, col=1, line={"color": "black", "dash": "dash", "width": 1.2})
+        plot.add_hline(y, row=2, col=1, line={"color": INK, "dash": "dash", "width": 1.2})
     for first, last in spans(s.held_out):
-        plot.add_vrect(
-            s.time[first], s.time[last], fillcolor=HELD_OUT_COLOUR, layer="below", line_width=0
-        )
+        left, right = clock.factor * s.time[first], clock.factor * s.time[last]
+        plot.add_vrect(left, right, fillcolor=HELD_OUT_COLOUR, layer="below", line_width=0)
+    styled(plot, _FULL)
     plot.update_yaxes(title_text=f"displacement [{scale.unit}]", row=1, col=1)
     plot.update_yaxes(title_text=f"residual [{small.unit}]", row=2, col=1)
-    plot.update_xaxes(title_text="time [s]", row=2, col=1)
-    return _styled(plot, 560)
+    plot.update_xaxes(title_text=f"time [{clock.unit}]", row=2, col=1)
+    return plot
 
 
-def zoom_plot(s: Series, origin: str) -> Plot:
+def zoom_plot(s: Series, origin: str, limit: int) -> Plot:
     """Displacement over time in the window where the curves are easiest to tell apart."""
     window = telling_window(s)
     shown = np.arange(len(s.time))[window]
-    shown = shown[kept([s.measured[window]], _ZOOM_POINTS)]
-    scale, plot = s.scale, go.Figure()
+    shown = shown[kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
+    scale, clock, plot = s.scale, s.time_scale, go.Figure()
+    time = compact(clock.factor * s.time[shown])
     plot.add_scatter(
-        x=s.time[shown], y=np.float32(scale.factor * s.measured[shown]), mode="lines+markers",
+        x=time, y=compact(scale.factor * s.measured[shown]), mode="lines+markers",
         name=origin, line={"color": NOISE_COLOUR, "width": 0.7},
         marker={"color": MEASURED_COLOUR, "size": 4},
     )  # fmt: skip
     for curve in s.curves:
         plot.add_scatter(
-            x=s.time[shown], y=np.float32(scale.factor * curve.values[shown]), mode="lines",
-            name=curve.label, line={"color": curve.colour, "width": 2.5},
+            x=time, y=compact(scale.factor * curve.values[shown]), mode="lines",
+            name=curve.label, line={"color": curve.colour, "width": 2.2},
         )  # fmt: skip
-    plot.update_xaxes(title_text="time [s]")
-    plot.update_yaxes(title_text=f"displacement [{scale.unit}]")
-    return _styled(plot, 420)
+    return _labelled(plot, f"time [{clock.unit}]", f"displacement [{scale.unit}]")
 
 
 def loop_plot(s: Series, origin: str, limit: int) -> Plot:
     """Displacement over voltage."""
-    shown = kept([s.measured, *(c.values for c in s.curves)], limit)
+    shown = kept([s.voltage, s.measured, *(c.values for c in s.curves)], limit)
     scale, plot = s.scale, go.Figure()
     rows = [(s.measured, MEASURED_COLOUR, origin, 3.0)]
     rows += [(c.values, c.colour, c.label, 1.2) for c in s.curves]
     for values, colour, name, width in rows:
         plot.add_scatter(
-            x=np.float32(s.voltage[shown]), y=np.float32(scale.factor * values[shown]),
+            x=compact(s.voltage[shown]), y=compact(scale.factor * values[shown]),
             mode="lines", name=name, line={"color": colour, "width": width},
         )  # fmt: skip
-    plot.update_xaxes(title_text="voltage [V]")
-    plot.update_yaxes(title_text=f"displacement [{scale.unit}]")
-    return _styled(plot, 420)
+    return _labelled(plot, "voltage [V]", f"displacement [{scale.unit}]")
 
 
-def spectrum_plot(s: Series) -> Plot:
-    """Amplitude density of the residual before and after, and of white noise of that level."""
-    plot = go.Figure()
-    small = s.residual_scale
+def error_loop_plot(s: Series, limit: int) -> Plot:
+    """Residual over voltage: where in the loop the model goes wrong."""
+    residuals = [s.residual(c) for c in s.curves]
+    shown = kept([s.voltage, *residuals], limit)
+    small, plot = s.residual_scale, go.Figure()
+    for curve, residual in zip(s.curves, residuals, strict=True):
+        plot.add_scatter(
+            x=compact(s.voltage[shown]), y=compact(small.factor * residual[shown]), mode="lines",
+            name=curve.label, line={"color": curve.colour, "width": 0.9},
+        )  # fmt: skip
+    for edge in (-2.0, 2.0):
+        y = edge * s.noise * small.factor
+        plot.add_hline(y, line={"color": INK, "dash": "dash", "width": 1.2})
+    plot.update_layout(showlegend=len(s.curves) > 1)
+    return _labelled(plot, "voltage [V]", f"residual [{small.unit}]")
+
+
+def spectrum_plot(s: Series, limit: int) -> Plot:
+    """Amplitude density of every curve's residual, and of white noise of the record's level."""
+    plot, small = go.Figure(), s.residual_scale
+    floor = small.factor * noise_density(s)
+    low, high, ends = floor, floor, [0.0, 0.0]
     for curve in s.curves:
         frequency, density = spectrum(s.time, s.residual(curve))
+        ends = [float(frequency[0]), float(frequency[-1])]
+        shown = shown_lines(frequency, density, min(limit // 2, _SPECTRUM_POINTS))
+        values = small.factor * density[shown]
+        low, high = min(low, float(np.min(values))), max(high, float(np.max(values)))
         plot.add_scatter(
-            x=np.float32(frequency), y=np.float32(small.factor * density), mode="lines",
+            x=compact(frequency[shown]), y=compact(values), mode="lines",
             name=curve.label, line={"color": curve.colour, "width": 1.4},
         )  # fmt: skip
-    floor = float(small.factor * noise_density(s))
     plot.add_scatter(
-        x=[float(frequency[0]), float(frequency[-1])], y=[floor, floor], mode="lines",
-        name="noise floor", line={"color": "black", "dash": "dash", "width": 1.4},
+        x=ends, y=[floor, floor], mode="lines", name="noise floor",
+        line={"color": INK, "dash": "dash", "width": 1.4},
     )  # fmt: skip
-    plot.update_xaxes(title_text="frequency [Hz]", type="log")
-    plot.update_yaxes(title_text=f"residual [{small.unit}/√Hz]", type="log")
-    return _styled(plot, 420)
+    _labelled(plot, "frequency [Hz]", f"residual [{small.unit}/√Hz]")
+    plot.update_xaxes(**logarithmic((ends[0], ends[1])))
+    return plot.update_yaxes(**logarithmic((low, high)))
 
 
-def evidence_plot(d: Diagnosis) -> Plot:
-    """One bar for every effect that was tried; text says the share of the excess it explains."""
-    rows = d.candidates[::-1]
-    causes = {c.effect for c in d.causes}
-    # asinh shows small, large and negative evidence in one picture; the labels give the figures
-    values = [float(np.arcsinh(c.evidence / 10.0)) for c in rows]
-    plot = go.Figure(
-        go.Bar(
-            x=values,
-            y=[plain(c.effect).replace("independent ", "independent<br>") for c in rows],
-            orientation="h",
-            marker={"color": [bar_colour(c, causes) for c in rows]},
-            text=[f"{c.evidence:,.0f} ({share_text(c)})" for c in rows],
-            textposition="auto",
-            hoverinfo="y+text",
-        )
-    )
-    largest = max([abs(v) for v in values], default=1.0) or 1.0
-    plot.update_xaxes(
-        title_text="evidence [ln units], compressed",
-        showticklabels=False,
-        range=[min([0.0, *values]) * 1.1, 1.35 * largest],
-    )
-    plot.update_yaxes(showgrid=False)
-    styled = _styled(plot, 130 + 42 * len(rows))
-    styled.update_layout(margin={"l": 10, "r": 8, "t": 16, "b": 44})
-    styled.update_yaxes(automargin=True)
-    return styled
+def autocorrelation_plot(s: Series) -> Plot:
+    """Autocorrelation of every curve's residual over the lag, and the band of white noise."""
+    plot, clock, steps = go.Figure(), s.time_scale, np.diff(s.time)
+    step = float(np.median(steps))
+    even = float(np.max(np.abs(steps - step))) < 0.02 * step
+    unit, size = (clock.unit, clock.factor * step) if even else ("samples", 1.0)
+    band = ends = 0.0
+    for curve in s.curves:
+        lags, values = autocorrelation(s.residual(curve))
+        band, ends = white_band(s.residual(curve)), float(lags[-1])
+        plot.add_scatter(
+            x=compact(size * lags.astype(np.float64)), y=compact(values), mode="lines",
+            name=curve.label, line={"color": curve.colour, "width": 1.6},
+        )  # fmt: skip
+    for edge in (-band, band):
+        plot.add_hline(edge, line={"color": INK, "dash": "dash", "width": 1.2})
+    _labelled(plot, f"lag [{unit}]", "autocorrelation")
+    plot.update_layout(showlegend=len(s.curves) > 1)
+    plot.update_yaxes(range=[-1.05, 1.05], zeroline=True, zerolinecolor=NOISE_COLOUR)
+    return plot.update_xaxes(**logarithmic((size, size * ends)))
 
 
-def _styled(plot: Plot, height: int) -> Plot:
-    plot.update_layout(
-        template="plotly_white",
-        height=height,
-        margin={"l": 62, "r": 8, "t": 40, "b": 46},
-        font={"size": 13, "color": "#222222"},
-        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0.0},
-        hovermode="closest",
-    )
-    plot.update_xaxes(zeroline=False, linecolor="#999999", mirror=True, ticks="outside")
-    plot.update_yaxes(zeroline=False, linecolor="#999999", mirror=True, ticks="outside")
-    return plot
+def distribution_plot(s: Series) -> Plot:
+    """Share of samples over the size of every curve's residual, beside a normal distribution."""
+    plot, small = go.Figure(), s.residual_scale
+    residuals = [s.residual(c) for c in s.curves]
+    low = min(float(np.nanmin(r)) for r in residuals)
+    high = max(float(np.nanmax(r)) for r in residuals)
+    for curve, residual in zip(s.curves, residuals, strict=True):
+        d = distribution(residual, low, high)
+        plot.add_scatter(
+            x=compact(small.factor * d.centres), y=compact(d.shares), mode="lines",
+            name=curve.label, fill="tozeroy" if curve is s.curves[-1] else "none",
+            line={"color": curve.colour, "width": 1.4, "shape": "hvh"},
+        )  # fmt: skip
+    mean, spread = float(np.nanmean(residuals[-1])), float(np.nanstd(residuals[-1]))
+    if spread > 0:
+        x = np.linspace(low, high, 161)
+        normal = np.exp(-0.5 * ((x - mean) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
+        plot.add_scatter(
+            x=compact(small.factor * x), y=compact(100.0 * d.width * normal), mode="lines",
+            name="normal", line={"color": INK, "dash": "dash", "width": 1.4},
+        )  # fmt: skip
+    return _labelled(plot, f"residual [{small.unit}]", "samples in a bin [%]")
+
+
+def _labelled(plot: Plot, x: str, y: str) -> Plot:
+    styled(plot, _HALF)
+    return plot.update_xaxes(title_text=x).update_yaxes(title_text=y)

@@ -1,4 +1,4 @@
-"""What a picture needs: curves over time, a telling window, fewer points, a spectrum."""
+"""What a picture needs: curves over time, a telling window, fewer points, small numbers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,11 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
 
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prediction import measured
 from psa_casadi.report.phrases import Scale, added, length_scale
 
@@ -59,6 +59,14 @@ class Series:
         return length_scale(span, counts=self.counts)
 
     @property
+    def time_scale(self) -> Scale:
+        """The unit to show times in: `shown = factor * seconds`."""
+        span = float(self.time[-1] - self.time[0])
+        if span >= 1.0:
+            return Scale("s", 1.0)
+        return Scale("ms", 1e3) if span >= 1e-3 else Scale("µs", 1e6)
+
+    @property
     def residual_scale(self) -> Scale:
         """The unit to show residuals in."""
         largest = max(float(np.nanmax(np.abs(self.residual(c)))) for c in self.curves)
@@ -77,12 +85,17 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
 
 
 def series_of_fit(found: Identification) -> tuple[Series, ...]:
-    """Return the records of an identification with the fitted model."""
-    predicted = found.fit.predicted(found.experiments)
-    return tuple(
-        _series(e, [Curve("model", EXTENDED_COLOUR, y)], sigma)
-        for e, y, sigma in zip(found.experiments, predicted, found.fit.sigma, strict=True)
-    )
+    """Return the records of an identification with the fitted model.
+
+    The noise is that of the residual's fast differences: the level that weighted a record in the
+    fit may be its whole residual.
+    """
+    rows = []
+    predictions = found.fit.predicted(found.experiments)
+    for e, predicted in zip(found.experiments, predictions, strict=True):
+        noise = high_frequency_noise((measured(e.record) - predicted)[e.used])
+        rows.append(_series(e, [Curve("model", EXTENDED_COLOUR, predicted)], noise))
+    return tuple(rows)
 
 
 def _series(e: Experiment, curves: Sequence[Curve], noise: float) -> Series:
@@ -152,13 +165,21 @@ def telling_window(s: Series) -> slice:
 
 
 def kept(signals: Sequence[FloatArray], limit: int) -> IndexArray:
-    """Return about `limit` indices that keep the extremes of every signal in every bucket."""
+    """Return about `limit` indices that keep the extremes of every signal in every bucket.
+
+    The buckets are equal runs of samples. A bucket without any value of a signal keeps a sample
+    that is missing there, so that a gap stays a gap.
+    """
     n = len(signals[0])
     if n <= limit:
         return np.arange(n)
     buckets = max(1, limit // (2 * len(signals)))
-    edges = np.linspace(0, n, buckets + 1).astype(np.int64)
-    chosen = {0, n - 1}
+    return extremes(signals, np.linspace(0, n, buckets + 1).astype(np.int64))
+
+
+def extremes(signals: Sequence[FloatArray], edges: IndexArray) -> IndexArray:
+    """Return first and last index, and those of the extremes of every signal between the edges."""
+    chosen = {int(edges[0]), int(edges[-1]) - 1}
     for values in signals:
         low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
         for a, b in pairwise(edges.tolist()):
@@ -166,20 +187,10 @@ def kept(signals: Sequence[FloatArray], limit: int) -> IndexArray:
     return np.array(sorted(chosen), dtype=np.int64)
 
 
-def spectrum(time: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies [Hz] and the amplitude density [m/sqrt(Hz)] of a residual (Welch, Hann).
-
-    Missing samples and uneven sampling are bridged by straight lines.
-    """
-    valid = np.isfinite(residual)
-    step = float(np.median(np.diff(time)))
-    grid = np.arange(time[0], time[-1], step)
-    even = np.interp(grid, time[valid], residual[valid])
-    segment = min(len(even), max(256, len(even) // 6))
-    frequency, power = signal.welch(even, 1.0 / step, nperseg=segment)
-    return frequency[1:], np.sqrt(power[1:])
-
-
-def noise_density(s: Series) -> float:
-    """Return the amplitude density [m/sqrt(Hz)] of white noise of the record's level."""
-    return s.noise * float(np.sqrt(2.0 * np.median(np.diff(s.time))))
+def compact(values: FloatArray) -> npt.NDArray[np.floating]:
+    """Return the values in single precision where no picture can show the difference."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return values.astype(np.float32)
+    lost = 6e-8 * float(np.max(np.abs(finite)))
+    return values if lost > 1e-5 * float(np.ptp(finite)) else values.astype(np.float32)

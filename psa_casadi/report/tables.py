@@ -8,9 +8,12 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.export.check import CheckReport, CheckRow
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.search import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import Stack, stack_model
+from psa_casadi.report.grades import grade
 from psa_casadi.report.phrases import (
+    Scale,
     added,
     interval_text,
     number,
@@ -19,6 +22,7 @@ from psa_casadi.report.phrases import (
     shown_in,
     with_unit,
 )
+from psa_casadi.report.residuals import ResidualFigures
 from psa_casadi.units import convert
 
 
@@ -61,11 +65,8 @@ def parameter_table(model: Model, found: Identification | None = None) -> Table:
 def _status(model: Model, name: str, found: Identification | None) -> str:
     if name not in model.provenance.free:
         return "not fitted"
-    if found is not None and name in found.determinacy.on_bound:
-        return "fit, on its bound"
-    if found is not None and name in found.determinacy.undetermined:
-        return "fit, undetermined"
-    return "fit"
+    degree = grade(found, name).degree if found is not None else "determined"
+    return "fit" if degree in ("determined", "fixed") else f"fit, {degree}"
 
 
 def candidate_table(d: Diagnosis) -> Table:
@@ -85,6 +86,39 @@ def error_table(d: Diagnosis, unit: str, factor: float) -> Table:
     rows.append(("noise", noise, noise, "", ""))
     head = (f"training rms [{unit}]", f"held-out rms [{unit}]", f"held-out largest [{unit}]")
     return _table(("model", *head, "held-out rms [% of range]"), rows)
+
+
+def fit_error_table(rows: Sequence[tuple[str, ResidualFigures]], scale: Scale) -> Table:
+    """Return what the model leaves of every record, beside the record's noise level."""
+    lines = []
+    for name, f in rows:
+        lengths = (f.rms, f.largest, f.noise)
+        ratio = number(f.rms / f.noise, 2) if f.noise > 0 else ""
+        share = number(100.0 * f.range_share, 2)
+        shown = (number(scale.factor * v) for v in lengths)
+        lines.append((name, *shown, ratio, share, number(f.neighbours, 2)))
+    unit = scale.unit
+    return _table(
+        (
+            "record",
+            f"rms [{unit}]",
+            f"largest [{unit}]",
+            f"noise [{unit}]",
+            "rms / noise",
+            "rms [% of range]",
+            "correlation of neighbours",
+        ),
+        lines,
+    )
+
+
+def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:
+    """Return where the fits from several starts ended."""
+    ends = {True: "the best fit", False: "another minimum", None: "not followed to its end"}
+    rows = [
+        (s.name, number(s.cost, 5), number(scale.factor * s.rms, 4), ends[s.agrees]) for s in starts
+    ]
+    return _table(("start", "cost", f"rms [{scale.unit}]", "led to"), rows)
 
 
 def record_table(experiments: Sequence[Experiment], origin: str) -> Table:

@@ -8,7 +8,7 @@ import casadi as ca
 from psa_casadi.model.compose import Structure
 
 #: The functions that the solver needs, and those that sensitivities need besides.
-_SOLVER_FUNCTIONS = ("psa_ode", "psa_jacobian", "psa_outputs")
+_SOLVER_FUNCTIONS = ("psa_ode", "psa_jacobian", "psa_outputs", "psa_switches")
 
 _PRAGMAS = """\
 #if defined(__GNUC__)
@@ -23,16 +23,18 @@ _PRAGMAS = """\
 def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.Function]:
     """Return the CasADi functions behind `model.h`, all of arguments (time, x, u, p).
 
-    psa_ode: xdot; psa_jacobian: df/dx dense (nx, nx); psa_outputs: y; with sensitivities also
-    psa_sensitivity: (df/dx, df/dp) dense; psa_output_sensitivity: (dg/dx, dg/dp) dense.
+    psa_ode: xdot; psa_jacobian: df/dx dense (nx, nx); psa_outputs: y; psa_switches: zero
+    where xdot has a kink. With sensitivities also psa_sensitivity: (df/dx, df/dp) dense;
+    psa_output_sensitivity: (dg/dx, dg/dp) dense.
     """
     s = structure
     arguments = [s.time, s.x, s.u, s.p]
     jacobian = ca.densify(ca.jacobian(s.xdot, s.x))
-    table = {
+    table: dict[str, list[ca.SX]] = {
         "psa_ode": [ca.densify(s.xdot)],
         "psa_jacobian": [jacobian],
         "psa_outputs": [ca.densify(s.y)],
+        "psa_switches": [ca.densify(ca.vertcat(ca.SX(0, 1), *s.switches.values()))],
     }
     if sensitivities:
         table["psa_sensitivity"] = [jacobian, ca.densify(ca.jacobian(s.xdot, s.p))]
@@ -67,6 +69,7 @@ def _config(structure: Structure, functions: list[ca.Function], sensitivities: b
         "PSA_NU": len(structure.inputs),
         "PSA_NP": len(structure.parameters),
         "PSA_NY": len(structure.outputs),
+        "PSA_NZ": len(structure.switches),
         "PSA_SZ_ARG": max(4, *(f.sz_arg() for f in functions)),
         "PSA_SZ_RES": max(2, *(f.sz_res() for f in functions)),
         "PSA_SZ_IW": max(1, *(f.sz_iw() for f in functions)),

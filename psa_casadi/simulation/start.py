@@ -74,6 +74,25 @@ def start_state(
     return Start(final.ravel(), by_p, by_memory)
 
 
+def settling_time(model: Model) -> float:
+    """Return the slowest time constant [s] of the states without memory, at rest at zero inputs."""
+    p = model.parameter_vector()
+    memory = np.zeros(len(memory_names(model.structure)))
+    zeros = np.zeros(len(model.input_names))
+    jacobian = np.array(_fast_jacobian(model.structure)(0.0, 0.0, zeros, p, memory))
+    decay = -np.linalg.eigvals(jacobian).real
+    return float(1.0 / np.min(decay)) if np.all(decay > 0) else float("inf")
+
+
+@cache
+def _fast_jacobian(structure: Structure) -> ca.Function:
+    s = structure
+    fast = [i for i, state in enumerate(s.states) if not state.memory]
+    deviation = ca.SX.sym("deviation", sum(state.memory for state in s.states))
+    jacobian = ca.jacobian(s.xdot, s.x)[fast, fast]
+    return ca.Function("fast", [s.time, s.x, s.u, s.p, deviation], [jacobian])
+
+
 def _settle(
     rest: ca.Function,
     x: FloatArray,

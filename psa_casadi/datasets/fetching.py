@@ -1,0 +1,146 @@
+"""Datasets as files: from the folder a user names, or downloaded, converted and kept."""
+
+import difflib
+import hashlib
+import os
+from pathlib import Path
+
+from psa_casadi.datasets.published import DATASETS, Dataset, DatasetFile, Extract, Original
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.files import atomic_write
+from psa_casadi.simulation.compiler import cache_directory
+
+#: Names the folder with the records of a machine that downloads nothing.
+DATA_VARIABLE = "PSA_CASADI_DATA"
+
+
+def find(name: str) -> Dataset:
+    """Return the dataset of that name. Raises InputError: there is none."""
+    if name not in DATASETS:
+        near = difflib.get_close_matches(name.lower(), DATASETS, n=1, cutoff=0.4)
+        meant = f"did you mean {near[0]}?" if near else f"there are {', '.join(DATASETS)}."
+        raise InputError(f"There is no dataset named '{name}'; {meant}")
+    return DATASETS[name]
+
+
+def paths(name: str) -> list[Path]:
+    """Return the verified CSV files of a dataset, downloaded where that is needed.
+
+    Raises:
+        InputError: no such dataset, or a file in `$PSA_CASADI_DATA` is missing or differs.
+        PsaError: a file cannot be downloaded, or what came differs from what was published.
+    """
+    dataset = find(name)
+    return [_path(dataset, file) for file in dataset.files]
+
+
+def copy(name: str, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the CSV files of a dataset to a folder, with source and licence; return what is there.
+
+    Raises:
+        InputError: as `paths`, or the folder cannot be written to.
+        PsaError: as `paths`.
+    """
+    dataset, target = find(name), Path(folder)
+    found = paths(name)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{target}: cannot be made a folder ({error.strerror}); name another one."
+        ) from error
+    written = []
+    for path in found:
+        written.append(target / path.name)
+        atomic_write(written[-1], path.read_bytes())
+    written.append(target / f"{name}_licence.txt")
+    atomic_write(written[-1], origin_text(dataset))
+    return written
+
+
+def origin_text(dataset: Dataset) -> str:
+    """Return source, citation, what was taken, and licence, as they go with every copy."""
+    taken = "\n".join(
+        f"{f.name}: {f.description}. From {f.original.url} (SHA-256 {f.original.sha256}),"
+        f" {f.extract.rows} rows from row {f.extract.first_row} on, columns {f.extract.voltage} and"
+        f" {f.extract.displacement}, all counted from 0."
+        for f in dataset.files
+    )
+    return (
+        f"{dataset.name}: {dataset.description}.\nSource: {dataset.source}\n"
+        f"Citation: {dataset.citation}\n\n{taken}\n\n{dataset.licence_text}"
+    )
+
+
+def convert(table: bytes, extract: Extract) -> bytes:
+    """Return the CSV file of a record, taken from a table of numbers in text.
+
+    Time in s with three decimals, voltage in V with six, displacement in um with four.
+    """
+    lines = table.decode("ascii").splitlines()[extract.first_row :][: extract.rows]
+    rows = ["time [s],voltage [V],displacement [um]"]
+    for k, line in enumerate(lines):
+        cells = line.split()
+        voltage, displacement = float(cells[extract.voltage]), float(cells[extract.displacement])
+        rows.append(f"{k / extract.sample_rate:.3f},{voltage:.6f},{displacement:.4f}")
+    return ("\n".join(rows) + "\n").encode("ascii")
+
+
+def _path(dataset: Dataset, file: DatasetFile) -> Path:
+    data = os.environ.get(DATA_VARIABLE)
+    if data:
+        return _from_folder(Path(data) / dataset.name, dataset, file)
+    kept = cache_directory() / "datasets" / dataset.name / file.name
+    if kept.is_file() and _sha256(kept.read_bytes()) == file.sha256:
+        return kept
+    content = convert(_download(file.original, kept.parent).read_bytes(), file.extract)
+    if _sha256(content) != file.sha256:
+        raise PsaError(
+            f"{file.name}: the conversion of {file.original.url} has changed; report it."
+        )
+    atomic_write(kept, content)
+    return kept
+
+
+def _from_folder(folder: Path, dataset: Dataset, file: DatasetFile) -> Path:
+    path = folder / file.name
+    if not path.is_file():
+        raise InputError(
+            f"{path}: there is no such file, and {DATA_VARIABLE} says that records lie there; run"
+            f" `psa datasets {dataset.name} -o {folder}` without {DATA_VARIABLE} on a machine with"
+            f" a network, or unset {DATA_VARIABLE}."
+        )
+    if _sha256(path.read_bytes()) != file.sha256:
+        raise InputError(
+            f"{path}: is not the published record, its SHA-256 differs from {file.sha256}; it was"
+            f" changed or damaged: fetch it again from {dataset.source}."
+        )
+    return path
+
+
+def _download(original: Original, folder: Path) -> Path:
+    """Return the path of the original in `folder`, downloaded and verified."""
+    import pooch  # noqa: PLC0415 - slow to import, and needed for a download only
+
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        return Path(
+            pooch.retrieve(
+                original.url, f"sha256:{original.sha256}", fname=original.name, path=folder
+            )
+        )
+    except ValueError as error:
+        raise PsaError(
+            f"{original.url}: what was downloaded is not the published file, its SHA-256 differs"
+            f" from {original.sha256}; a proxy's page in its place is the likely cause: try again,"
+            f" or open the address in a browser."
+        ) from error
+    except OSError as error:
+        raise PsaError(
+            f"{original.url}: cannot be downloaded ({type(error).__name__}); connect to a network,"
+            f" or set {DATA_VARIABLE} to a folder that holds the records (`psa datasets --help`)."
+        ) from error
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,46 @@
+"""What every file format is read to: named columns of numbers, each cell with its place."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The columns of one file in the units of the file, before they are checked.
+
+    `units` names the columns in the order of `values`, shape (rows, columns), where nan stands for
+    a cell that is empty or unreadable. Row k stands in `place` number `lines[k]` of the file, such
+    as "line" 17 of a CSV file. `reported` is True where a cell was already reported as unreadable.
+    """
+
+    path: str
+    sha256: str
+    place: str
+    units: Mapping[str, str]
+    values: FloatArray
+    lines: NDArray[np.int64]
+    reported: NDArray[np.bool_]
+
+
+def whole_samples(
+    path: str, sha256: str, place: str, columns: Mapping[str, tuple[str, FloatArray]]
+) -> Samples:
+    """Return samples of arrays of numbers, `columns` giving unit and values (n,) by name.
+
+    Rows are counted from 1.
+    """
+    values = np.column_stack([array for _, array in columns.values()])
+    return Samples(
+        path=path,
+        sha256=sha256,
+        place=place,
+        units={name: unit for name, (unit, _) in columns.items()},
+        values=values,
+        lines=np.arange(1, len(values) + 1, dtype=np.int64),
+        reported=np.zeros(values.shape, dtype=np.bool_),
+    )

@@ -1,0 +1,242 @@
+"""The paper's hysteresis part, eqs. (25) to (35): zero crossings, then logarithmic least squares.
+
+Quasi-static, in displacement units: x = k u + h,
+h' = A u' - beta |u'| |h|^(n-1) h - gamma u' |h|^n + delta u sgn(u').
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.identification.paper.rates import Rates, rates_of
+from psa_casadi.identification.paper.shapes import Loop
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Samples count in (31), (34) where h and |u'| exceed this share of their largest values.
+_CLEAR = 0.1
+#: A crossing counts above this share of the largest voltage.
+_NEAR_REST = 0.05
+#: More logarithms of negative numbers than this share are worth a sentence.
+_FEW = 0.1
+#: Scatter of A_i over the periods, and h at the loop's top, that make k doubtful.
+_SCATTER, _CLOSED = 0.1, 0.3
+
+
+@dataclass(frozen=True)
+class Bends:
+    """n [1], beta and gamma [m^(1-n)/V] of eq. (26), in displacement units."""
+
+    n: float
+    beta: float
+    gamma: float
+
+
+@dataclass(frozen=True)
+class HysteresisPart:
+    """What the loops tell; None where they tell nothing. A alone stands when n, beta, gamma fail.
+
+    `A` [m/V] and `delta` [m/(V.s)] are those of eq. (30), `bends` n, beta and gamma (35).
+    """
+
+    A: float | None = None
+    delta: float | None = None
+    bends: Bends | None = None
+    sentences: tuple[str, ...] = ()
+
+
+class Crossing(NamedTuple):
+    """Voltage [V], u' [V/s] and x' [m/s] where x = k u on one branch."""
+
+    u: float
+    u_rate: float
+    x_rate: float
+
+
+class _Line(NamedTuple):
+    """Slope and factor of sign e^intercept h^slope, and the share of samples of the other sign."""
+
+    sign: float
+    n: float
+    mean_log: float
+    mean_log_h: float
+    lost: float
+
+
+def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
+    """Return A, delta by eqs. (28) to (30), n, beta, gamma by (31) to (35), given k [m/V].
+
+    (34) takes the logarithm of (gamma - beta) h^n. A loop that lags has beta > gamma; then the
+    logarithm of (beta - gamma) h^n is taken, which says the same, and a sentence tells it.
+    """
+    rates = [rates_of(loop, k) for loop in loops]
+    sentences = [s for r in rates for s in r.sentences]
+    pairs = [pair for r in rates for pair in crossing_pairs(r)]
+    if not pairs:
+        return HysteresisPart(sentences=(*sentences, _no_crossing(rates)))
+    each = np.array([slope_and_asymmetry(up, down, k) for up, down in pairs])
+    A, delta = (float(v) for v in each.mean(axis=0))
+    sentences += _doubts_about_k(rates, each[:, 0])
+    rising, falling = (_logarithms(rates, A, delta, sign) for sign in (1.0, -1.0))
+    sentences += _lost(rising, "rising", "beta + gamma") + _lost(falling, "falling", "gamma - beta")
+    if rising is None or falling is None:
+        return HysteresisPart(A=A, delta=delta, sentences=tuple(sentences))
+    n = rising.n
+    total, difference = (
+        line.sign * float(np.exp(line.mean_log - n * line.mean_log_h)) for line in (rising, falling)
+    )
+    if falling.sign < 0.0:
+        sentences.append(_LAGGING)
+    bends = Bends(n, 0.5 * (total - difference), 0.5 * (total + difference))
+    return HysteresisPart(A, delta, bends, tuple(sentences))
+
+
+def crossing_pairs(r: Rates) -> Iterator[tuple[Crossing, Crossing]]:
+    """Yield a crossing of x = k u on a rising branch with that of the next falling branch.
+
+    Where no rising branch with a crossing is followed by such a falling one, a falling branch is
+    paired with the next rising one.
+    """
+    branches = [(r.sign(b), _crossing(r, b)) for b in r.branches]
+    pairs = [
+        (first[1], then[1])
+        for first, then in pairwise(branches)
+        if first[0] > 0.0 > then[0] and first[1] is not None and then[1] is not None
+    ]
+    if not pairs:
+        pairs = [
+            (then[1], first[1])
+            for first, then in pairwise(branches)
+            if then[0] > 0.0 > first[0] and first[1] is not None and then[1] is not None
+        ]
+    yield from pairs
+
+
+def slope_and_asymmetry(up: Crossing, down: Crossing, k: float) -> tuple[float, float]:
+    """Return A_i [m/V] and delta_i [m/(V.s)] of one period, eq. (29).
+
+    x'_+ = (A_i + k) u'_+ + delta_i u_+,  x'_- = (A_i + k) u'_- - delta_i u_-.
+    """
+    below = up.u_rate * down.u + down.u_rate * up.u
+    if below == 0.0:
+        return (up.x_rate + down.x_rate) / (up.u_rate + down.u_rate) - k, 0.0
+    slope = (up.x_rate * down.u + down.x_rate * up.u) / below
+    return slope - k, (up.x_rate * down.u_rate - down.x_rate * up.u_rate) / below
+
+
+def _crossing(r: Rates, branch: slice) -> Crossing | None:
+    """Return the middle one of the crossings on a branch, linear between samples, or None.
+
+    Near 0 V none counts: there h is 0 at rest, on either side of the line by noise alone.
+    """
+    h, u = r.h[branch], np.abs(r.u[branch])
+    away = u > _NEAR_REST * float(np.max(np.abs(r.u)))
+    where = np.flatnonzero((h[1:] * h[:-1] <= 0.0) & away[1:] & away[:-1])
+    if where.size == 0:
+        return None
+    j = int(where[where.size // 2])
+    jump = float(h[j] - h[j + 1])
+    share = float(h[j]) / jump if jump else 0.5
+
+    def at(values: FloatArray) -> float:
+        first, then = values[branch][j : j + 2]
+        return float(first + share * (then - first))
+
+    return Crossing(at(r.u), at(r.u_rate), at(r.x_rate))
+
+
+def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> _Line | None:
+    """Fit ln |A - (h' - sign delta u)/u'| = constant + n ln h on rising (+1) or falling branches.
+
+    Eqs. (31) to (34), over samples with h > 0. The sign that most arguments have is taken for all;
+    the others are left out. None where fewer than three samples remain.
+    """
+    h, argument = [np.empty(0)], [np.empty(0)]
+    for r in rates:
+        largest = float(np.max(np.abs(r.h[r.inner])))
+        part: BoolArray = r.inner & (r.h > _CLEAR * largest)
+        part &= sign * r.u_rate > _CLEAR * float(np.max(np.abs(r.u_rate)))
+        h.append(r.h[part])
+        h_rate = r.x_rate[part] - r.k * r.u_rate[part]
+        argument.append(A - (h_rate - sign * delta * r.u[part]) / r.u_rate[part])
+    bend, log_h = np.concatenate(argument), np.log(np.concatenate(h))
+    common = 1.0 if np.count_nonzero(bend > 0.0) >= 0.5 * bend.size else -1.0
+    good = common * bend > 0.0
+    if np.count_nonzero(good) < 3 or np.ptp(log_h[good]) == 0.0:
+        return None
+    logs = np.log(common * bend[good])
+    slope = float(np.polyfit(log_h[good], logs, 1)[0])
+    lost = 1.0 - float(np.mean(good))
+    return _Line(common, slope, float(np.mean(logs)), float(np.mean(log_h[good])), lost)
+
+
+def _lost(line: _Line | None, branch: str, what: str) -> list[str]:
+    """Say where (31) or (34) had no samples, or logarithms of numbers of the wrong sign."""
+    if line is None:
+        return [
+            f"No samples with h = x - k u above zero are left on the {branch} branches, so {what}"
+            " has no equation, and the model has no loop (f_H = 0). Likely cause: k is wrong or the"
+            " loops did not begin at rest at 0 V; give loops that do."
+        ]
+    found = []
+    if branch == "rising" and line.sign < 0.0:
+        found.append(
+            "The logarithms of (31) are of negative numbers on the rising branches, so beta + gamma"
+            " > 0 does not hold; the logarithms of the opposite numbers are taken."
+        )
+    if line.lost > _FEW:
+        found.append(
+            f"{100.0 * line.lost:.0f} % of the logarithms on the {branch} branches ({what}) are of"
+            " numbers of the wrong sign and were left out, which biases the rest. Likely cause:"
+            " noise, or a k that is wrong; give slower loops or another step."
+        )
+    return found
+
+
+def _no_crossing(rates: Sequence[Rates]) -> str:
+    missing = [
+        name
+        for name, sign in (("rising", 1.0), ("falling", -1.0))
+        if not any(_crossing(r, b) for r in rates for b in r.branches if r.sign(b) == sign)
+    ]
+    where = f"the {' and the '.join(missing)} branches" if missing else "two branches in succession"
+    return (
+        f"x = k u is not met on {where} of the loops, so A and delta cannot be read at zero"
+        " crossings, and n, beta and gamma rest on them: the model has no loop (f_H = 0). Likely"
+        " cause: k contains a part of the hysteresis (it is the secant of the step), or the loops"
+        " did not begin at rest at 0 V; give two periods or more from rest."
+    )
+
+
+def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[str]:
+    """Say that k is doubtful where A scatters, or where the loop closes on the line x = k u."""
+    found = []
+    scatter = float(np.std(slopes) / max(abs(float(np.mean(slopes))), 1e-300))
+    if scatter > _SCATTER:
+        found.append(
+            f"A scatters by {100.0 * scatter:.0f} % between the loops' periods, which it should"
+            " not: the loops are not those of eq. (8) with this k."
+        )
+    widest = max(rates, key=lambda r: float(np.ptp(r.u)))
+    top = int(np.argmax(np.abs(widest.u)))
+    share = abs(float(widest.h[top])) / float(np.max(np.abs(widest.h)))
+    if share < _CLOSED:
+        found.append(
+            f"At its tip the loop '{widest.name}' meets the line x = k u (h there is"
+            f" {100.0 * share:.0f} % of its largest value): k, read from a step, holds what the"
+            " hysteresis adds at that voltage, and the paper takes it for the linear part alone."
+            " k, A, delta and all that rest on them are off."
+        )
+    return found
+
+
+_LAGGING = (
+    "The logarithm of (34) is of negative numbers: gamma > beta does not hold, as it cannot for a"
+    " loop that lags. The logarithm of (beta - gamma) h^n was taken instead, which is the same"
+    " equation."
+)

@@ -1,0 +1,31 @@
+"""What is done to a record before it is fitted: suspect samples masked, oversampling averaged."""
+
+import numpy as np
+
+from psa_casadi.experiment.decimate import decimated
+from psa_casadi.experiment.fast_noise import fast_noise
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.suspects import cleaned, suspects
+from psa_casadi.identification.prediction import measured
+from psa_casadi.identification.starting import static_slope
+
+
+def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
+    """Return the record to fit, and sentences on what was done to it.
+
+    Outliers, drop-outs and a stuck sensor are masked; where the sampling is so fast that block
+    averages lose nothing, they take the samples' place.
+    """
+    said = list(suspects(record).sentences(record.name))
+    clean = cleaned(record)
+    y = measured(clean)
+    noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([clean])
+    if noise <= 0 or slope == 0:
+        return clean, tuple(said)
+    shorter, factor = decimated(clean, noise, slope)
+    if factor > 1:
+        said.append(
+            f"{record.name}: {record.n} samples are averaged in blocks of {factor}, which loses"
+            " nothing of voltage or displacement beyond a tenth of the noise."
+        )
+    return shorter, tuple(said)

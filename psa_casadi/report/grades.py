@@ -1,0 +1,66 @@
+"""How well the records determine each parameter, in one word each."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from psa_casadi.identification.identify import Identification
+
+Degree = Literal["determined", "weak", "undetermined", "on its bound", "fixed"]
+DEGREES: tuple[Degree, ...] = get_args(Degree)
+
+#: A relative standard error above this is weak.
+WEAK_ERROR = 0.1
+#: Two parameters whose estimates correlate by more than this are known only together.
+STRONG_CORRELATION = 0.95
+
+
+@dataclass(frozen=True)
+class Grade:
+    """One parameter's relative standard error, and what that makes of it.
+
+    It is over the value, or over an ordinary change of a parameter that may be zero
+    (`by_change`); a fixed parameter has none (nan).
+    """
+
+    name: str
+    error: float
+    degree: Degree
+    by_change: bool = False
+
+
+def grades(found: Identification) -> tuple[Grade, ...]:
+    """Return a grade for every parameter of the identified model, in the model's order."""
+    return tuple(grade(found, p.name) for p in found.model.structure.parameters)
+
+
+def grade(found: Identification, name: str) -> Grade:
+    """Return the grade of one parameter."""
+    known, values = found.determinacy, found.model.values
+    if name not in known.standard_errors:
+        return Grade(name, float("nan"), "fixed")
+    parameter = found.model.parameter(name)
+    size = abs(values[name]) if parameter.log else parameter.typical(values)
+    error = known.standard_errors[name] / size if size > 0 else float("inf")
+    degree: Degree = "weak" if error > WEAK_ERROR else "determined"
+    if name in known.on_bound:
+        degree = "on its bound"
+    elif name in known.undetermined:
+        degree = "undetermined"
+    return Grade(name, error, degree, by_change=not parameter.log)
+
+
+def named(graded: tuple[Grade, ...], degree: Degree) -> list[str]:
+    """Return the names of the parameters of one degree."""
+    return [g.name for g in graded if g.degree == degree]
+
+
+def strong_pairs(found: Identification) -> list[tuple[str, str, float]]:
+    """Return the pairs of parameters that are known only together, the strongest first."""
+    names, matrix = found.determinacy.names, found.determinacy.correlations
+    pairs = [
+        (names[i], names[k], float(matrix[i, k]))
+        for i in range(len(names))
+        for k in range(i + 1, len(names))
+        if abs(matrix[i, k]) >= STRONG_CORRELATION
+    ]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))

@@ -1,0 +1,52 @@
+(function () {
+  'use strict';
+  var dark = JSON.parse(document.getElementById('dark-colours').textContent);
+  var scheme = window.matchMedia('(prefers-color-scheme: dark)');
+  var finger = window.matchMedia('(pointer: coarse)').matches;
+  var boxes = Array.prototype.slice.call(document.querySelectorAll('.drawing'));
+  var config = {responsive: true, displaylogo: false, displayModeBar: false};
+
+  // every colour of a figure is written for paper; at night each has a counterpart
+  function painted(part, night) {
+    if (typeof part === 'string') {
+      return night && Object.prototype.hasOwnProperty.call(dark, part) ? dark[part] : part;
+    }
+    if (Array.isArray(part)) {
+      return part.map(function (p) { return painted(p, night); });
+    }
+    if (part === null || typeof part !== 'object' || 'bdata' in part) { return part; }
+    var copy = {};
+    Object.keys(part).forEach(function (key) { copy[key] = painted(part[key], night); });
+    return copy;
+  }
+
+  function draw(box, night, width) {
+    var figure = painted(JSON.parse(box.previousElementSibling.textContent), night);
+    var layout = figure.layout;
+    if (width) {
+      layout.width = width;
+      layout.autosize = false;
+    }
+    var room = width || box.clientWidth;
+    if (layout.meta && layout.meta.square) { layout.height = Math.min(layout.height, room + 30); }
+    if (room < 480) {
+      layout.font.size = 11;
+      layout.margin.l = Math.min(layout.margin.l, 52);
+    }
+    // a finger scrolls the page over a plot instead of zooming it
+    if (finger) { layout.dragmode = false; }
+    return Plotly.react(box, figure.data, layout, config);
+  }
+
+  function all(night, printing) {
+    boxes.forEach(function (box) {
+      var half = box.closest('.pair') !== null;
+      draw(box, night, printing ? (half ? 330 : 680) : 0);
+    });
+  }
+
+  all(scheme.matches, false);
+  scheme.addEventListener('change', function () { all(scheme.matches, false); });
+  window.addEventListener('beforeprint', function () { all(false, true); });
+  window.addEventListener('afterprint', function () { all(scheme.matches, false); });
+})();

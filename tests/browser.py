@@ -1,0 +1,100 @@
+"""Headless Chromium as a command: a page's document, console and screenshot."""
+
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+#: Headless windows are at least 500 wide; a phone is a frame in one.
+PHONE = 390
+DARK = "--blink-settings=preferredColorScheme=0"
+_CONSOLE = re.compile(r":CONSOLE[:(]\d+\)?\] (.*)")
+
+# Tells the page around the frame how the page in the frame came out.
+_REPORTER = """<script>
+window.addEventListener('load', function () {
+  setTimeout(function () {
+    var root = document.documentElement, sizes = [], outside = [], small = [];
+    function look(node) {
+      var box = node.getBoundingClientRect();
+      if (box.right > root.clientWidth + 1 && !node.closest('.scroll')) {
+        outside.push(node.tagName + '.' + node.getAttribute('class'));
+      }
+      var size = parseFloat(getComputedStyle(node).fontSize);
+      if (node.childElementCount === 0 && node.textContent.trim()) {
+        sizes.push(size);
+        if (size < 9) { small.push(node.textContent); }
+      }
+    }
+    document.body.querySelectorAll('*:not(script):not(defs *)').forEach(look);
+    var plots = Array.prototype.slice.call(document.querySelectorAll('.drawing'));
+    parent.postMessage(JSON.stringify({
+      width: root.clientWidth, needed: root.scrollWidth, outside: outside.slice(0, 5),
+      smallest: Math.min.apply(null, sizes), small: small.slice(0, 5), plots: plots.length,
+      drawn: plots.filter(function (p) { return p.querySelector('svg.main-svg'); }).length,
+      narrowest: Math.min.apply(null, plots.map(function (p) {
+        return p.querySelector('svg.main-svg').getBoundingClientRect().width; }))
+    }), '*');
+  }, 500);
+});
+</script>"""
+
+
+@dataclass(frozen=True)
+class Browser:
+    """The browser at `path`, with a folder for its profile and its pages."""
+
+    path: str
+    folder: Path
+
+    def document(self, page: Path, *flags: str) -> tuple[str, list[str]]:
+        """Return the page's document after its scripts ran, and the lines of its console."""
+        done = self._run(page, "--dump-dom", *flags)
+        return done.stdout, _CONSOLE.findall(done.stderr)
+
+    def screenshot(self, page: Path, width: int, height: int, *flags: str) -> Path:
+        """Return a picture of the window."""
+        path = self.folder / f"{page.stem}-{width}-{len(flags)}.png"
+        self._run(page, f"--screenshot={path}", f"--window-size={width},{height}", *flags)
+        return path
+
+    def _run(self, page: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+        command = [
+            self.path, "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+            "--enable-logging=stderr", "--virtual-time-budget=20000", "--no-first-run",
+            f"--user-data-dir={self.folder / 'profile'}", *flags, page.as_uri(),
+        ]  # fmt: skip
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=240, check=True, errors="replace"
+        )
+
+
+def find_browser(folder: Path) -> Browser:
+    """Return a browser; without one the test is skipped, or fails where one is required."""
+    path = next((p for p in map(shutil.which, NAMES) if p), None)
+    if path is None:
+        reason = f"no browser is installed: none of {', '.join(NAMES)} is in PATH"
+        if os.environ.get("PSA_CASADI_REQUIRE_BROWSER") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return Browser(path, folder)
+
+
+def on_a_phone(page: Path, height: int = 844) -> Path:
+    """Return a page that shows `page` in a frame as wide as a phone, and how it came out."""
+    inner, outer = (page.with_name(f"{page.stem}-{part}.html") for part in ("inner", "phone"))
+    text = page.read_text(encoding="utf-8")
+    inner.write_text(text.replace("</body>", f"{_REPORTER}</body>"), encoding="utf-8")
+    outer.write_text(
+        "<!DOCTYPE html><html><body style='margin:0'><script>addEventListener('message',"
+        "function (e) { document.getElementById('told').textContent = e.data; });</script>"
+        f"<iframe src='{inner.name}' width='{PHONE}' height='{height}' style='border:0'></iframe>"
+        "<pre id='told'></pre></body></html>",
+        encoding="utf-8",
+    )
+    return outer

@@ -1,0 +1,58 @@
+"""What an HTML page of a report holds: its text, what it would load, its figures."""
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+
+_SCRIPT = re.compile(r'<script type="application/json">(.*?)</script>', re.DOTALL)
+_DTYPES = {"f4": np.float32, "f8": np.float64, "i1": np.int8, "i2": np.int16, "i4": np.int32}
+
+
+class Page(HTMLParser):
+    """Resources that a page loads, its inner links and their ends, its text without scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.targets: set[str] = set()
+        self.names: set[str] = set()
+        self.words: list[str] = []
+        self._open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._open.append(tag)
+        given = {k: v or "" for k, v in attrs}
+        self.names.add(given.get("id", ""))
+        links = [v for k, v in given.items() if k in ("src", "href", "srcset", "data")]
+        self.targets |= {link[1:] for link in links if link.startswith("#")}
+        self.loaded += [link for link in links if not link.startswith("#")]
+
+    def handle_endtag(self, tag: str) -> None:
+        while self._open and self._open.pop() != tag:
+            pass
+
+    def handle_data(self, data: str) -> None:
+        if not {"script", "style"} & set(self._open):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def figures(page: str) -> list[dict[str, Any]]:
+    """Return the plotly figures of a page in their order."""
+    return [json.loads(text) for text in _SCRIPT.findall(page)]
+
+
+def numbers(values: Any) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Return the numbers of a trace, which plotly may have written in base64."""
+    if isinstance(values, dict):
+        data = base64.b64decode(values["bdata"])
+        return np.frombuffer(data, _DTYPES[values["dtype"]]).astype(np.float64)
+    return np.array([np.nan if v is None else v for v in values], dtype=np.float64)

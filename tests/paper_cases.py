@@ -1,0 +1,100 @@
+"""Steps in closed form, and records of the reference that the paper's method is tried on."""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi import reference
+from psa_casadi.experiment import Record, sine, time_grid
+from psa_casadi.model.stacks import STACKS
+
+FloatArray = NDArray[np.float64]
+
+LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}
+#: A loop that leads, for which the paper's own condition gamma > beta holds (over k_L).
+LEADING = {"A": 0.25, "beta": 0.05, "gamma": 0.2, "delta": -0.02}
+
+
+def values(name: str, **changes: float) -> dict[str, float]:
+    return {key: figure.value for key, figure in STACKS[name].values.items()} | changes
+
+
+def compliance(p: dict[str, float]) -> float:
+    return 1.0 / p["k_P"] + 1.0 / p["k_B"]
+
+
+def transfer(p: dict[str, float], s: complex) -> complex:
+    """Return (13) over (14) as the paper writes it, from (10)."""
+    wafers = p["m_P"] * s**2 + p["c_P"] * s + p["k_P"]
+    bonding = p["m_B"] * s**2 + p["c_B"] * s + p["k_B"]
+    both = (p["c_B"] + p["c_P"]) * s + p["k_B"] + p["k_P"]
+    return both / (wafers * bonding) / (p["tau"] * s + 1.0) / compliance(p)
+
+
+def poles(p: dict[str, float]) -> NDArray[np.complex128]:
+    parts = [np.roots([p[f"m_{q}"], p[f"c_{q}"], p[f"k_{q}"]]) for q in "PB"]
+    return np.concatenate([[-1.0 / p["tau"]], *parts]).astype(np.complex128)
+
+
+def residues(p: dict[str, float]) -> NDArray[np.complex128]:
+    """Return r_i of the step response 1 + sum r_i e^(p_i t), by the limit (s - p_i) G(s)/s."""
+    found = []
+    for k, pole in enumerate(poles(p)):
+        others = np.delete(poles(p), k)
+        scale = p["tau"] * p["m_P"] * p["m_B"] * compliance(p)
+        both = (p["c_B"] + p["c_P"]) * pole + p["k_B"] + p["k_P"]
+        found.append(both / (scale * pole * np.prod(pole - others)))
+    return np.array(found)
+
+
+def step_response(p: dict[str, float], time: FloatArray) -> FloatArray:
+    g = 1.0 + np.exp(np.outer(time, poles(p))) @ residues(p)
+    return np.asarray(g.real, dtype=np.float64)
+
+
+def closed_step(p: dict[str, float], duration: float, samples: int, noise: float = 0.0) -> Record:
+    """Return a record of the closed step response: a jump to u_rated in 0.1 ns, then held."""
+    time = np.linspace(0.0, duration, samples)
+    g = step_response(p, time) + noise * np.random.default_rng(0).standard_normal(samples)
+    voltage = np.concatenate([[0.0], np.full(samples, p["u_rated"])])
+    x = np.concatenate([[0.0], g]) * p["k_L"] * compliance(p) * p["u_rated"]
+    return Record("step", np.concatenate([[0.0], time + 1e-10]), voltage, x)
+
+
+def respond(p: dict[str, float], time: FloatArray, voltage: FloatArray) -> FloatArray:
+    drive = reference.from_samples(time, voltage)
+    return reference.simulate(
+        p, drive, time, breakpoints=time[1:3].tolist(), rtol=1e-9
+    ).displacement
+
+
+@lru_cache(maxsize=8)
+def loop(name: str = "P-885.51", frequency: float = 1.0, leading: bool = False) -> Record:
+    """Return two periods of a sine from rest at 0 V to u_rated, without noise."""
+    p = values(name)
+    if leading:
+        p |= {key: share * p["k_L"] for key, share in LEADING.items()}
+    time = time_grid(2.0 / frequency, 1.0 / (500.0 * frequency))
+    voltage = sine(time, 0.0, p["u_rated"], frequency)
+    return Record(f"loop {frequency:g} Hz", time, voltage, respond(p, time, voltage))
+
+
+@lru_cache(maxsize=4)
+def real_step(volts: float, name: str = "P-885.51") -> Record:
+    """Return the reference's response, hysteresis and all, to a jump of so many volts."""
+    p = values(name)
+    time = np.linspace(0.0, 4e-3, 4001)
+    voltage = np.full(time.shape, volts)
+    voltage[0] = 0.0
+    return Record(f"step {volts:g} V", time, voltage, respond(p, time, voltage))
+
+
+def changed(record: Record, displacement: FloatArray) -> Record:
+    return Record(record.name, record.time, record.voltage, displacement)
+
+
+def noisy(record: Record, share: float) -> Record:
+    x = np.asarray(record.displacement)
+    draw = np.random.default_rng(1).standard_normal(record.n)
+    return changed(record, x + share * record.range_m * draw)

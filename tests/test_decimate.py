@@ -1,0 +1,186 @@
+"""Block averages keep what a fit could use, and are not taken where they would not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, hold, read_record, sine, steps, time_grid, triangle
+from psa_casadi.experiment.decimate import decimated
+from psa_casadi.experiment.fast_noise import fast_noise
+
+FloatArray = NDArray[np.float64]
+SLOPE, NOISE = 1e-7, 1e-8
+N = 250_000
+T = time_grid(25.0, 1e-4)
+
+
+def white(seed: int, n: int = N) -> FloatArray:
+    return np.random.default_rng(seed).standard_normal(n)
+
+
+def curve(u: FloatArray) -> FloatArray:
+    """Return the displacement of a bent loop without memory, for voltages of 0 to 100 V."""
+    return np.asarray(SLOPE * (0.8 * u + 0.002 * u**2), dtype=float)
+
+
+def loop(t: FloatArray = T, seed: int = 1, noise: float = NOISE) -> Record:
+    u = sine(t, 0.0, 100.0, 0.05)
+    return Record("loop", t, u, curve(u) + noise * white(seed, t.size))
+
+
+def test_a_million_slow_samples_shrink_and_keep_their_content() -> None:
+    record = loop(time_grid(100.0, 1e-4))
+    small, q = decimated(record, NOISE, SLOPE)
+    assert 32 <= q <= 500
+    assert (record.n, small.n) == (1_000_000, 1_000_000 // q)
+    assert small.displacement is not None
+    np.testing.assert_allclose(
+        small.time, np.mean(record.time[: small.n * q].reshape(-1, q), axis=1)
+    )
+    exact = sine(small.time, 0.0, 100.0, 0.05)
+    residual = small.displacement - curve(exact)
+    assert np.std(residual) == pytest.approx(NOISE / np.sqrt(q), rel=0.05)
+    assert abs(np.mean(residual)) < 4 * NOISE / np.sqrt(record.n)
+    assert np.max(np.abs(small.voltage - exact)) < 0.1 * NOISE / SLOPE
+    own = np.polyfit(small.voltage, small.displacement, 2)
+    full = np.polyfit(record.voltage, np.asarray(record.displacement), 2)
+    spread = NOISE / np.sqrt(record.n) / np.array([30.0**2, 30.0, 1.0])
+    assert np.all(np.abs(own - full) < 3 * spread)
+    assert (small.name, small.source, small.sha256) == (record.name, record.source, record.sha256)
+
+
+def test_a_louder_record_shrinks_further_and_a_quieter_one_less() -> None:
+    factors = [decimated(loop(noise=s), s, SLOPE)[1] for s in (1e-12, 1e-10, 1e-8)]
+    assert factors == sorted(factors)
+    assert factors[0] < factors[-1] // 4
+
+
+def test_the_tips_of_a_triangle_are_kept() -> None:
+    u = triangle(T, 0.0, 100.0, 0.05)
+    record = Record("triangle", T, u, curve(u) + NOISE * white(2))
+    small, q = decimated(record, NOISE, SLOPE)
+    assert q >= 8
+    tips = 100.0 - small.voltage.max(), small.voltage.min()
+    assert max(tips) < 0.2 * NOISE / SLOPE
+    assert 2 * q * 1e-4 * 5.0 * SLOPE > 0.1 * NOISE or N // (2 * q) < 2000
+    again = np.interp(record.time[q:-q], small.time, small.voltage)
+    assert np.max(np.abs(again - u[q:-q])) < 0.1 * NOISE / SLOPE
+
+
+def test_a_ringing_step_is_not_touched() -> None:
+    u = steps(T, [0.0, 100.0, 0.0, 100.0])
+    for period in (10, 100, 1000):
+        w, d = 2 * np.pi / period, 0.02
+        a = [1.0, -2 * np.exp(-d * w) * np.cos(w), np.exp(-2 * d * w)]
+        y = lfilter([sum(a)], a, SLOPE * u) + NOISE * white(3)
+        small, q = decimated(Record("step", T, u, y), NOISE, SLOPE)
+        assert q == 1
+        assert small.n == N
+
+
+@pytest.mark.parametrize("frequency", [1234.5, 100.0, 3700.0])
+def test_a_tone_below_the_noise_is_kept(frequency: float) -> None:
+    base = loop()
+    assert base.displacement is not None
+    tone = 0.05 * NOISE * np.sin(2 * np.pi * frequency * T)
+    small, q = decimated(replace(base, displacement=base.displacement + tone), NOISE, SLOPE)
+    assert frequency < 0.5 / small.sample_time
+    assert q < decimated(base, NOISE, SLOPE)[1]
+
+
+def test_a_resonance_in_the_noise_is_kept() -> None:
+    base = loop()
+    assert base.displacement is not None
+    w, d = 2 * np.pi * 0.31, 2e-4
+    a = [1.0, -2 * np.exp(-d * w) * np.cos(w), np.exp(-2 * d * w)]
+    hum = lfilter([1.0], a, white(7))
+    y = base.displacement + 0.1 * NOISE * hum / np.std(hum)
+    assert decimated(replace(base, displacement=y), NOISE, SLOPE)[1] == 1
+
+
+def test_a_step_in_a_slow_record_is_kept() -> None:
+    base = loop()
+    u = base.voltage.copy()
+    u[150_001] += 5.0
+    assert decimated(replace(base, voltage=u), NOISE, SLOPE)[1] == 1
+    u[150_001:] += 5.0
+    assert decimated(replace(base, voltage=u), NOISE, SLOPE)[1] == 1
+
+
+def test_white_noise_of_the_voltage_is_no_reason_to_stop_and_fast_motion_is_none_to_go_on() -> None:
+    base = loop()
+    noisy = replace(base, voltage=base.voltage + 0.3 * white(8))
+    assert decimated(noisy, NOISE, SLOPE)[1] == decimated(base, NOISE, SLOPE)[1]
+    fast = sine(T, 0.0, 100.0, 500.0)
+    record = Record("fast", T, fast, curve(fast) + NOISE * white(9))
+    assert decimated(record, NOISE, SLOPE)[1] == 1
+
+
+def test_missing_samples_move_nothing_and_stay_missing() -> None:
+    base = loop()
+    assert base.displacement is not None
+    y, draw = base.displacement.copy(), np.random.default_rng(10)
+    y[draw.random(N) < 0.2] = np.nan
+    y[100_000:110_000] = np.nan
+    small, q = decimated(replace(base, displacement=y), NOISE, SLOPE)
+    assert q >= 16
+    assert small.displacement is not None
+    inside = (small.time > T[100_000] + q * 1e-4) & (small.time < T[110_000] - q * 1e-4)
+    assert not small.mask[inside].any()
+    assert small.mask[~inside].mean() > 0.99
+    residual = (small.displacement - curve(sine(small.time, 0.0, 100.0, 0.05)))[small.mask]
+    assert abs(np.mean(residual)) < 4 * NOISE / np.sqrt(0.8 * N)
+    assert np.std(residual) == pytest.approx(NOISE / np.sqrt(0.8 * q), rel=0.1)
+
+
+def test_short_uneven_and_planned_records() -> None:
+    short = loop(time_grid(0.3999, 1e-4))
+    assert short.n == 3999
+    assert decimated(short, NOISE, SLOPE) == (short, 1)
+    jitter = T + 2e-5 * np.random.default_rng(11).random(N)
+    assert decimated(loop(jitter), NOISE, SLOPE)[1] == 1
+    planned = Record("planned", T, sine(T, 0.0, 100.0, 0.05))
+    small, q = decimated(planned, NOISE, SLOPE)
+    assert q > 1
+    assert small.displacement is None
+
+
+def test_other_columns_are_averaged_and_a_sudden_load_is_kept() -> None:
+    base = loop()
+    wide = replace(base, current=1e-3 + 0.0 * T, temperature=293.0 + T, load_force=hold(T, 5.0))
+    small, q = decimated(wide, NOISE, SLOPE)
+    assert q > 1
+    assert small.temperature is not None
+    assert small.load_force is not None
+    np.testing.assert_allclose(small.temperature, 293.0 + small.time, rtol=1e-12)
+    np.testing.assert_allclose(small.load_force, 5.0)
+    kicked = replace(base, load_force=np.where(T < 12.50005, 0.0, 5.0))
+    assert decimated(kicked, NOISE, SLOPE)[1] == 1
+
+
+@pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
+def test_the_measured_records_have_nothing_to_spare(measured_data: object, file: str) -> None:
+    record = read_record(f"{measured_data}/micromanipulator/{file}.csv")
+    assert decimated(record, 7e-8, record.range_m / float(np.ptp(record.voltage)))[1] == 1
+
+
+def test_a_noise_or_slope_of_nothing_is_refused() -> None:
+    for noise, slope in ((0.0, 1e-7), (-1.0, 1e-7), (np.nan, 1e-7), (1e-8, 0.0)):
+        with pytest.raises(InputError, match="expected a positive number"):
+            decimated(loop(time_grid(1.0, 1e-4)), noise, slope)
+    record = loop(time_grid(100.0, 1e-3))
+    assert decimated(record, NOISE, -SLOPE)[1] == decimated(record, NOISE, SLOPE)[1]
+
+
+def test_fast_noise_is_the_white_part() -> None:
+    t = T[:20_000]
+    for motion in (0.0 * t, 50.0 * np.sin(2 * np.pi * 5 * t), triangle(t, 0.0, 100.0, 3.0)):
+        assert fast_noise(motion + 0.3 * white(12, t.size)) == pytest.approx(0.3, rel=0.05)
+        assert fast_noise(motion) < 1e-6
+    assert fast_noise(np.sin(2 * np.pi * 500 * t)) == 0.0
+    assert fast_noise(np.asarray(lfilter([1], [1, -0.9], white(13, t.size)))) < 1.0
+    assert fast_noise(np.repeat([1.0, 2.0], 3)) == 0.0

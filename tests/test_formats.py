@@ -1,0 +1,364 @@
+"""Records in other formats and spellings than a plain CSV file."""
+
+import hashlib
+import sys
+import time as clock
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow
+import pytest
+from numpy.typing import ArrayLike, NDArray
+from pyarrow import parquet
+from scipy.io import savemat
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, read_record, read_records, write_record
+from psa_casadi.experiment.column_map import parse_columns
+from psa_casadi.experiment.columns import Source
+from tests.record_files import HEADER, ROWS, write
+
+N = 24
+T = np.arange(N) / 8.0
+U = np.sin(T)
+Y = np.cos(T)
+COLUMNS = "time=t:ms,voltage=u:mV,displacement=y:nm"
+
+
+def mat(path: Path, content: Mapping[str, object], version: str = "5") -> Path:
+    """Write a MATLAB file as MATLAB does: vectors upright, v7.3 as transposed HDF5."""
+    if version != "7.3":
+        savemat(path, dict(content), format="5", do_compression=version == "7", oned_as="column")
+        return path
+    with h5py.File(path, "w", userblock_size=512) as file:
+        _fill(file, content)
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+    return path
+
+
+def _fill(group: Any, content: Mapping[str, object]) -> None:
+    for name, value in content.items():
+        if isinstance(value, dict):
+            _fill(group.create_group(name), value)
+        else:
+            group[name] = np.atleast_2d(np.asarray(value))
+
+
+def table(path: Path, columns: Mapping[str, object]) -> Path:
+    parquet.write_table(pyarrow.table(dict(columns)), path)
+    return path
+
+
+def problems_of(path: Path, columns: str | None = None) -> tuple[str, ...]:
+    with pytest.raises(InputError) as caught:
+        read_record(path, columns=columns)
+    assert all(p.startswith((str(path), "--columns")) for p in caught.value.problems)
+    assert all(p.endswith(".") for p in caught.value.problems)
+    assert len(caught.value.problems) < 20
+    return caught.value.problems
+
+
+def assert_is(record: Record, t: ArrayLike, u: ArrayLike, y: ArrayLike) -> None:
+    assert record.displacement is not None
+    np.testing.assert_allclose(record.time, np.asarray(t, float), rtol=1e-15)
+    np.testing.assert_allclose(record.voltage, np.asarray(u, float), rtol=1e-15)
+    np.testing.assert_allclose(record.displacement, np.asarray(y, float), rtol=1e-15)
+
+
+@pytest.mark.parametrize("version", ["5", "7", "7.3"])
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16])
+def test_matlab_arrays_of_every_version_and_kind(
+    tmp_path: Path, version: str, kind: type[np.generic]
+) -> None:
+    arrays: dict[str, NDArray[np.generic]] = {
+        "t": np.arange(N).astype(kind),
+        "u": (100 * U).astype(kind),
+        "y": (1000 * Y).astype(kind),
+    }
+    path = mat(tmp_path / "rig.mat", arrays, version)
+    record = read_record(path, columns=COLUMNS)
+    t, u, y = (arrays[name].astype(float) for name in "tuy")
+    assert_is(record, t / 1e3, u / 1e3, y / 1e9)
+    assert record.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert (record.name, record.source) == ("rig", str(path))
+
+
+@pytest.mark.parametrize("version", ["5", "7.3"])
+def test_structures_matrices_lying_vectors_and_names_with_units(
+    tmp_path: Path, version: str
+) -> None:
+    content = {
+        "log": {"t": T, "deep": {"u": U}},
+        "m": np.column_stack([T, U, Y]) if version == "5" else np.vstack([T, U, Y]),
+        "lying": Y[None, :],
+        "note": "rig 3",
+    }
+    if version == "7.3":
+        del content["note"]
+    path = mat(tmp_path / "a.mat", content, version)
+    record = read_record(path, columns="time=log.t,voltage=log.deep.u,displacement=lying:um")
+    assert_is(record, T, U, Y / 1e6)
+    record = read_record(path, columns="time=m.1:ms,voltage=m.2,displacement=m.3[mm]")
+    assert_is(record, T / 1e3, U, Y / 1e3)
+    named = {"time_ms": T, "voltage": U, "displacement_um": Y, "temperature_degC": 20 + Y}
+    record = read_record(mat(tmp_path / "b.mat", named, version))
+    assert_is(record, T / 1e3, U, Y / 1e6)
+    np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + Y)
+
+
+def test_missing_displacements_of_other_formats_are_masked(tmp_path: Path) -> None:
+    y = Y.copy()
+    y[[3, 7]] = np.nan
+    record = read_record(
+        mat(tmp_path / "a.mat", {"t": T, "u": U, "y": y}),
+        columns="time=t,voltage=u,displacement=y:m",
+    )
+    assert list(np.flatnonzero(~record.mask)) == [3, 7]
+    holes = [None if k in (2, 5) else float(v) for k, v in enumerate(Y)]
+    columns = {"time [s]": T, "voltage [V]": U, "displacement [um]": holes}
+    record = read_record(table(tmp_path / "a.parquet", columns))
+    assert list(np.flatnonzero(~record.mask)) == [2, 5]
+
+
+def test_parquet_columns_are_named_as_in_a_csv_header(tmp_path: Path) -> None:
+    columns = {
+        "remark": ["ok"] * N,
+        "displacement [counts]": np.arange(N, dtype=np.int32),
+        "Time [ms]": T.astype(np.float32),
+        "voltage [kV]": U,
+        "Load Force [N]": Y,
+    }
+    path = table(tmp_path / "a.parquet", columns)
+    record = read_record(path)
+    assert_is(record, T / 1e3, U * 1e3, np.arange(N))
+    assert record.displacement_unit == "counts"
+    assert record.load_force is not None
+    assert record.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    other = table(tmp_path / "b.pq", {"t [ms]": T, "Piezo": U, "x": Y, "voltage [V]": Y})
+    record = read_record(other, columns="time=t,voltage=piezo:mV,displacement=x:um")
+    assert_is(record, T / 1e3, U / 1e3, Y / 1e6)
+
+
+def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "a.csv", "t [ms],amp out,LVDT [um],voltage [V]", *(f"{r},9" for r in ROWS)
+    )
+    record = read_record(path, columns="time=t,voltage=amp out:mV,displacement=lvdt:µm")
+    plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
+    assert plain.displacement is not None
+    assert_is(record, plain.time / 1e3, plain.voltage / 1e3, plain.displacement)
+    (problem,) = problems_of(path, "time=t,voltage=amp out,displacement=LVDT:mm")
+    assert "line 1, column 'LVDT': the header gives the unit 'um', --columns gives 'mm'" in problem
+    (problem,) = problems_of(path, "time=t,displacement=LVTD")
+    assert "'LVTD', which --columns names for 'displacement', is not in the header" in problem
+    assert "(found: time, voltage, amp out, LVDT)" in problem
+    (problem,) = problems_of(
+        write(tmp_path / "c.csv", "time [s],voltage [V],y", *ROWS), "displacement=y"
+    )
+    assert "line 1, column 'y': has no unit" in problem
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("voltage", "'voltage': is not understood; write NAME=ARRAY:UNIT"),
+        ("voltage=", "'voltage=': is not understood"),
+        ("voltag=u", "'voltag' is no column of a record; is 'voltage' meant?"),
+        ("strain=u", "'strain' is no column of a record; there are time, voltage"),
+        ("voltage=u,voltage=v", "'voltage=v': 'voltage' is given twice"),
+        ("voltage=u:um", "the unit 'um' does not measure voltage"),
+        ("voltage=u:volts", "the unit 'volts' is unknown"),
+        ("voltage=u:", "has no unit"),
+    ],
+)
+def test_mistakes_of_the_columns_option(text: str, expected: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_columns(text)
+    (problem,) = caught.value.problems
+    assert problem.startswith("--columns, '")
+    assert expected in problem
+
+
+def test_the_columns_option_is_read_whole(tmp_path: Path) -> None:
+    found = parse_columns(" time = t:ms , load-force=f[kN],displacement=log.y.2")
+    assert found == {
+        "time": Source("t", "ms"),
+        "load_force": Source("f", "kN"),
+        "displacement": Source("log.y.2", None),
+    }
+    with pytest.raises(InputError) as caught:
+        read_records([tmp_path / "a.csv"], columns="a=b,voltage=u:s,=,c")
+    assert len(caught.value.problems) == 4
+
+
+def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
+    t, y = T.copy(), Y.copy()
+    t[5], y[9] = t[3], np.inf
+    path = mat(tmp_path / "a.mat", {"t": t, "u": np.r_[U[:4], np.nan, U[5:]], "y": y, "z": Y[:7]})
+    problems = problems_of(path, "time=t,voltage=u,displacement=y:um")
+    assert len(problems) == 3
+    assert "sample 6, column 'time': time goes back (from 0.5 in sample 5 to 0.375)" in problems[0]
+    assert "in every sample; remove repeated samples" in problems[0]
+    assert "sample 5, column 'voltage': found no value" in problems[1]
+    assert "fill the cell or remove the sample" in problems[1]
+    assert "sample 10, column 'displacement': found inf" in problems[2]
+    problems = problems_of(path)
+    assert len(problems) == 3
+    assert "no array is named 'voltage' (arrays and their lengths: t (24), u (24)" in problems[1]
+    assert "such as --columns displacement=ARRAY:um" in problems[2]
+    problems = problems_of(path, "time=t,voltage=w,displacement=y")
+    assert "there is no array 'w' of numbers" in problems[0]
+    assert (
+        "the displacement has no unit; give it, such as --columns displacement=y:um" in problems[1]
+    )
+    (problem,) = problems_of(path, "time=t,voltage=u,displacement=z:um")
+    assert "array 'z' (displacement) has 7 values, 'time' has 24" in problem
+
+
+def test_mistakes_of_a_parquet_file_are_told_at_once(tmp_path: Path) -> None:
+    t = T.copy()
+    t[1] = 9.0
+    columns = {"time [s]": t, "voltage [V]": ["a"] * N, "displacement [kg]": Y}
+    problems = problems_of(table(tmp_path / "a.parquet", columns))
+    assert len(problems) == 3
+    everything = "\n".join(problems)
+    assert (
+        "column names, column 'displacement': the unit 'kg' does not measure length" in everything
+    )
+    assert "column 'voltage': holds string, expected numbers" in everything
+    assert "row 3, column 'time': time goes back (from 9 in row 2 to 0.25)" in everything
+
+
+def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
+    text = write(tmp_path / "text.mat", HEADER, *ROWS)
+    (problem,) = problems_of(text)
+    assert "is no readable MATLAB file" in problem
+    (problem,) = problems_of(write(tmp_path / "text.parquet", HEADER, *ROWS))
+    assert "is no readable Parquet file" in problem
+    (tmp_path / "broken.mat").write_bytes(
+        b"MATLAB 7.3".ljust(512) + b"\x89HDF\r\n\x1a\n" + b"x" * 50
+    )
+    (problem,) = problems_of(tmp_path / "broken.mat")
+    assert "is no readable MATLAB file" in problem
+    (problem,) = problems_of(tmp_path / "absent.mat")
+    assert "there is no such file" in problem
+    (problem,) = problems_of(tmp_path / "absent.parquet")
+    assert "there is no such file" in problem
+    empty = mat(tmp_path / "empty.mat", {"note": "nothing"})
+    assert "it holds none" in problems_of(empty)[0]
+
+
+@pytest.mark.parametrize("version", ["5", "7", "7.3"])
+def test_a_damaged_matlab_file_is_told_in_sentences(tmp_path: Path, version: str) -> None:
+    whole = mat(tmp_path / "a.mat", {"t": T, "u": U, "y": Y}, version).read_bytes()
+    draw = np.random.default_rng(1)
+    for stop in draw.integers(1, len(whole), 40):
+        cut = tmp_path / "cut.mat"
+        cut.write_bytes(whole[:stop])
+        with pytest.raises(InputError) as caught:
+            read_record(cut, columns=COLUMNS)
+        assert str(cut) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "sentence"),
+    [
+        ("h5py", "a.mat", "version 7.3, and reading it needs h5py, which is not installed; run"),
+        ("pyarrow", "a.parquet", "reading Parquet needs pyarrow, which is not installed; run"),
+    ],
+)
+def test_a_missing_optional_package_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, name: str, sentence: str
+) -> None:
+    path = tmp_path / name
+    if module == "h5py":
+        mat(path, {"t": T, "u": U, "y": Y}, "7.3")
+    else:
+        table(path, {"time [s]": T, "voltage [V]": U, "displacement [um]": Y})
+    monkeypatch.setitem(sys.modules, module, None)
+    (problem,) = problems_of(path, COLUMNS if module == "h5py" else None)
+    assert sentence in problem
+
+
+def test_the_commands_take_every_format(tmp_path: Path) -> None:
+    path = mat(tmp_path / "a.mat", {"t": 1e-3 * T, "u": 10 + U})
+    out = tmp_path / "out.csv"
+    base = ["simulate", "--stack", "demo", "--input", str(path), "-o", str(out)]
+    result = CliRunner().invoke(app, [*base, "--columns", "time=t,voltage=u"])
+    assert result.exit_code == 0, result.output
+    np.testing.assert_array_equal(read_record(out).voltage, 10 + U)
+    for command in ("identify", "diagnose"):
+        arguments = [command, str(path), "-o", str(tmp_path / "m.json")]
+        result = CliRunner().invoke(
+            app, [*arguments, "--columns", "time=t,voltage=u,displacement=u:s"]
+        )
+        assert result.exit_code == 2
+        assert "the unit 's' does not measure length" in result.stderr
+        result = CliRunner().invoke(app, [*arguments, "--columns", "time=t,voltage=u"])
+        assert result.exit_code == 2
+        assert "no array is named 'displacement'" in result.stderr
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_decimal_commas_are_read(tmp_path: Path, delimiter: str, encoding: str) -> None:
+    rows = [row.replace(",", delimiter).replace(".", ",") for row in ROWS]
+    rows[3] = delimiter.join(["0,003", "-1,5e-1", ""])
+    rows = [f"{row}{delimiter}12.03.2024 10:00" for row in rows]
+    header = delimiter.join(["time [s]", "voltage [V]", "displacement [µm]", "stamp"])
+    path = write(tmp_path / "a.csv", "# Prüfstand 3", "", header, *rows, encoding=encoding)
+    record = read_record(path)
+    plain = ROWS.copy()
+    plain[3] = "0.003,-0.15,"
+    expected = read_record(write(tmp_path / "b.csv", HEADER, *plain))
+    assert expected.displacement is not None
+    assert_is(record, expected.time, expected.voltage, expected.displacement)
+    quoted = [row.replace(";", '";"').replace("\t", '"\t"') for row in rows]
+    again = read_record(write(tmp_path / "c.csv", header, *(f'"{row}"' for row in quoted)))
+    assert_is(again, expected.time, expected.voltage, expected.displacement)
+
+
+def test_quoted_decimal_commas_between_commas_are_read(tmp_path: Path) -> None:
+    rows = [",".join(f'"{cell.replace(".", ",")}"' for cell in row.split(",")) for row in ROWS]
+    record = read_record(write(tmp_path / "a.csv", HEADER, *rows))
+    plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
+    assert plain.displacement is not None
+    assert_is(record, plain.time, plain.voltage, plain.displacement)
+
+
+@pytest.mark.parametrize("unit", ["um", "counts"])
+@pytest.mark.parametrize("low", [-150.0, 0.0])
+@pytest.mark.parametrize("temperature", ["degC", "K", "°C"])
+def test_half_an_hour_at_10_hz_one_sided_and_bipolar(
+    tmp_path: Path, unit: str, low: float, temperature: str
+) -> None:
+    t = np.arange(18000) / 10.0
+    u = low + (150.0 - low) * 0.5 * (1 - np.cos(2 * np.pi * t / 60.0))
+    y = np.round(u / 3.0)
+    kelvin = temperature == "K"
+    degrees = (293.15 if kelvin else 20.0) + t / 1800.0
+    path = tmp_path / "slow.csv"
+    columns = {"time [s]": t, "voltage [V]": u, f"displacement [{unit}]": y}
+    write_record(path, columns | {f"temperature [{temperature}]": degrees})
+    record = read_record(path, need_excitation=True)
+    assert (record.n, record.displacement_unit) == (18000, "counts" if unit == "counts" else "m")
+    assert record.sample_time == pytest.approx(0.1)
+    assert record.voltage.min() == pytest.approx(low)
+    assert_is(record, t, u, y if unit == "counts" else y / 1e6)
+    np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + t / 1800.0, rtol=1e-14)
+
+
+def test_a_million_rows_with_decimal_commas_are_read_quickly(tmp_path: Path) -> None:
+    rows = [
+        f"{k / 10000:.4f};{k % 1000 / 10};{k % 1000 / 100}".replace(".", ",") for k in range(10**6)
+    ]
+    path = write(tmp_path / "long.csv", HEADER.replace(",", ";"), *rows)
+    started = clock.process_time()
+    assert read_record(path).n == 10**6
+    assert clock.process_time() - started < 6.0

@@ -1,0 +1,200 @@
+"""Profile likelihoods: where they must agree with the linearised interval, and where not."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, multisine, time_grid
+from psa_casadi.experiment.split import Experiment, whole
+from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.profile import (
+    PROFILE_LIMIT,
+    Profile,
+    profile,
+    profile_sentences,
+)
+from psa_casadi.model.compose import Model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.report.profile_plot import profile_plot
+from psa_casadi.simulation.simulate import simulate
+
+FloatArray = NDArray[np.float64]
+
+SIGMA = 2e-8
+#: The lags of wafers and bonding layers are far below the sampling: a tenth and less of it.
+SAMPLE = 2e-3
+
+
+def plant() -> Model:
+    return stack_model("demo").with_values({"delta": -0.5, "n": 1.3, "tau": 3e-3, "c_B": 8e3})
+
+
+def record_of(model: Model, seed: int, noise: float = SIGMA) -> Record:
+    time = time_grid(400 * SAMPLE, SAMPLE)
+    voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
+    x = simulate(model, time, voltage).displacement
+    return Record(f"r{seed}", time, voltage, x + noise * coloured(seed, len(time)))
+
+
+def coloured(seed: int, count: int) -> FloatArray:
+    """Return noise of variance 1 whose neighbours have the correlation 0.3."""
+    white = np.random.default_rng(seed).standard_normal(count)
+    noise: FloatArray = lfilter([np.sqrt(1.0 - 0.3**2)], [1.0, -0.3], white)
+    return noise
+
+
+@cache
+def fitted(*free: str, noise: float = SIGMA) -> tuple[Fit, list[Experiment]]:
+    """Return a fit whose weights assume the noise SIGMA, whatever it is."""
+    experiments = [whole(record_of(plant(), 1, noise))]
+    return fit(plant(), experiments, free, sigma=[SIGMA]), experiments
+
+
+@pytest.mark.parametrize("name", ["k_L", "tau", "beta", "n"])
+def test_where_the_cost_is_quadratic_it_is_the_linearised_interval(name: str) -> None:
+    found, experiments = fitted("k_L", "A", "beta", "gamma", "n", "tau")
+    p = profile(found, experiments, name)
+    linear = determinacy(found, experiments).intervals[name]
+    assert p.low is not None
+    assert p.high is not None
+    assert p.high - p.low == pytest.approx(linear.high - linear.low, rel=0.1)
+    assert 0.5 * (p.high + p.low) == pytest.approx(
+        0.5 * (linear.high + linear.low), abs=0.05 * (linear.high - linear.low)
+    )
+    assert p.estimate == found.model.values[name]
+    assert np.all(np.diff(p.values) > 0)
+    assert p.increase.min() == 0.0
+
+
+def test_residuals_above_the_weights_widen_it() -> None:
+    """The weights say 2e-8 m, the residuals 6e-8 m: the interval is three times as wide."""
+    widths = []
+    for noise in (SIGMA, 3.0 * SIGMA):
+        found, experiments = fitted("k_L", "tau", noise=noise)
+        p = profile(found, experiments, "tau")
+        assert p.low is not None
+        assert p.high is not None
+        widths.append(p.high - p.low)
+    assert widths[1] == pytest.approx(3.0 * widths[0], rel=0.1)
+
+
+def test_at_its_ends_the_cost_of_the_best_fit_has_grown_by_the_limit() -> None:
+    """R_s C_p lies far below the sampling: an interval that no standard error describes."""
+    found, experiments = fitted("k_L", "tau", "R_s")
+    p = profile(found, experiments, "R_s")
+    assert p.high is not None
+
+    def grown(value: float) -> float:
+        held = fit(
+            found.model.with_values({"R_s": value}),
+            experiments,
+            ("k_L", "tau"),
+            sigma=found.sigma,
+            start_states=[found.start(0)],
+        )
+        return held.cost - found.cost
+
+    unit = grown(float(p.values[-1])) / p.increase[-1]
+    assert grown(p.high) / unit == pytest.approx(PROFILE_LIMIT, rel=0.1)
+    if p.low is None:
+        assert p.values[0] == pytest.approx(p.bounds[0], rel=1e-6)
+
+
+def test_a_parameter_without_influence_is_open_on_both_sides() -> None:
+    """The time constant of a creep of gain 0 changes nothing."""
+    model = plant().with_effect(EFFECTS["slow_creep"])
+    free = next(
+        q.name for q in EFFECTS["slow_creep"].parameters if q.name != EFFECTS["slow_creep"].gain
+    )
+    experiments = [whole(record_of(plant(), 1))]
+    found = fit(model, experiments, ("k_L", free), sigma=[SIGMA])
+    p = profile(found, experiments, free)
+    assert p.low is None
+    assert p.high is None
+    assert p.increase.max() < 0.1
+    assert p.values[0] == pytest.approx(p.bounds[0], rel=1e-6)
+    assert p.values[-1] == pytest.approx(p.bounds[1], rel=1e-6)
+    assert f"{free} is not determined" in profile_sentences(p)[0]
+
+
+def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
+    found, experiments = fitted("k_L", "tau", "c_P")
+    p = profile(found, experiments, "c_P")
+    assert p.low is None
+    assert p.high is not None
+    assert p.high > 1e3
+    sentence = profile_sentences(p)[0]
+    assert sentence.startswith("c_P is below")
+    assert "nothing bounds it from below" in sentence
+
+
+def test_a_fit_that_stopped_short_is_told_so() -> None:
+    found, experiments = fitted("k_L", "tau")
+    theta = found.theta.copy()
+    error = determinacy(found, experiments).standard_errors["tau"]
+    moved = found.model.values["tau"] + 1.5 * error
+    theta[:2] = found.unknowns.coordinates({**found.model.values, "tau": moved})
+    short = replace(found, theta=theta, model=found.model.with_values({"tau": moved}))
+    p = profile(short, experiments, "tau")
+    complete = profile(found, experiments, "tau")
+    assert len(profile_sentences(complete)) == 1
+    assert "had not reached its minimum" in profile_sentences(p)[1]
+    assert p.low == pytest.approx(complete.low, rel=2e-3)
+    assert p.high == pytest.approx(complete.high, rel=2e-3)
+
+
+def test_a_parameter_that_was_not_searched_has_no_profile() -> None:
+    found, experiments = fitted("k_L", "tau")
+    with pytest.raises(InputError, match=r"'m_P' was not searched in this fit.*k_L, tau"):
+        profile(found, experiments, "m_P")
+
+
+def test_progress_names_the_parameter_and_the_value() -> None:
+    found, experiments = fitted("k_L", "tau")
+    seen: list[str] = []
+    p = profile(found, experiments, "tau", progress=seen.append)
+    assert len(seen) == len(p.values)
+    assert all(s.startswith("profile of tau, ") for s in seen)
+    assert len(p.values) <= 21
+
+
+@pytest.fixture
+def closed() -> Profile:
+    found, experiments = fitted("k_L", "tau")
+    return profile(found, experiments, "tau")
+
+
+def test_the_sentence_uses_the_display_unit(closed: Profile) -> None:
+    (sentence,) = profile_sentences(closed)
+    assert sentence.startswith("tau lies between 2.")
+    assert sentence.endswith("ms.")
+
+
+def test_the_plot_shows_profile_limit_and_interval(closed: Profile) -> None:
+    plot = profile_plot(closed)
+    assert plot.layout.xaxis.title.text == "tau [ms]"
+    np.testing.assert_allclose(plot.data[0].x, 1e3 * closed.values)
+    np.testing.assert_allclose(plot.data[0].y, closed.increase)
+    line, interval = plot.layout.shapes
+    assert line.y0 == line.y1 == PROFILE_LIMIT
+    assert closed.low is not None
+    assert closed.high is not None
+    assert (interval.x0, interval.x1) == pytest.approx((1e3 * closed.low, 1e3 * closed.high))
+    # where the cost is quadratic the dotted parabola passes through the profile's points
+    parabola = np.interp(plot.data[0].x, plot.data[1].x, plot.data[1].y)
+    np.testing.assert_allclose(parabola, closed.increase, atol=0.3)
+
+
+def test_a_cost_that_levels_off_is_followed_to_the_bound() -> None:
+    """Below the sampling the cost stays a little under the limit for six decades."""
+    found, experiments = fitted("k_L", "tau", "c_P")
+    p = profile(found, experiments, "c_P")
+    assert p.values[0] == pytest.approx(p.bounds[0], rel=1e-6)
+    assert 0.5 * PROFILE_LIMIT < p.increase[0] < PROFILE_LIMIT

@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+
+from psa_casadi.report.fit_words import residual_sentence
+from psa_casadi.report.phrases import Scale
+from psa_casadi.report.residuals import (
+    ResidualFigures,
+    autocorrelation,
+    distribution,
+    residual_figures,
+    shown_lines,
+    spectrum,
+    white_band,
+)
+from psa_casadi.report.series import Curve, FloatArray, Series
+
+SECONDS = Scale("s", 1.0)
+
+
+def white(samples: int, seed: int = 0) -> FloatArray:
+    return np.random.default_rng(seed).standard_normal(samples)
+
+
+def first_order(samples: int, r: float) -> FloatArray:
+    drive, values = white(samples, 1), np.zeros(samples)
+    for k in range(1, samples):
+        values[k] = r * values[k - 1] + drive[k]
+    return values
+
+
+def figures_of(residual: FloatArray) -> ResidualFigures:
+    time = np.arange(len(residual)) / 1000.0
+    model = np.sin(time) * 1e-5
+    none = np.zeros(len(time), dtype=bool)
+    curve = Curve("model", "#0072b2", model)
+    s = Series("r", time, time, model + 1e-9 * residual, (curve,), none, 1e-9, False)
+    return residual_figures(s, curve)
+
+
+def test_the_autocorrelation_of_a_first_order_process_is_a_power_of_its_pole() -> None:
+    residual = first_order(200_000, 0.9)
+    lags, values = autocorrelation(residual)
+    assert (lags[0], lags[-1]) == (1, 50_000)
+    assert np.all(np.diff(lags) > 0)
+    near = lags <= 30
+    assert values[near] == pytest.approx(0.9 ** lags[near], abs=0.03)
+
+
+def test_missing_samples_do_not_change_the_autocorrelation() -> None:
+    residual = first_order(200_000, 0.9)
+    residual[np.random.default_rng(2).random(len(residual)) < 0.3] = np.nan
+    residual[50_000:60_000] = np.nan
+    lags, values = autocorrelation(residual)
+    near = lags <= 30
+    assert values[near] == pytest.approx(0.9 ** lags[near], abs=0.04)
+
+
+def test_the_band_holds_nineteen_of_twenty_lags_of_white_noise() -> None:
+    outside = []
+    for seed in range(20):
+        residual = white(20_000, seed)
+        _, values = autocorrelation(residual)
+        outside.append(np.mean(np.abs(values) > white_band(residual)))
+    assert 0.03 < float(np.mean(outside)) < 0.08
+
+
+def test_a_white_normal_residual_is_called_so() -> None:
+    found = figures_of(white(20_000))
+    assert found.rms == pytest.approx(1e-9, rel=0.02)
+    assert found.beyond_three == pytest.approx(0.0027, abs=0.0012)
+    sentence = residual_sentence(found, "base model", SECONDS)
+    assert sentence.startswith("The residual of the base model is as white as noise")
+    assert "close to normal" in sentence
+
+
+def test_a_slow_residual_is_called_correlated_and_for_how_long() -> None:
+    time = 1e-3 * np.arange(20_000)
+    found = figures_of(np.sin(2 * np.pi * time) + 0.05 * white(20_000))
+    sentence = residual_sentence(found, "model", SECONDS)
+    assert "is not white: neighbouring samples correlate by 1.00" in sentence
+    assert "lighter in its tails" in sentence
+    assert found.lasting == pytest.approx(0.25, rel=0.06)  # a quarter of the period
+    assert f"that of noise after {found.lasting:.2f} s" in sentence
+
+
+def test_a_lopsided_and_a_heavy_distribution_are_called_so() -> None:
+    rng = np.random.default_rng(3)
+    upwards = figures_of(rng.exponential(size=20_000) - 1.0)
+    assert upwards.skewness == pytest.approx(2.0, abs=0.3)
+    assert "longer upwards and heavier in its tails" in residual_sentence(upwards, "m", SECONDS)
+    heavy = figures_of(rng.laplace(size=20_000))
+    assert heavy.kurtosis == pytest.approx(3.0, abs=0.8)
+    assert "is heavier in its tails than" in residual_sentence(heavy, "m", SECONDS)
+    downwards = figures_of(1.0 - rng.exponential(size=20_000))
+    assert "longer downwards" in residual_sentence(downwards, "m", SECONDS)
+
+
+@pytest.mark.parametrize("samples", [10, 1000, 100_000])
+def test_the_shares_of_a_distribution_add_up(samples: int) -> None:
+    residual = white(samples)
+    found = distribution(residual, float(residual.min()), float(residual.max()))
+    assert found.shares.sum() == pytest.approx(100.0)
+    assert 15 <= len(found.shares) <= 61
+    assert found.width == pytest.approx(float(np.diff(found.centres).mean()))
+
+
+def test_a_spectrum_of_many_lines_is_thinned_and_keeps_its_peaks() -> None:
+    time = np.arange(1_000_000) / 100_000.0
+    residual = white(len(time)) + np.sin(2 * np.pi * 20_000.0 * time)
+    frequency, density = spectrum(time, residual)
+    shown = shown_lines(frequency, density, 800)
+    assert len(frequency) > 50_000
+    assert len(shown) <= 810
+    peak = int(np.argmax(density))
+    assert peak in shown
+    assert frequency[peak] == pytest.approx(20_000.0, rel=1e-3)
+    assert (shown[0], shown[-1]) == (0, len(frequency) - 1)
+
+
+def test_a_fast_burst_in_a_long_record_does_not_fill_the_memory() -> None:
+    time = np.concatenate([np.arange(2000) / 1e6, 1.0 + 10.0 * np.arange(1000)])
+    frequency, density = spectrum(time, white(len(time)))
+    assert len(frequency) < 4 * len(time)
+    assert np.isfinite(density).all()
+
+
+def test_a_constant_residual_has_no_correlation() -> None:
+    _, values = autocorrelation(np.zeros(100))
+    assert np.all(values == 0.0)
+    assert figures_of(np.zeros(100)).kurtosis == -3.0

@@ -1,0 +1,209 @@
+"""What a sensor has made is told from what a stack has made."""
+
+import time as clock
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from psa_casadi.experiment import Record, multisine, read_record, sine, steps, time_grid, triangle
+from psa_casadi.experiment.quantum import quantum_of
+from psa_casadi.experiment.suspects import cleaned, suspects
+
+FloatArray = NDArray[np.float64]
+RANGE = 20e-6
+T = time_grid(1.0, 1e-4)
+
+
+def stack(u: FloatArray, f: float = 200.0, damping: float = 0.05) -> FloatArray:
+    """Return the displacement of a light resonance with play hysteresis, sampled as T is."""
+    held, play = np.empty(u.size), u[0]
+    for k, v in enumerate(u):
+        play = min(max(play, v - 8.0), v + 8.0)
+        held[k] = play
+    x, w, dt = (0.7 * u + 0.3 * held) * RANGE / 100.0, 2 * np.pi * f, T[1]
+    a = 1.0 + 2 * damping * w * dt + (w * dt) ** 2
+    filtered = lfilter([(w * dt) ** 2 / a], [1.0, -(2.0 + 2 * damping * w * dt) / a, 1.0 / a], x)
+    return np.asarray(filtered, dtype=float)
+
+
+def ringing(n: int, period: float) -> FloatArray:
+    k = np.arange(n)
+    return np.asarray(np.exp(-k / (3.0 * period)) * np.cos(2 * np.pi * k / period))
+
+
+VOLTAGES: dict[str, FloatArray] = {
+    "sine": sine(T, 0.0, 100.0, 5.0),
+    "fast sine": sine(T, -50.0, 50.0, 500.0),
+    "triangle": triangle(T, 0.0, 100.0, 10.0),
+    "steps": steps(T, [0.0, 100.0, 30.0, 80.0, 0.0]),
+    "small steps": steps(T, [50.0, 51.0, 50.5, 0.0, 50.0]),
+    "multisine": multisine(T, 0.0, 100.0, (5.0, 2000.0), seed=3),
+}
+NOISES: dict[str, Callable[[np.random.Generator], FloatArray]] = {
+    "none": lambda g: np.zeros(T.size),
+    "white": lambda g: 1e-3 * g.standard_normal(T.size),
+    "loud": lambda g: 2e-2 * g.standard_normal(T.size),
+    "coloured": lambda g: lfilter([0.71e-3], [1, -0.7], g.standard_normal(T.size)),
+    "fine steps": lambda g: 1e-3 * g.standard_normal(T.size),
+    "coarse steps": lambda g: 5e-3 * g.standard_normal(T.size),
+}
+STEP = {"fine steps": 1e-3 * RANGE, "coarse steps": 2e-2 * RANGE}
+
+
+def record(voltage: str, noise: str, seed: int = 0, f: float = 200.0) -> Record:
+    u = VOLTAGES[voltage]
+    y = stack(u, f) + RANGE * NOISES[noise](np.random.default_rng(seed))
+    if noise in STEP:
+        y = np.round(y / STEP[noise]) * STEP[noise]
+    return Record(f"{voltage}, {noise}", T, u, y)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("voltage", VOLTAGES)
+@pytest.mark.parametrize("f", [20.0, 200.0, 1500.0])
+def test_what_a_stack_does_is_not_suspect(voltage: str, noise: str, f: float) -> None:
+    flagged = [int(suspects(record(voltage, noise, seed, f)).mask.sum()) for seed in range(2)]
+    assert sum(flagged) <= 1
+
+
+@pytest.mark.parametrize("period", [3.0, 4.5, 6.0, 9.0, 15.0])
+@pytest.mark.parametrize("delay", [0, 3, 12])
+def test_ringing_after_a_jump_is_not_suspect(period: float, delay: int) -> None:
+    u = np.where(T < 0.5, 0.0, 100.0)
+    at = 5000 + delay
+    y = np.where(np.arange(T.size) < at, 0.0, RANGE)
+    y[at:] -= RANGE * ringing(T.size - at, period)
+    y += 2e-4 * RANGE * np.random.default_rng(1).standard_normal(T.size)
+    assert not suspects(Record("ringing", T, u, y)).mask.any()
+
+
+def test_a_kick_of_the_load_is_not_suspect() -> None:
+    load = np.zeros(T.size)
+    load[6000:6002] = 50.0
+    base = record("sine", "white")
+    assert base.displacement is not None
+    y = base.displacement.copy()
+    y[6001:6004] += 0.2 * RANGE
+    assert not suspects(replace(base, displacement=y, load_force=load)).mask.any()
+    assert list(np.flatnonzero(suspects(replace(base, displacement=y)).mask)) == [6001, 6002, 6003]
+
+
+@pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
+def test_the_measured_records_have_no_suspects(measured_data: object, file: str) -> None:
+    found = suspects(read_record(f"{measured_data}/micromanipulator/{file}.csv"))
+    assert found.counts == {"outlier": 0, "drop-out": 0, "stuck": 0}
+    assert found.quantum is None
+    assert found.sentences(file) == ()
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+@pytest.mark.parametrize("noise", ["white", "coloured", "fine steps"])
+@pytest.mark.parametrize("voltage", ["sine", "triangle", "steps"])
+def test_spikes_are_found_and_nothing_else(voltage: str, noise: str, width: int) -> None:
+    base = record(voltage, noise)
+    assert base.displacement is not None
+    y, draw = base.displacement.copy(), np.random.default_rng(4)
+    spikes = np.zeros(T.size, dtype=bool)
+    for start in range(60, T.size - 60, 97):
+        spikes[start : start + width] = True
+        y[start : start + width] += draw.choice([-1, 1]) * draw.uniform(0.03, 0.6) * RANGE
+    found = suspects(replace(base, displacement=y))
+    assert (found.mask & spikes).sum() > 0.9 * spikes.sum()
+    assert (found.mask & ~spikes).sum() <= 1
+    assert found.counts["outlier"] == found.mask.sum()
+
+
+@pytest.mark.parametrize("value", [0.0, 1.4 * RANGE, -0.3 * RANGE])
+@pytest.mark.parametrize("length", [5, 40, 300])
+def test_drop_outs_are_found(value: float, length: int) -> None:
+    base = record("sine", "white")
+    assert base.displacement is not None
+    y = base.displacement.copy()
+    starts = [k for k in range(400, 9000, 1300) if abs(y[k] - value) > 0.2 * RANGE]
+    lost = np.zeros(T.size, dtype=bool)
+    for start in starts:
+        lost[start : start + length] = True
+    y[lost] = value
+    found = suspects(replace(base, displacement=y))
+    assert len(starts) >= 4
+    np.testing.assert_array_equal(found.mask, lost)
+    assert found.counts == {"outlier": 0, "drop-out": lost.sum(), "stuck": 0}
+    (sentence,) = found.sentences("a.csv")
+    assert sentence.startswith(f"a.csv: {lost.sum()} samples belong to drop-outs")
+
+
+@pytest.mark.parametrize("noise", ["white", "fine steps", "none"])
+def test_a_stuck_sensor_is_found(noise: str) -> None:
+    base = record("sine", noise)
+    assert base.displacement is not None
+    y = base.displacement.copy()
+    y[3300:3700] = y[3299]
+    found = suspects(replace(base, displacement=y))
+    assert found.counts["stuck"] >= 399
+    assert set(np.flatnonzero(found.mask)) <= set(range(3295, 3702))
+
+
+def test_a_flat_dwell_after_a_reversal_and_a_held_voltage_are_not_stuck() -> None:
+    u = VOLTAGES["triangle"]
+    play, y = 0.0, np.empty(u.size)
+    for k, v in enumerate(u):
+        play = min(max(play, v - 12.0), v + 12.0)
+        y[k] = play
+    for step in (0.5, 1e-9):
+        levels = np.asarray(np.round(y / step) * (step * RANGE / 100.0), dtype=float)
+        assert not suspects(Record("backlash", T, u, levels)).mask.any()
+    held = steps(T, [0.0, 100.0, 50.0])
+    assert not suspects(Record("held", T, held, 1e-7 * held)).mask.any()
+
+
+def test_cleaned_masks_and_makes_nothing_up() -> None:
+    base = record("sine", "white")
+    assert base.displacement is not None
+    y = base.displacement.copy()
+    y[[100, 4000]] += RANGE
+    y[2000:2050] = np.nan
+    spoilt = replace(base, displacement=y)
+    result = cleaned(spoilt)
+    assert result.displacement is not None
+    assert list(np.flatnonzero(spoilt.mask & ~result.mask)) == [100, 4000]
+    np.testing.assert_array_equal(result.displacement[result.mask], y[result.mask])
+    assert (result.name, result.sha256) == (spoilt.name, spoilt.sha256)
+    assert cleaned(base) is base
+    planned = Record("planned", T, VOLTAGES["sine"])
+    assert cleaned(planned) is planned
+    assert suspects(spoilt).sentences("r")[0].startswith("r: 2 samples stand out as spikes")
+
+
+def test_the_quantum_is_the_step_of_the_sensor() -> None:
+    draw = np.random.default_rng(2)
+    motion = 1e-5 * np.sin(30 * T)
+    for step in (3.0517e-8, 2e-7, 1e-6):
+        for noise in (0.0, 0.3, 2.0):
+            y = np.round((motion + noise * step * draw.standard_normal(T.size)) / step) * step
+            assert quantum_of(y) == pytest.approx(step, rel=1e-6)
+            assert quantum_of(np.round(y, 10)) == pytest.approx(step, rel=5e-3)
+    assert quantum_of(motion + 1e-8 * draw.standard_normal(T.size)) is None
+    assert quantum_of(np.round(motion, 10)) is None
+    assert quantum_of(np.repeat(draw.standard_normal(50), 100)) is None
+    assert quantum_of(np.where(T < 0.5, 0.0, 1.0)) is None
+    found = suspects(record("sine", "coarse steps"))
+    assert found.quantum == pytest.approx(STEP["coarse steps"])
+    assert found.sentences("r") == ("r: the displacement is quantised in steps of 400 nm.",)
+    counts = np.round(np.asarray(record("sine", "white").displacement) / 1e-7)
+    found = suspects(Record("c", T, VOLTAGES["sine"], counts, displacement_unit="counts"))
+    assert found.sentences("c") == ("c: the displacement is quantised in steps of 1 counts.",)
+
+
+def test_a_million_samples_are_looked_at_quickly() -> None:
+    t = time_grid(100.0, 1e-4)
+    u = sine(t, 0.0, 100.0, 0.1)
+    y = 1e-7 * u + 2e-8 * np.random.default_rng(5).standard_normal(t.size)
+    y[[200, 500_000, t.size - 5]] += 5e-6
+    started = clock.process_time()
+    found = suspects(Record("long", t, u, y))
+    assert clock.process_time() - started < 10.0
+    assert list(np.flatnonzero(found.mask)) == [200, 500_000, t.size - 5]
