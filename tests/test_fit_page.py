@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from psa_casadi.errors import InputError
+from psa_casadi.identification.advice import Advice
+from psa_casadi.identification.combinations import Combination
 from psa_casadi.report.fit_page import fit_page, write_fit_report
 from psa_casadi.report.fit_words import determined_sentence, error_bar_note, pairs_sentence
 from psa_casadi.report.grades import Grade, grades, strong_pairs
@@ -24,11 +26,13 @@ pytestmark = pytest.mark.xdist_group("fit-page")
 @pytest.fixture(scope="module")
 def text(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("fit") / "fit.html"
-    found = replace(identification(), warnings=("Tom & <Jerry> disagree.",))
-    combinations = ["k_L and A only as their sum"]
-    write_fit_report(
-        found, path, origin="synthetic"
+    found = replace(
+        identification(),
+        warnings=("Tom & <Jerry> disagree.",),
+        combinations=(Combination(("k_L", "A"), "k_L + A", 1e-3, "k_L and A only as their sum"),),
+        advice=(Advice("Hold 60 V.", ("tau",), None),),
     )
+    write_fit_report(found, path, origin="synthetic")
     assert [p.name for p in path.parent.iterdir()] == ["fit.html"]
     return path.read_text(encoding="utf-8")
 
@@ -54,7 +58,7 @@ def test_the_page_of_a_fit_tells_all_of_it(text: str) -> None:
 
 
 def test_sections_without_content_are_left_out() -> None:
-    found = replace(identification(), warnings=(), starts=())
+    found = replace(identification(), warnings=(), starts=(), combinations=(), advice=())
     page = Page(fit_page(found, series_of_fit(found)))
     for title in ("Warning", "Starts", "leave open", "What to measure next"):
         assert title not in page.text

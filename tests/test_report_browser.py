@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from psa_casadi.identification.advice import Advice
 from psa_casadi.report.fit_page import write_fit_report
 from psa_casadi.report.page import write_report
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone
@@ -30,8 +32,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
 def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pages") / f"{request.param}.html"
     if request.param == "fit":
-        advice = ["Play a voltage that is held for ten times the creep lag at three levels."]
-        write_fit_report(identification(), path, origin="synthetic")
+        said = "Play a voltage that is held for ten times the creep lag at three levels."
+        found = replace(identification(), advice=(Advice(said, ("tau",), None),))
+        write_fit_report(found, path, origin="synthetic")
     else:
         write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")
     return path

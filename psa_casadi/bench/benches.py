@@ -32,6 +32,11 @@ BENCHES: dict[str, Bench] = {
             "the paper's identification beside the prediction-error fit, against noise and window",
         ),
         _later(
+            "measured",
+            "measured",
+            "the measured micromanipulator: held-out error of the paper's model and of two effects",
+        ),
+        _later(
             "verification",
             "verification",
             "the paper's figures 6 to 10 (loops, steps, other voltages), and three mechanics",

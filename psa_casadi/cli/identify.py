@@ -42,6 +42,10 @@ def identify(
     method: Annotated[
         Method, typer.Option(help="How the parameters are found.")
     ] = Method.PREDICTION_ERROR,
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(help="Parameter whose profile likelihood is wanted; may be repeated."),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
     columns: ColumnsOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -55,7 +59,12 @@ def identify(
     from psa_casadi.report.fit_page import write_fit_report
     from psa_casadi.report.text import identification_text
 
+    from psa_casadi.identification.profile import profile as profile_of
+    from psa_casadi.identification.profile import profile_sentences
+
     given = Given()
+    if method is Method.PAPER and profile:
+        given.add("--method paper has no likelihood; leave --profile or --method out.")
     if method is Method.PAPER and model is not None:
         given.add("--method paper starts from no model; leave --model or --method out.")
     given.stiffness(stiffness)
@@ -69,8 +78,19 @@ def identify(
         else:
             found = run(measured, model=start, stiffness=stiffness, progress=progress)
         save_model(found.model, output)
+        wanted = [n for n in profile or () if n in found.determinacy.names]
+        profiles = [profile_of(found.fit, found.experiments, n, progress=progress) for n in wanted]
         if report is not None:
             progress("writing the report")
-            write_fit_report(found, report, origin=origin.value)
+            write_fit_report(found, report, origin=origin.value, profiles=profiles)
     show(identification_text(found, origin=origin.value, width=width()), quiet)
+    for found_profile in profiles:
+        show("\n" + "\n".join(profile_sentences(found_profile)), quiet)
+    left_out = [n for n in profile or () if n not in wanted]
+    if left_out:
+        show(
+            f"\nNo profile of {', '.join(left_out)}: not searched in this fit; the parameters"
+            f" searched are {', '.join(found.determinacy.names)}.",
+            quiet,
+        )
     tell_written(output, report, quiet=quiet)

@@ -81,6 +81,8 @@ def diagnose(
     start = (model or starting_model(records, stiffness)).without(
         c.name for c in table if c.gain is not None
     )
+    there = {c.name for c in start.components}
+    table = [effect for effect in table if set(effect.needs) <= there]
     base = fit_base(start, experiments, progress=progress)
     rounds = _search(base, experiments, table, progress)
     progress("judging")

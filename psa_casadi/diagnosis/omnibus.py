@@ -40,7 +40,7 @@ def omnibus(
     """
     white = colour.whiten(residual)
     tests = {
-        "neighbouring samples are correlated": _ljung_box(white),
+        "neighbouring samples are correlated": whiteness(white),
         "its spectrum has a line": _fisher_line(white),
         "it depends on voltage, rate or time": _features(white, voltage, time, colour),
     }
@@ -50,7 +50,8 @@ def omnibus(
     return Omnibus(min(1.0, 3.0 * p), excess, f"In the residual {where}.")
 
 
-def _ljung_box(white: FloatArray) -> float:
+def whiteness(white: FloatArray) -> float:
+    """Return the p-value of Ljung and Box's test (1978) that neighbours are not correlated."""
     n = len(white)
     centred = white - np.mean(white)
     power = float(centred @ centred)

@@ -1,8 +1,8 @@
 """Reciprocal coupling: the wafers feel the bonding layers too, as Newton's third law demands.
 
-With positive masses, dampings and stiffnesses every gain from 0 to 1 + m_B/m_P is stable: the
-lower three coefficients of the characteristic polynomial (but for m_P k_B + m_B k_P + g m_B k_B,
-which stays) carry the factor 1 - g + g^2 > 0, and Hurwitz' determinant is a sum of positive terms.
+Stable for every gain g from 0 to 1 + m_B/m_P: with q = 1 - g + g^2 the characteristic polynomial is
+m_P m_B s^4 + (m_P c_B + m_B (c_P + g c_B)) s^3 + (m_P k_B + m_B (k_P + g k_B) + q c_P c_B) s^2
++ q (c_P k_B + k_P c_B) s + q k_P k_B, and Hurwitz' determinant is a sum of positive terms.
 """
 
 from psa_casadi.component import Component, Equations, Symbols

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from psa_casadi.identification.excerpts import RADII, Excerpt
 from psa_casadi.identification.levenberg_marquardt import Evaluate, minimise
-from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.linear_response import (
     FloatArray,
     first_order,
@@ -26,6 +25,7 @@ from psa_casadi.identification.linear_response import (
     plays,
     respond,
 )
+from psa_casadi.identification.noise import high_frequency_noise
 
 IndexArray = npt.NDArray[np.intp]
 
@@ -34,18 +34,21 @@ IndexArray = npt.NDArray[np.intp]
 COORDINATES = ("T", "tau", "a_P", "q_P", "a_B", "q_B", "r")
 #: Standard deviations of the weak priors of the coordinates, centred where a fit starts.
 _PRIOR = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0])
-#: Weak prior of ln (damping ratio) of both pairs, a/(2 sqrt(q)): 0.7, with standard deviation 1.5.
-#: It keeps a pole and the zero from cancelling far below the band of the records.
-_DAMPING = np.array([[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0]]) / 1.5
-_DAMPING_CENTRE = np.full(2, np.log(2.0 * 0.7) / 1.5)
+#: Weak priors, all with standard deviation 1.5: ln of the damping ratios a/(2 sqrt(q)) about 0.7,
+#: which keeps a pole and the zero from cancelling far below the band, and ln (m_P/m_B) about 0,
+#: since wafers and bonding layers with their places exchanged respond alike.
+_TYPICAL = np.array(
+    [[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0], [0, 0, 0, 1, 0, -1, 1]]
+) / 1.5  # fmt: skip
+_TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
 #: Standard deviation of the prior of a play operator's weight, over the static gain.
 _LOOP_PRIOR = 0.1
 #: Step of the derivatives by differences, in natural logarithms.
 _STEP = 1e-3
 #: A fit ends when two steps in a row lower the cost by less than this share of it.
 _TOLERANCE = 1e-3
-#: Shortest time constant over the shortest interval; longest over the longest excerpt.
-_SHORTEST, _LONGEST = 0.01, 1.0
+#: Shortest time constant over the shortest interval.
+_SHORTEST = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,7 @@ def cost_of(parts: Sequence[Excerpt], theta: FloatArray) -> float:
 
 def _bounds(parts: Sequence[Excerpt]) -> tuple[FloatArray, FloatArray]:
     shortest = np.log(_SHORTEST * min(e.h for e in parts))
-    longest = np.log(_LONGEST * max(e.h * e.v.size for e in parts))
+    longest = np.log(min(e.longest for e in parts))
     power = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0])
     ratio = np.log([0.05, 100.0])
     return np.append(power * shortest, ratio[0]), np.append(power * longest, ratio[1])
@@ -125,13 +128,13 @@ def _objective(parts: Sequence[Excerpt], start: FloatArray, free: IndexArray) ->
             *(f.residual[:n] for f, n in zip(each, counts, strict=True)),
             *(f.residual[n:] for f, n in zip(each, counts, strict=True)),
             weights * (coordinates - start[free]),
-            _DAMPING @ theta - _DAMPING_CENTRE,
+            _TYPICAL @ theta - _TYPICAL_AT,
         ]
         jacobian = [
             *(j[:n] for j, n in zip(slopes, counts, strict=True)),
             *(j[n:] for j, n in zip(slopes, counts, strict=True)),
             np.diag(weights),
-            _DAMPING[:, free],
+            _TYPICAL[:, free],
         ]
         return np.concatenate(residual), np.vstack(jacobian)
 
@@ -140,7 +143,7 @@ def _objective(parts: Sequence[Excerpt], start: FloatArray, free: IndexArray) ->
 
 @dataclass(frozen=True, eq=False)
 class _Eliminated:
-    """One excerpt at one theta: residual of data and loop prior, basis, force, and weights of it."""
+    """One excerpt at one theta: residual of data and loop prior, basis, force and its weights."""
 
     residual: FloatArray
     basis: FloatArray

@@ -2,12 +2,11 @@
 
     X/U = (b s + 1) / ((T s + 1) (tau s + 1) (q_P s^2 + a_P s + 1) (q_B s^2 + a_B s + 1))
 
-T = R_s C_p, a = c/k [s] and q = m/k [s^2] of wafers (P) and bonding layers (B), and with r = k_P/k_B
+T = R_s C_p, a = c/k [s] and q = m/k [s^2] of wafers (P) and bonding layers (B), r = k_P/k_B and
 b = (c_P + c_B)/(k_P + k_B) = (r a_P + a_B)/(r + 1). The gain at rest is 1. The poles need not be
 apart: those closer than `_APART` are moved apart, far less than a starting value needs.
 """
 
-from collections.abc import Sequence
 from math import exp, log, sqrt
 
 import numpy as np
@@ -93,16 +92,19 @@ def transfer(theta: FloatArray, frequency: FloatArray) -> ComplexArray:
     """Return X/U at the frequencies [Hz], shape (k,), gain 1 at rest."""
     s = 2j * np.pi * frequency
     whole = np.append(mechanics_poles(theta), -np.exp(-theta[0]))
-    return (1.0 + numerator_time(theta) * s) / np.prod(1.0 - s[:, None] / whole, axis=1)
+    found: ComplexArray = (1.0 + numerator_time(theta) * s) / np.prod(
+        1.0 - s[:, None] / whole, axis=1
+    )
+    return found
 
 
-def plays(u: FloatArray, radii: Sequence[float]) -> FloatArray:
+def plays(u: FloatArray, radii: npt.ArrayLike) -> FloatArray:
     """Return play operators (n, k) of the radii on u (n,), all of them centred at the first sample.
 
     p_i = min(max(p_{i-1}, u_i - r), u_i + r). A run of such steps clips between two levels, so the
     levels of all blocks are found side by side, then the blocks are joined.
     """
-    r = np.asarray(radii)
+    r = np.asarray(radii, dtype=np.float64)
     length = max(int(sqrt(u.size)), 1)
     blocks = -(-u.size // length)
     padded = np.concatenate([u, np.full(blocks * length - u.size, u[-1])]).reshape(blocks, length)
@@ -122,7 +124,7 @@ def plays(u: FloatArray, radii: Sequence[float]) -> FloatArray:
 
 
 def orthonormal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q (n, j), orthonormal and spanning the columns of a matrix (n, k), and T, Q = matrix T.
+    """Return Q (n, j), orthonormal, that spans the columns of a matrix (n, k), and T: Q = matrix T.
 
     From the columns' products, twice; directions below 1e-7 of the largest are left out. For tall
     matrices this is as good as Householder's QR and does not start threads for a millisecond's
@@ -141,15 +143,16 @@ def orthonormal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _apart(poles: ComplexArray) -> ComplexArray:
     """Return the poles in conjugate pairs, each about `_APART` or more from every other."""
-    own, real = [], []
-    for p in poles[poles.imag >= 0]:
-        size = abs(p)
-        if p.imag > _APART * size:
-            while any(abs(p - other) < _APART * size for other in own):
-                p = p * (1.0 + _APART)
-            own += [p, p.conjugate()]
+    own: list[complex] = []
+    real: list[float] = []
+    for pole in poles[poles.imag >= 0]:
+        size, moved = abs(pole), complex(pole)
+        if pole.imag > _APART * size:
+            while any(abs(moved - other) < _APART * size for other in own):
+                moved *= 1.0 + _APART
+            own += [moved, moved.conjugate()]
         else:
-            real += [log(size), log(size)] if p.imag else [log(size)]
+            real += [log(size), log(size)] if pole.imag else [log(size)]
     real.sort()
     for k in range(1, len(real)):
         real[k] = max(real[k], real[k - 1] + _APART)

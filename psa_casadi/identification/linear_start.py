@@ -29,8 +29,9 @@ _SOURCES = 3
 _ROUNDS, _FULL = ((16, 3), (8, 6)), 20
 #: Largest difference, in natural logarithms, of starts that are the same.
 _ALIKE = 0.1
-#: Dynamics show when they leave less than this of what a static loop leaves.
-_GAIN = 0.7
+#: Dynamics show when the variance that they leave is less than this of what a static loop leaves,
+#: and that is more than this of the noise.
+_GAIN, _VISIBLE = 0.5, 0.1
 #: Least residual, over the range, by which an excerpt is weighted.
 _FLOOR = 5e-4
 #: How much more a residual that is not white counts than a white one.
@@ -81,26 +82,34 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
     best = best[:CANDIDATES]
     fits = [_refined(parts, f) for f in best]
     fits = _different(sorted(fits, key=lambda f: f.cost))
-    static = _share(parts, [e.static for e in parts])
-    kept = [f for f in fits if _share(parts, f.left) < _GAIN * static]
+    kept = [f for f in fits if _explains(parts, f)]
     if not kept:
         return None
     return LinearStart(
         candidates=tuple(_candidate(f, values, _share(parts, f.left)) for f in kept),
         records=tuple(e.name for e in parts),
-        static_misfit=static,
+        static_misfit=_share(parts, [e.static for e in parts]),
     )
 
 
 def _reweighted(parts: Sequence[Excerpt], fit: LinearFit) -> list[Excerpt]:
-    """Return the excerpts with the noise that a fit leaves; the rest of the residual, which the
-    model misses and which is not white, counts many times.
+    """Return the excerpts with the noise that a fit leaves.
+
+    The rest of the residual, which the model misses and which is not white, counts many times.
     """
     found = []
     for e, left, white in zip(parts, fit.left, fit.white, strict=True):
         missed = _MISSED * np.sqrt(max(left**2 - white**2, 0.0))
         found.append(replace(e, sigma=float(max(np.hypot(white, missed), _FLOOR * e.range))))
     return found
+
+
+def _explains(parts: Sequence[Excerpt], fit: LinearFit) -> bool:
+    """Whether dynamics leave clearly less than a static loop does, white noise aside."""
+    noise = _share(parts, fit.white) ** 2
+    left = _share(parts, fit.left) ** 2 - noise
+    static = _share(parts, [e.static for e in parts]) ** 2 - noise
+    return left < _GAIN * static and static > _VISIBLE * noise
 
 
 def _share(parts: Sequence[Excerpt], left: Sequence[float]) -> float:
@@ -187,11 +196,11 @@ def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
     pairs = [(-2.0 * p.real / abs(p) ** 2, 1.0 / abs(p) ** 2) for p in tones[:2]]
     found = []
     for lags in (2, 1) if len(times) > 1 else (2,):
-        own = (times + [fast, fast])[:lags] + [0.5 * fast] * (2 - lags)
+        own = [*times, fast, fast][:lags] + [0.5 * fast] * (2 - lags)
         left = times[lags:]
         both = list(pairs)
         while len(both) < 2:
-            one, two = (left + [fast, 0.7 * fast])[:2]
+            one, two = [*left, fast, 0.7 * fast][:2]
             left = left[2:]
             both.append((one + two, one * two))
         for tau, drive in {(own[0], own[1]), (own[1], own[0])}:

@@ -317,13 +317,12 @@ def _exchanged(
             other = _from(best, values, experiments, progress, what)
             if other is None:
                 continue
-            if _equal(best, other):
-                differing |= set(values)
+            differing |= set(_differing(best, other, experiments))
             if other.cost < best.cost and (other.interrupted or not _equal(best, other)):
                 best = other
                 break
         if best is before or best.interrupted:
-            return best, tuple(n for n in differing if n in best.unknowns.names)
+            return best, tuple(differing)
     return best, ()
 
 

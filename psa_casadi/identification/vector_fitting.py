@@ -43,9 +43,8 @@ def vector_fit(responses: Sequence[Response], order: int) -> ComplexArray:
     """Return `order` poles [rad/s] in the left half plane that the responses share."""
     fastest = 2.0 * min(r.h for r in responses)
     slowest = max(r.h * r.y.size for r in responses) / 5.0
-    poles = -1.0 / np.geomspace(fastest, slowest, order) + 0j
-    if order == 1:
-        poles = np.array([-1.0 / np.sqrt(fastest * slowest)]) + 0j
+    spread = (np.arange(order) + 0.5) / order
+    poles: ComplexArray = np.array(-1.0 / (fastest * (slowest / fastest) ** spread), dtype=complex)
     for _ in range(_ROUNDS):
         poles = _settled(_relocated(responses, poles), fastest, slowest)
     return poles

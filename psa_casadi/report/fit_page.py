@@ -7,6 +7,7 @@ import numpy as np
 
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.profile import Profile, profile_sentences
 from psa_casadi.report.document import Document, Picture
 from psa_casadi.report.finding_plots import correlation_plot, determinacy_plot
 from psa_casadi.report.fit_words import (
@@ -17,6 +18,7 @@ from psa_casadi.report.fit_words import (
 )
 from psa_casadi.report.grades import Grade, grades, named, strong_pairs
 from psa_casadi.report.phrases import Scale, number
+from psa_casadi.report.profile_plot import profile_plot
 from psa_casadi.report.record_part import add_records
 from psa_casadi.report.residuals import ResidualFigures, residual_figures
 from psa_casadi.report.series import Series, series_of_fit
@@ -28,14 +30,16 @@ def write_fit_report(
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
+    profiles: Sequence[Profile] = (),
 ) -> None:
     """Write the page of an identification, whole or not at all.
 
     It shows what the records determine, measured and model, and what the residual is.
-    `origin`, "measured" or "synthetic", is what the page calls the records. Raises InputError when `path` cannot be written to.
+    `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
+    beside the determinacy. Raises InputError when `path` cannot be written to.
     """
     series = series_of_fit(found)
-    atomic_write(path, fit_page(found, series, origin=origin))
+    atomic_write(path, fit_page(found, series, origin=origin, profiles=profiles))
 
 
 def fit_page(
@@ -43,6 +47,7 @@ def fit_page(
     series: Sequence[Series],
     *,
     origin: str = "measured",
+    profiles: Sequence[Profile] = (),
 ) -> str:
     """Return the page; `series` are the records of the identification with the model's curve."""
     figures = [residual_figures(s, s.curves[0]) for s in series]
@@ -52,6 +57,14 @@ def fit_page(
     page = Document("Identification of a stack", [f"{origin} data", records])
     _verdict(page, found, figures, graded, origin, _scale(series))
     _determined(page, found, graded)
+    if profiles:
+        page.section("Profile likelihoods")
+        page.pictures(
+            [
+                Picture(f"Profile of {p.name}", profile_plot(p), " ".join(profile_sentences(p)))
+                for p in profiles
+            ]
+        )
     _bullets(page, "What these records leave open", [c.sentence for c in found.combinations])
     _bullets(page, "What to measure next", [a.sentence for a in found.advice])
     if found.starts:
