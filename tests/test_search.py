@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import psa_casadi.identification.fit as fitting
 from psa_casadi.bench.coverage import Run, one_run
@@ -16,6 +17,8 @@ from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.model.stacks import STACKS
+
+FloatArray = NDArray[np.float64]
 
 pytestmark = pytest.mark.xdist_group("search")
 
@@ -141,9 +144,9 @@ def test_drop_outs_and_outliers_do_not_move_the_fit(found: Identification) -> No
 
 
 def test_oversampled_records_are_averaged_and_say_so() -> None:
-    t = np.arange(400_000) * 2.5e-6
-    v = 50.0 * (1.0 - np.cos(2 * np.pi * t))
-    y = 1e-7 * v + 1e-9 * np.random.default_rng(1).standard_normal(t.size)
+    t: FloatArray = 2.5e-6 * np.arange(400_000.0)
+    v: FloatArray = 50.0 * (1.0 - np.cos(2 * np.pi * t))
+    y: FloatArray = 1e-7 * v + 1e-9 * np.random.default_rng(1).standard_normal(t.size)
     shorter, sentences = prepared(Record("fast", t, v, y))
     factor = t.size // shorter.n
     assert factor >= 8

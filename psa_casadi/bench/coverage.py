@@ -109,12 +109,12 @@ def compared(found: Identification, truth: Values) -> tuple[Found, ...]:
     for name in known.names:
         step = 1e-5 * max(abs(p[name]), 1e-300)
         up, down = (quantities({**p, name: p[name] + h}, size) for h in (step, -step))
-        for key in gradients:
-            gradients[key].append((up[key] - down[key]) / (2.0 * step))
+        for key, gradient in gradients.items():
+            gradient.append((up[key] - down[key]) / (2.0 * step))
     open_ones = {*known.undetermined, *known.on_bound}
     results = []
-    for key, gradient in gradients.items():
-        g: FloatArray = np.array(gradient)
+    for key, parts in gradients.items():
+        g: FloatArray = np.array(parts)
         error = float(np.sqrt(g @ known.covariance @ g))
         told = key in known.names and key not in open_ones and error < _WEAK * abs(value[key])
         results.append(Found(key, true[key], value[key], error, told))

@@ -1,4 +1,4 @@
-"""The measured micromanipulator: the paper's model and two effects more, judged on held-out blocks."""
+"""The measured micromanipulator: the paper's model and two effects, judged on held-out blocks."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,8 @@ from psa_casadi.diagnosis.errors_of import errors_of
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.split import Experiment, split
 from psa_casadi.identification.fit import Fit, fit
-from psa_casadi.identification.search import refit, search
+from psa_casadi.identification.refitting import refit
+from psa_casadi.identification.search import search
 from psa_casadi.identification.starting import starting_model
 from psa_casadi.report.tables import Table
 

@@ -103,9 +103,9 @@ def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
     return TitledTable(
         f"One fit of {len(FREE) + 1} parameters to {samples} samples",
         Table(("who", "time to the final cost [s]", "simulations", "lowest cost"), tuple(rows)),
-        f"The fit here takes 1/{ratio:.0f} of the time. Both search the offset and {', '.join(FREE)}"
-        f" from one start, in one process of one run; a cost of {samples} is pure noise. Compiling"
-        " the model once (cached afterwards) is not counted.",
+        f"The fit here takes 1/{ratio:.0f} of the time. Both search the offset and"
+        f" {', '.join(FREE)} from one start, in one process of one run; a cost of {samples} is pure"
+        " noise. Compiling the model once (cached afterwards) is not counted.",
     )
 
 
@@ -150,7 +150,7 @@ def _scipy(record: Record, sigma: float) -> _Trace:
 
     ratio = np.array([start[n] for n in FREE]) / reference
     z0 = np.append(np.where(positive, np.log(np.abs(ratio)), ratio), 0.0)
-    least_squares(residual, z0, method="lm", diff_step=1e-3, ftol=1e-5, xtol=1e-6)
+    least_squares(residual, z0, method="lm", diff_step=np.full(z0.size, 1e-3), ftol=1e-5, xtol=1e-6)
     return trace
 
 

@@ -55,12 +55,11 @@ def identify(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.identification.identify import identify as run
     from psa_casadi.identification.paper.method import identify_by_paper as by_paper
+    from psa_casadi.identification.profile import profile as profile_of
+    from psa_casadi.identification.profile import profile_sentences
     from psa_casadi.model.model_file import save_model
     from psa_casadi.report.fit_page import write_fit_report
     from psa_casadi.report.text import identification_text
-
-    from psa_casadi.identification.profile import profile as profile_of
-    from psa_casadi.identification.profile import profile_sentences
 
     given = Given()
     if method is Method.PAPER and profile:

@@ -29,7 +29,8 @@ from psa_casadi.experiment.split import Experiment, split, whole
 from psa_casadi.experiment.suspects import cleaned
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
-from psa_casadi.identification.search import Progress, fit_base, refit
+from psa_casadi.identification.refitting import Progress, refit
+from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import starting_model
 from psa_casadi.model.compose import Model
 

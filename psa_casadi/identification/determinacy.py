@@ -123,8 +123,8 @@ def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | N
 
     k_P / k_B sets the zero -(k_P + k_B)/(c_P + c_B) beside the static gain, eqs. (11), (14). Where
     it is assumed and not searched, lags and masses carry its error: with c_P/k_P, m_P/k_P and all
-    displacements held, d theta = -H^-1 J^T W dx/d ln(k_P / k_B). Forces keep their proportion to the
-    assumed stiffness and carry none. None where k_P is searched or the model has none.
+    displacements held, d theta = -H^-1 J^T W dx/d ln(k_P / k_B). Forces keep their proportion to
+    the assumed stiffness and carry none. None where k_P is searched or the model has none.
     """
     p, free = fit.model.values, fit.unknowns.names
     if "k_P" not in p or "k_P" in free:

@@ -14,14 +14,8 @@ from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.linear_start import linear_start
 from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prepare import prepared
-from psa_casadi.identification.search import (
-    Progress,
-    Search,
-    StartOutcome,
-    record_rms,
-    refit,
-    search,
-)
+from psa_casadi.identification.refitting import Progress, record_rms, refit
+from psa_casadi.identification.search import Search, StartOutcome, search
 from psa_casadi.identification.starting import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.variables import Provenance

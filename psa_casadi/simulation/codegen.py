@@ -5,6 +5,7 @@ from pathlib import Path
 
 import casadi as ca
 
+from psa_casadi.component import Expression
 from psa_casadi.model.compose import Structure
 
 #: The functions that the solver needs, and those that sensitivities need besides.
@@ -30,11 +31,12 @@ def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.F
     s = structure
     arguments = [s.time, s.x, s.u, s.p]
     jacobian = ca.densify(ca.jacobian(s.xdot, s.x))
-    table: dict[str, list[ca.SX]] = {
+    switches: Expression = ca.vertcat(ca.SX(0, 1), *s.switches.values())
+    table = {
         "psa_ode": [ca.densify(s.xdot)],
         "psa_jacobian": [jacobian],
         "psa_outputs": [ca.densify(s.y)],
-        "psa_switches": [ca.densify(ca.vertcat(ca.SX(0, 1), *s.switches.values()))],
+        "psa_switches": [ca.densify(switches)],
     }
     if sensitivities:
         table["psa_sensitivity"] = [jacobian, ca.densify(ca.jacobian(s.xdot, s.p))]

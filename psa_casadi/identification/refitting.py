@@ -1,0 +1,80 @@
+"""Continuing a fit: refits, noise levels, and whether two fits are equally good."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.determinacy import covariance_of
+from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.noise import high_frequency_noise
+from psa_casadi.identification.prediction import measured
+
+#: Evaluations that a fit gets to its end, and those with the tolerance of a quick one.
+POLISH, QUICK_RTOL = 100, 1e-4
+#: Fits whose costs differ by less, in units of the log-likelihood's double, are equally good.
+_EQUAL = 3.84
+#: ... and they differ where a parameter is this many standard errors apart.
+_APART = 4.0
+
+Progress = Callable[[str], None]
+
+
+def noise_levels(experiments: Sequence[Experiment]) -> list[float]:
+    """Return the white noise of every record's displacement [m], from its fast differences."""
+    levels = []
+    for e in experiments:
+        y = measured(e.record)[e.used]
+        levels.append(max(high_frequency_noise(y), 1e-6 * float(np.ptp(y)), 1e-15))
+    return levels
+
+
+def record_rms(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
+    """Return the root mean square of every record's residual [m]."""
+    parts = [
+        previous.residuals[previous.of_record(experiments, r)] for r in range(len(experiments))
+    ]
+    return [max(float(np.sqrt(np.mean(p**2))), 1e-15) if len(p) else 1e-15 for p in parts]
+
+
+def residual_noise(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
+    """Return the white noise of every record's residual [m], from its fast differences."""
+    parts = [
+        previous.residuals[previous.of_record(experiments, r)] for r in range(len(experiments))
+    ]
+    return [max(high_frequency_noise(p), 1e-15) for p in parts]
+
+
+def refit(
+    previous: Fit,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    *,
+    sigma: Sequence[float] | None = None,
+) -> Fit:
+    """Continue a fit from where it stands, with the noise level its residuals suggest."""
+    return fit(
+        previous.model,
+        experiments,
+        free,
+        sigma=sigma or residual_noise(previous, experiments),
+        start_states=[previous.start(r) for r in range(len(experiments))],
+        evaluations=POLISH,
+    )
+
+
+def equal(one: Fit, other: Fit) -> bool:
+    """Whether two fits are equally likely, residuals beyond the noise scaled to it."""
+    inflation = max(one.cost / max(len(one.residuals), 1), 1.0)
+    return abs(one.cost - other.cost) < _EQUAL * inflation
+
+
+def differing(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[str, ...]:
+    """Return the parameters in which two equally likely fits differ beyond their intervals."""
+    if one is other or not equal(one, other):
+        return ()
+    count = len(one.unknowns.names)
+    there = one.unknowns.coordinates(other.model.values)
+    errors = np.sqrt(np.diag(covariance_of(one, experiments)))[:count]
+    apart = np.abs(there - one.theta[:count]) > _APART * errors
+    return tuple(n for n, far in zip(one.unknowns.names, apart, strict=True) if far)
