@@ -170,8 +170,8 @@ def test_gaps_offset_clock_and_polarity_do_not_matter() -> None:
 
 def test_irregular_samples_are_put_on_a_grid() -> None:
     values, rng = values_of("WYDS0808020"), np.random.default_rng(2)
-    time = np.asarray(np.sort(rng.random(4000)), np.float64) * step_of("WYDS0808020").duration
-    voltage = np.where(time > 0.05 * time[-1], 200.0, 0.0)
+    time = np.array(sorted(step_of("WYDS0808020").duration * rng.random(4000)), dtype=np.float64)
+    voltage: FloatArray = np.where(time > 0.05 * time[-1], 200.0, 0.0)
     record = noisy("random", time, voltage, simulated(values, time, voltage), 1e-3)
     assert errors(start(record), values, record)[0] < 0.06
 
@@ -208,6 +208,24 @@ def test_stacks_of_any_speed(seed: int) -> None:
     time, voltage = step_voltage(values)
     record = noisy("step", time, voltage, simulated(values, time, voltage), 1e-3)
     assert min(errors(start(record), values, record)) < 0.1
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.6])
+def test_a_zero_in_the_band_tells_the_stiffness_ratio(ratio: float) -> None:
+    """Ringing wafers, overdamped bonding layers: b of eq. (11) is far from both a_P and a_B."""
+    values = {**values_of("PTBS200"), "tau": 2e-5, "R_s": 5.0}
+    values["k_P"] = ratio * values["k_B"]
+    for part, omega, damping in (("P", 2e5, 0.05), ("B", 1e5, 1.2)):
+        k = values[f"k_{part}"]
+        values |= {f"m_{part}": k / omega**2, f"c_{part}": 2.0 * damping * k / omega}
+    time, voltage = step_voltage(values)
+    record = noisy("step", time, voltage, simulated(values, time, voltage), 5e-4)
+    found = start(record)
+    assert found is not None
+    k_B = starting_model([record]).values["k_B"]
+    told = [c.values["k_P"] / k_B for c in found.candidates if "k_P" in c.told]
+    assert told
+    assert min(abs(np.log(t / ratio)) for t in told) < 0.5
 
 
 def random_stack(rng: np.random.Generator) -> dict[str, float]:

@@ -13,7 +13,7 @@ from psa_casadi.identification.noise import high_frequency_noise
 BoolArray = npt.NDArray[np.bool_]
 
 #: Samples that all excerpts together may have, and that one may.
-SAMPLES, MOST = 10_000, 5_000
+SAMPLES, MOST = 8_000, 4_000
 #: Radii of the play operators that stand for the loop, over the range of the voltage.
 RADII = tuple(k / 16.0 for k in range(1, 9))
 #: Share of its range that a static loop must miss in a record: with a voltage that crosses its

@@ -41,8 +41,9 @@ _TYPICAL = np.array(
     [[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0], [0, 0, 0, 1, 0, -1, 1]]
 ) / 1.5  # fmt: skip
 _TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
-#: Standard deviation of the prior of a play operator's weight, over the static gain.
-_LOOP_PRIOR = 0.1
+#: Standard deviation of the prior of a play operator's weight, over the static gain. Wide ones let
+#: a bent curve stand for a fast response behind a slow drive.
+_LOOP_PRIOR = 0.02
 #: Step of the derivatives by differences, in natural logarithms.
 _STEP = 1e-3
 #: A fit ends when two steps in a row lower the cost by less than this share of it.

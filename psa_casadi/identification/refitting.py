@@ -14,6 +14,8 @@ from psa_casadi.identification.prediction import measured
 POLISH, QUICK_RTOL = 100, 1e-4
 #: Fits whose costs differ by less, in units of the log-likelihood's double, are equally good.
 _EQUAL = 3.84
+#: ... or by less than this share of what the model's own error adds to the cost.
+_OF_EXCESS = 0.05
 #: ... and they differ where a parameter is this many standard errors apart.
 _APART = 4.0
 
@@ -64,9 +66,15 @@ def refit(
 
 
 def equal(one: Fit, other: Fit) -> bool:
-    """Whether two fits are equally likely, residuals beyond the noise scaled to it."""
-    inflation = max(one.cost / max(len(one.residuals), 1), 1.0)
-    return abs(one.cost - other.cost) < _EQUAL * inflation
+    """Whether two fits are equally likely.
+
+    Beyond the noise, what the model lacks is in both costs; a gain of a small share of that says
+    more about the lack than about the parameters.
+    """
+    count = max(len(one.residuals), 1)
+    excess = max(min(one.cost, other.cost) - count, 0.0)
+    limit = _EQUAL * max(one.cost / count, 1.0) + _OF_EXCESS * excess
+    return abs(one.cost - other.cost) < limit
 
 
 def differing(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit, fit
 from psa_casadi.identification.linear_start import LinearCandidate
-from psa_casadi.identification.refinement import FAST, exchanged, with_fast, without_blur
+from psa_casadi.identification.refinement import exchanged, with_fast, without_blur
 from psa_casadi.identification.refitting import (
     QUICK_RTOL,
     Progress,
@@ -18,7 +18,7 @@ from psa_casadi.identification.refitting import (
     refit,
     residual_noise,
 )
-from psa_casadi.identification.starting_points import starting_points
+from psa_casadi.identification.starting_points import resolved, starting_points
 from psa_casadi.model.compose import Model
 
 #: Parameters that voltage and displacement determine in every record with loops.
@@ -87,10 +87,10 @@ def search(
     PsaError when no start can be simulated.
     """
     core = free_parameters(model)
-    told = [n for n in FAST if linear and n in model.values]
-    told = [n for n in told if n != "k_P" or n in linear[0].told]
+    fastest = min(e.record.sample_time for e in experiments)
+    told = resolved(model, linear, fastest)
     found = _quick_fits(
-        model, experiments, [*core, *told], starting_points(model, linear), progress
+        model, experiments, [*core, *told], starting_points(model, linear, fastest), progress
     )
     free = found[0][1].unknowns.names
     sigma = residual_noise(found[0][1], experiments)
@@ -135,7 +135,7 @@ def _quick_fits(
     sigma = noise_levels(experiments)
     quickly: dict[str, Any] = {"sigma": sigma, "rtol": QUICK_RTOL}
     found: list[tuple[str, Fit]] = []
-    rounds = (_QUICK,) if len(starts) <= _FINALISTS else (_FIRST, _QUICK - _FIRST)
+    rounds: tuple[int, ...] = (_QUICK,) if len(starts) <= _FINALISTS else (_FIRST, _QUICK - _FIRST)
     for name, start in starts:
         progress(f"base fit from {name}")
         try:

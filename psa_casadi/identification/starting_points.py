@@ -9,16 +9,19 @@ from psa_casadi.model.compose import Model
 
 #: Candidate dynamics that miss the fast records this much more than the best are not tried.
 _WORSE, _DYNAMICS = 1.2, 3
+#: An oscillator shows where sqrt(m/k) is at least this share of the sampling interval.
+_RESOLVED = 0.3
+_MASSES = ("m_P", "m_B")
 
 
 def starting_points(
-    model: Model, linear: Sequence[LinearCandidate]
+    model: Model, linear: Sequence[LinearCandidate], sample_time: float
 ) -> list[tuple[str, dict[str, float]]]:
     """Return the starts by name; static gain and loop keep their size where k_P moves."""
     shapes = [("loop shape {}", shape) for shape in loop_starts(model)]
     named = [(name.format(k + 1), dict(shape)) for k, (name, shape) in enumerate(shapes)]
     if linear:
-        dynamics = _dynamics(model, linear)
+        dynamics = _dynamics(model, linear, sample_time)
         named = [(name, _moved(model, shape, dynamics[0])) for name, shape in named]
         named += [
             (f"dynamics {k}", _moved(model, shapes[0][1], other))
@@ -27,20 +30,53 @@ def starting_points(
     return named
 
 
-def _dynamics(model: Model, linear: Sequence[LinearCandidate]) -> list[dict[str, float]]:
+def resolved(
+    model: Model, linear: Sequence[LinearCandidate], sample_time: float
+) -> tuple[str, ...]:
+    """Return the masses, and k_P, that are searched because the best candidate shows them.
+
+    Two masses that the sampling resolves are searched even where they are told badly: lags told
+    beside masses that are only assumed would look surer than they are.
+    """
+    if not linear:
+        return ()
+    values = {**model.values, **linear[0].values}
+    times = {m: (values[m] / values[m.replace("m", "k")]) ** 0.5 for m in _MASSES}
+    masses = tuple(m for m, t in times.items() if t >= _RESOLVED * sample_time)
+    return (*masses, *(n for n in ("k_P",) if masses and n in linear[0].told))
+
+
+def _dynamics(
+    model: Model, linear: Sequence[LinearCandidate], sample_time: float
+) -> list[dict[str, float]]:
     """Return the dynamics to start from: the creep lag the slower one, then the drive's lag.
 
-    A linear response cannot tell the two apart; amplifiers are usually the faster.
+    A linear response cannot tell the two apart; amplifiers are usually the faster. Where the
+    sampling resolves no mass, masses stay as they are and the slowest lag is the creep lag.
     """
-    near = [c.values for c in linear if c.misfit < _WORSE * linear[0].misfit]
+    near = [dict(c.values) for c in linear if c.misfit < _WORSE * linear[0].misfit]
+    if not set(_MASSES) & set(resolved(model, linear, sample_time)):
+        near = [_creep_slowest(model, values) for values in near]
     slow_first, turned = [], []
     for values in near:
         drive = values["R_s"] * model.values["C_p"]
         there = {**values, "tau": drive, "R_s": values["tau"] / model.values["C_p"]}
-        pair = (dict(values), there) if values["tau"] >= drive else (there, dict(values))
+        pair = (values, there) if values["tau"] >= drive else (there, values)
         slow_first.append(pair[0])
         turned.append(pair[1])
     return [*slow_first[:_DYNAMICS], turned[0]]
+
+
+def _creep_slowest(model: Model, values: Mapping[str, float]) -> dict[str, float]:
+    """Return dynamics of lags alone: ordinary masses, the creep lag exchanged with a slower c/k."""
+    ordinary = {k: v for k, v in values.items() if k not in (*_MASSES, "k_P")}
+    stiffness = {c: model.values[c.replace("c", "k")] for c in ("c_P", "c_B")}
+    shown = {c: values[c] / {**model.values, **values}[c.replace("c", "k")] for c in stiffness}
+    ordinary |= {c: lag * stiffness[c] for c, lag in shown.items()}
+    slow = max(shown, key=lambda c: shown[c])
+    if shown[slow] > values["tau"]:
+        ordinary |= {"tau": shown[slow], slow: values["tau"] * stiffness[slow]}
+    return ordinary
 
 
 def _moved(

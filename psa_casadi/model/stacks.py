@@ -90,7 +90,7 @@ def _identified(
 def _beside_the_record(top: float, h_ref: float, hold_rate: float) -> dict[str, Figure]:
     """Return the figures that `psa identify` does not search; all but the voltages are assumed."""
     slow = "Too fast to show in the record: the ordinary mass of the base model."
-    soft = "In series 50 N/um, since no stiffness is known: forces are right in proportion only."
+    soft = "Of the order of a stack's, since none is known: forces are right in proportion only."
     return {
         "G": _given(1.0, "definition: the voltage is the one that the record holds"),
         "C_p": _assumed(1.6e-6, "As the paper's stacks; the record shows R_s C_p only."),
@@ -98,9 +98,9 @@ def _beside_the_record(top: float, h_ref: float, hold_rate: float) -> dict[str, 
         "h_ref": _assumed(h_ref, "A tenth of the linear force over the span; beta and gamma fit."),
         "hold_rate": _assumed(hold_rate, "A span in 1000 s, far below the record's rates."),
         "m_P": _assumed(5e-3, slow),
-        "k_P": _assumed(6e7, soft),
+        "k_P": _assumed(2.5e8, soft),
         "m_B": _assumed(5e-3, slow),
-        "k_B": _assumed(3e8, soft),
+        "k_B": _assumed(5e7, soft),
     }
 
 
@@ -179,12 +179,12 @@ DEMO = Stack(
     name="demo",
     description="the synthetic stack of the demonstration, which creeps; its base model only",
     values={
-        **_beside_the_record(top=65.554, h_ref=126.804, hold_rate=0.065554),
+        **_beside_the_record(top=65.554, h_ref=105.670, hold_rate=0.065554),
         **_identified(
             "identified by `psa identify psa_casadi/data/demo.csv` (synthetic record)",
-            {"k_L": 26.0128, "A": -8.94120, "beta": 3.18392, "gamma": -0.381705, "n": 1.57498}
-            | {"tau": 1.14868e-3, "R_s": 55.1732},
-            undetermined={"delta": -0.689283, "c_P": 454.726, "c_B": 8156.37},
+            {"k_L": 21.6765, "A": -7.45580, "beta": 2.65995, "gamma": -0.316797, "n": 1.57145}
+            | {"tau": 1.13557e-3},
+            undetermined={"delta": -0.520552, "R_s": 68.1106, "c_P": 946.328, "c_B": 40.9041},
         ),
     },
 )
@@ -196,13 +196,13 @@ MICROMANIPULATOR = Stack(
         " forces per volt include the amplifier's gain; nested minor loops at 1 Hz"
     ),
     values={
-        **_beside_the_record(top=3.42367, h_ref=190.174, hold_rate=3.18734e-3),
+        **_beside_the_record(top=3.42367, h_ref=158.479, hold_rate=3.18734e-3),
         **_identified(
             "identified by `psa identify minor_loops.csv`, measured by Y. N. Aye (GitHub"
             " yan9a/DiscreteBacklashOperator, MIT licence)",
-            {"k_L": 917.252, "A": -316.907, "beta": 46.9124, "gamma": -26.4368, "n": 1.0}
-            | {"delta": -157.456, "tau": 1.77730e-2},
-            undetermined={"R_s": 273.709, "c_P": 15140.5, "c_B": 75165.2},
+            {"k_L": 742.361, "A": -244.196, "beta": 41.5186, "gamma": -24.0704, "n": 1.0}
+            | {"delta": -129.733},
+            undetermined={"tau": 1.39302e-2, "R_s": 2828.02, "c_P": 63302.4, "c_B": 13321.9},
         ),
     },
 )
