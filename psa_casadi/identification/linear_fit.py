@@ -41,9 +41,10 @@ _TYPICAL = np.array(
     [[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0], [0, 0, 0, 1, 0, -1, 1]]
 ) / 1.5  # fmt: skip
 _TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
-#: Standard deviation of the prior of a play operator's weight, over the static gain. Wide ones let
-#: a bent curve stand for a fast response behind a slow drive.
-_LOOP_PRIOR = 0.02
+#: Mean and standard deviation of the prior of a play operator's weight, over the slope, where the
+#: voltage turns; and where it does not: there only the prior keeps a curve that bends the other
+#: way from standing for a fast response behind a slow drive.
+_LOOP_PRIOR, _CURVE_PRIOR = (0.03, 0.1), (0.03, 0.02)
 #: Step of the derivatives by differences, in natural logarithms.
 _STEP = 1e-3
 #: A fit ends when two steps in a row lower the cost by less than this share of it.
@@ -156,12 +157,13 @@ def _eliminated(e: Excerpt, theta: FloatArray) -> _Eliminated:
     """Return the least-squares weights of one excerpt and the weighted residual they leave."""
     force = _force(e, theta)
     count, loop = int(e.valid.sum()), len(RADII)
-    gain = e.range / float(np.ptp(e.v))
+    slope = float(np.polyfit(e.v[e.valid], e.y[e.valid], 1)[0])
+    mean, deviation = _LOOP_PRIOR if e.turns else _CURVE_PRIOR
     matrix = np.zeros((count + loop, loop + 2))
     matrix[:count, :-1] = _behind(e, theta, force)[e.valid] / e.sigma
     matrix[:count, -1] = 1.0 / e.sigma
-    matrix[count:, 1:-1] = np.eye(loop) / (_LOOP_PRIOR * gain)
-    target = np.append(e.y[e.valid] / e.sigma, np.zeros(loop))
+    matrix[count:, 1:-1] = np.eye(loop) / (deviation * abs(slope))
+    target = np.append(e.y[e.valid] / e.sigma, np.full(loop, np.sign(slope) * mean / deviation))
     q, transform = orthonormal(matrix)
     weights = transform @ (q.T @ target)
     return _Eliminated(q @ (q.T @ target) - target, q, force, weights[:-1])
