@@ -45,6 +45,9 @@ _TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
 #: voltage turns; and where it does not: there only the prior keeps a curve that bends the other
 #: way from standing for a fast response behind a slow drive.
 _LOOP_PRIOR, _CURVE_PRIOR = (0.03, 0.1), (0.03, 0.02)
+#: The same for a shift of the voltage in time, in samples, where it jumps within `_JUMP` samples:
+#: the record does not tell when, between two of them.
+_SHIFT_PRIOR, _JUMP = (0.0, 0.3), 2.0
 #: Step of the derivatives by differences, in natural logarithms.
 _STEP = 1e-3
 #: A fit ends when two steps in a row lower the cost by less than this share of it.
@@ -156,14 +159,15 @@ class _Eliminated:
 def _eliminated(e: Excerpt, theta: FloatArray) -> _Eliminated:
     """Return the least-squares weights of one excerpt and the weighted residual they leave."""
     force = _force(e, theta)
-    count, loop = int(e.valid.sum()), len(RADII)
+    count, extra = int(e.valid.sum()), force.shape[1] - 1
     slope = float(np.polyfit(e.v[e.valid], e.y[e.valid], 1)[0])
-    mean, deviation = _LOOP_PRIOR if e.turns else _CURVE_PRIOR
-    matrix = np.zeros((count + loop, loop + 2))
+    priors = [_LOOP_PRIOR if e.turns else _CURVE_PRIOR] * len(RADII)
+    mean, deviation = np.array([*priors, _SHIFT_PRIOR][:extra]).T
+    matrix = np.zeros((count + extra, extra + 2))
     matrix[:count, :-1] = _behind(e, theta, force)[e.valid] / e.sigma
     matrix[:count, -1] = 1.0 / e.sigma
-    matrix[count:, 1:-1] = np.eye(loop) / (deviation * abs(slope))
-    target = np.append(e.y[e.valid] / e.sigma, np.full(loop, np.sign(slope) * mean / deviation))
+    matrix[count:, 1:-1] = np.diag(1.0 / (deviation * abs(slope)))
+    target = np.append(e.y[e.valid] / e.sigma, np.sign(slope) * mean / deviation)
     q, transform = orthonormal(matrix)
     weights = transform @ (q.T @ target)
     return _Eliminated(q @ (q.T @ target) - target, q, force, weights[:-1])
@@ -185,10 +189,13 @@ def _slopes(e: Excerpt, theta: FloatArray, free: IndexArray, at: _Eliminated) ->
 
 
 def _force(e: Excerpt, theta: FloatArray) -> FloatArray:
-    """Return the drive's voltage and the play operators on it, (n, 1 + loop)."""
+    """Return the drive's voltage, the play operators on it and, for a jump, its shift, (n, k)."""
     u = first_order(float(np.exp(theta[0])), e.v, e.h)
     span = float(np.ptp(e.v))
-    return np.column_stack([u, plays(u, [span * r for r in RADII])])
+    columns = [u[:, None], plays(u, [span * r for r in RADII])]
+    if e.crossing < _JUMP * e.h:
+        columns.append(np.gradient(u)[:, None])
+    return np.hstack(columns)
 
 
 def _behind(e: Excerpt, theta: FloatArray, x: FloatArray) -> FloatArray:
