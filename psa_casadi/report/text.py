@@ -53,7 +53,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
 def identification_text(
     found: Identification, *, origin: str = "measured", width: int = 100
 ) -> str:
-    """Return an identification: error, parameters with intervals, warnings."""
+    """Return an identification: error, parameters with intervals, warnings, what is left open."""
     scale = _scale(found.experiments, found.fit.rms)
     span = max(e.record.range_m for e in found.experiments)
     share = number(100.0 * found.fit.rms / span, 2)
@@ -62,7 +62,9 @@ def identification_text(
         ("error", f"{scale.text(found.fit.rms)} rms, {share} % of the largest range"),
     ]
     tail = [("warning", w) for w in found.warnings]
-    tail += [("note", n) for n in found.model.provenance.notes]
+    tail += [("open", c.sentence) for c in found.combinations]
+    tail += [("next", a.sentence) for a in found.advice]
+    tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
     blocks = ["\n".join(_line(label, text, width) for label, text in head)]
     blocks.append(str(parameter_table(found.model, found)))
     blocks += ["\n".join(_line(label, text, width) for label, text in tail)] if tail else []
