@@ -163,10 +163,12 @@ def _extend(
         if extension is not None:
             current.extensions.append(extension)
     current.extensions.sort(key=lambda e: -e.evidence)
-    if current.extensions and current.extensions[0].fit.rms > SETTLED * floor:
-        progress(f"cause {number}: {current.extensions[0].effect.name} afresh")
-        again = extend_afresh(current.fit, experiments, current.extensions[0], inflation)
-        current.extensions[0] = again
+    lost = [k for k, e in enumerate(current.extensions) if k == 0 or e.evidence < 0]
+    for k in lost if current.extensions and current.extensions[0].fit.rms > SETTLED * floor else ():
+        progress(f"cause {number}: {current.extensions[k].effect.name} afresh")
+        again = extend_afresh(current.fit, experiments, current.extensions[k], inflation)
+        current.extensions[k] = again
+    current.extensions.sort(key=lambda e: -e.evidence)
     for k, extension in enumerate(current.extensions[:FINALISTS]):
         if extension.evidence > RUNNER_UP * current.extensions[0].evidence:
             progress(f"cause {number}: {extension.effect.name} to the end")

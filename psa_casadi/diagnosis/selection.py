@@ -23,7 +23,7 @@ FULL_FITS = 3
 _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
-_QUICK = 8
+_QUICK, _AFRESH = 8, 25
 #: Tolerance of the stepper in quick fits, then of stepper and fit, and evaluations, to the end.
 _QUICK_RTOL = 1e-4
 _POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
@@ -104,8 +104,8 @@ def extend_afresh(
     starts = [
         (values, sign * size, memory) for sign in (1.0, -1.0) if sign > 0 or gain.bounds[0] < 0
     ]
-    ordinary = ordinary_values(before.model, min(e.record.sample_time for e in experiments))
-    quick = _quick(before, experiments, effect, starts, ordinary)
+    ordinary = ordinary_values(before.model, [e.record for e in experiments])
+    quick = _quick(before, experiments, effect, starts, ordinary, _AFRESH)
     if quick is None or quick.cost >= first.fit.cost:
         return first
     return _extension(before, quick, effect, experiments, inflation)
@@ -160,10 +160,20 @@ def _quick(
     effect: Component,
     starts: Sequence[_Start],
     reset: dict[str, float],
+    evaluations: int = _QUICK,
 ) -> Fit | None:
-    """A few iterations from every start; the best of them."""
-    fits = [_fit_from(before, experiments, effect, start, reset) for start in starts]
+    """A few iterations from every start; the best of them.
+
+    Where none comes below the fit without the effect, some more from there, with the gain at 0: the
+    loop may be such that no other start of the gain fits to it.
+    """
+    fits = [_fit_from(before, experiments, effect, start, reset, evaluations) for start in starts]
     found = [f for f in fits if f is not None]
+    if not any(f.cost < before.cost for f in found):
+        states = tuple(before.start(r) for r in range(len(experiments)))
+        nested = (starts[0][0], 0.0, states)
+        last = _fit_from(before, experiments, effect, nested, {}, 3 * _QUICK)
+        found += [last] if last is not None else []
     return min(found, key=lambda f: f.cost) if found else None
 
 
@@ -183,6 +193,7 @@ def _fit_from(
     effect: Component,
     start: _Start,
     reset: dict[str, float],
+    evaluations: int,
 ) -> Fit | None:
     values, gain, memory = start
     names = list(before.unknowns.names)
@@ -197,7 +208,7 @@ def _fit_from(
                 names,
                 sigma=before.sigma,
                 start_states=memory,
-                evaluations=_QUICK,
+                evaluations=evaluations,
                 tolerance=1e-3,
                 rtol=_QUICK_RTOL,
             )

@@ -7,6 +7,7 @@ import numpy as np
 from psa_casadi.components import BASE
 from psa_casadi.experiment.record import Record
 from psa_casadi.identification.prediction import measured
+from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.model.compose import Model, compose
 
 #: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
@@ -63,11 +64,15 @@ def loop_starts(model: Model) -> list[dict[str, float]]:
     ]
 
 
-def ordinary_values(model: Model, sample_time: float) -> dict[str, float]:
-    """Return an ordinary loop, some 12 % wide, and lags below the sampling, to the model's size."""
-    k_l = model.values["k_L"]
+def ordinary_values(model: Model, records: Sequence[Record]) -> dict[str, float]:
+    """Return an ordinary loop, some 12 % wide, and lags below the sampling, to the records' size.
+
+    k_L comes from the regression of displacement on voltage: that of a fitted model may be far off
+    it, since a steep loop trades k_L for A.
+    """
+    k_l = max(abs(static_slope(records)), 1e-12) / static_compliance(model.values)
     loop = {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
-    return {**loop, **_lags(model.values, sample_time)}
+    return {"k_L": k_l, **loop, **_lags(model.values, min(r.sample_time for r in records))}
 
 
 def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:

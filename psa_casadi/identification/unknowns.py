@@ -23,7 +23,7 @@ LAG_PRIOR = 1.0
 _LAGS = ("R_s", "c_P", "c_B", "c")
 _CARRIED = "f_H"
 _LOOP = ("k_L", "A", "beta", "gamma")
-_STEEPEST = 10.0  # |A| over k_L + A, beyond which the loop no longer changes
+_STEEPEST = 3.0  # |A| over k_L + A, beyond which the loop hardly changes
 _BEND_STEP = 0.2  # an ordinary change of beta A / s, in units of 0.1 k_L
 
 

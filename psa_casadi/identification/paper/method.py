@@ -107,10 +107,9 @@ def identify_by_paper(
     except InputError:
         raise
     except PsaError:
-        sample_time = min(r.sample_time for r in records)
-        usual = paper.model.with_values(ordinary_values(paper.model, sample_time))
+        usual = paper.model.with_values(ordinary_values(paper.model, records))
         best = fit(usual, experiments, [], sigma=sigma)
-        sentences, found = (*sentences, _RUNS_AWAY), ("k_L",) if "k_L" in found else ()
+        sentences, found = (*sentences, _RUNS_AWAY), ()
     nothing = determinacy(best, experiments)
     model = with_provenance(best.model, nothing, records, stiffness is not None)
     notes = (*model.provenance.notes, _note(found))
