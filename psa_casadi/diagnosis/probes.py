@@ -78,9 +78,10 @@ def _probe_values(
 ) -> Iterator[dict[str, float]]:
     longest = max(e.record.duration for e in experiments)
     grids: list[tuple[float, ...]] = []
-    for grid in effect.probe.values():
+    for name, grid in effect.probe.items():
         if grid == SPECTRAL_PEAKS:
-            grids.append(peaks)
+            low, high = next(p.bounds for p in effect.parameters if p.name == name)
+            grids.append(tuple(f for f in peaks if low < f < high))
         elif grid == RECORD_DURATION:
             grids.append((longest,))
         elif isinstance(grid, tuple):
