@@ -20,6 +20,7 @@ from psa_casadi.bench.outcome import Outcome, Progress, TitledTable
 from psa_casadi.bench.records import Values, clean_set, with_noise
 from psa_casadi.diagnosis.omnibus import whiteness
 from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.report.tables import Table
 
@@ -88,8 +89,7 @@ def one_run(name: str, seed: int) -> Run:
     level = NOISE * max(r.range_m for r in clean)
     records = with_noise(clean, NOISE, seed)
     found = identify(records, stiffness=truth["k_B"])
-    parts = [found.fit.of_record(found.experiments, r) for r in range(len(records))]
-    white = tuple(whiteness(found.fit.residuals[part]) > _WHITE for part in parts)
+    white = tuple(whiteness(r) > _WHITE for r in found.fit.residuals_of(found.experiments))
     return Run(
         stack=name,
         seed=seed,
@@ -103,7 +103,7 @@ def one_run(name: str, seed: int) -> Run:
 def compared(found: Identification, truth: Values) -> tuple[Found, ...]:
     """Return every quantity with its truth and its standard error (delta method)."""
     known, p = found.determinacy, found.model.values
-    size = _compliance(truth) * truth["h_ref"]
+    size = static_compliance(truth) * truth["h_ref"]
     true, value = quantities(truth, size), quantities(p, size)
     gradients: dict[str, list[float]] = {name: [] for name in value}
     for name in known.names:
@@ -121,17 +121,13 @@ def compared(found: Identification, truth: Values) -> tuple[Found, ...]:
     return tuple(results)
 
 
-def _compliance(p: Values) -> float:
-    return 1.0 / p["k_P"] + 1.0 / p["k_B"]
-
-
 def quantities(p: Values, size: float) -> dict[str, float]:
     """Return what voltage and displacement determine, by the parameter that it stands for.
 
     k, A, beta, gamma [m/V] and delta [m/(V.s)] as in eqs. (25), (26), beta and gamma at a
     hysteresis of `size` [m]; n; lags [s]; masses over stiffnesses [s^2].
     """
-    c = _compliance(p)
+    c = static_compliance(p)
     bend = c * (size / (c * p["h_ref"])) ** p["n"]
     return {
         "k_L": c * p["k_L"],

@@ -49,7 +49,7 @@ def _extended(
 ) -> Fit:
     """Return the fit with one more effect, all parameters searched together."""
     model = before.model.with_effect(EFFECTS[name], start)
-    states = [before.start(r) for r in range(len(experiments))]
+    states = before.starts()
     free = [*before.unknowns.names, *(p.name for p in EFFECTS[name].parameters)]
     first = fit(model, experiments, free, sigma=before.sigma, start_states=states)
     return refit(first, experiments, free)

@@ -115,7 +115,7 @@ def _histories(
     fit: Fit, experiments: Sequence[Experiment], effect: Component, model: Model
 ) -> list[tuple[dict[str, float], ...]]:
     """The effect's memories at rest, and for settling ones also as after long cycling."""
-    known = [fit.start(r) for r in range(len(experiments))]
+    known = fit.starts()
     settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
     variants = [tuple(known)]
     if settling:

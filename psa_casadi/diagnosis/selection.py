@@ -100,7 +100,7 @@ def extend_afresh(
         n: first.fit.model.values[n] if isinstance(grid, str) else _declared(effect, n)
         for n, grid in effect.probe.items()
     }
-    memory = tuple(before.start(r) for r in range(len(experiments)))
+    memory = tuple(before.starts())
     starts = [
         (values, sign * size, memory) for sign in (1.0, -1.0) if sign > 0 or gain.bounds[0] < 0
     ]
@@ -123,7 +123,7 @@ def polish(
                 experiments,
                 current.unknowns.names,
                 sigma=before.sigma,
-                start_states=[current.start(r) for r in range(len(experiments))],
+                start_states=current.starts(),
                 evaluations=evaluations,
                 tolerance=tolerance,
                 rtol=rtol,
@@ -170,7 +170,7 @@ def _quick(
     fits = [_fit_from(before, experiments, effect, start, reset, evaluations) for start in starts]
     found = [f for f in fits if f is not None]
     if not any(f.cost < before.cost for f in found):
-        states = tuple(before.start(r) for r in range(len(experiments)))
+        states = tuple(before.starts())
         nested = (starts[0][0], 0.0, states)
         last = _fit_from(before, experiments, effect, nested, {}, 3 * _QUICK)
         found += [last] if last is not None else []

@@ -95,7 +95,11 @@ def suspects(record: Record) -> Suspects:
 
 def cleaned(record: Record) -> Record:
     """Return the record with suspect samples masked (nan); name and `sha256` are kept."""
-    found = suspects(record)
+    return masked(record, suspects(record))
+
+
+def masked(record: Record, found: Suspects) -> Record:
+    """Return the record with the samples that were found suspect masked (nan)."""
     if record.displacement is None or not found.mask.any():
         return record
     return replace(record, displacement=np.where(found.mask, np.nan, record.displacement))

@@ -47,6 +47,10 @@ class Fit:
         counts = [int(e.used.sum()) for e in experiments[: record + 1]]
         return slice(sum(counts[:-1]), sum(counts))
 
+    def residuals_of(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+        """Residuals [m] record by record."""
+        return [self.residuals[self.of_record(experiments, r)] for r in range(len(experiments))]
+
     @property
     def rms(self) -> float:
         """Root mean square of the residuals [m]."""
@@ -55,6 +59,10 @@ class Fit:
     def start(self, record: int) -> dict[str, float]:
         """Deviations of one record's initial state from where its voltage and rate put it."""
         return self.unknowns.start(self.theta, record)
+
+    def starts(self) -> list[dict[str, float]]:
+        """The same for every record: where a further fit continues from."""
+        return [self.start(r) for r in range(self.unknowns.records)]
 
     def offset(self, record: int) -> float:
         """Sensor offset of one record [m]."""

@@ -179,8 +179,7 @@ def _disagreement(searched: Search) -> list[str]:
 def _missed(best: Fit, experiments: Sequence[Experiment]) -> list[str]:
     """Name the records whose residual is far above their own fast noise."""
     sentences = []
-    for r, e in enumerate(experiments):
-        residual = best.residuals[best.of_record(experiments, r)]
+    for e, residual in zip(experiments, best.residuals_of(experiments), strict=True):
         if len(residual) < 8:
             continue
         rms, noise = float(np.sqrt(np.mean(residual**2))), high_frequency_noise(residual)

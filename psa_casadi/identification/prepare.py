@@ -5,7 +5,7 @@ import numpy as np
 from psa_casadi.experiment.decimate import decimated
 from psa_casadi.experiment.fast_noise import fast_noise
 from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.suspects import cleaned, suspects
+from psa_casadi.experiment.suspects import masked, suspects
 from psa_casadi.identification.prediction import measured
 from psa_casadi.identification.starting import static_slope
 
@@ -16,8 +16,8 @@ def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
     Outliers, drop-outs and a stuck sensor are masked; where the sampling is so fast that block
     averages lose nothing, they take the samples' place.
     """
-    said = list(suspects(record).sentences(record.name))
-    clean = cleaned(record)
+    found = suspects(record)
+    said, clean = list(found.sentences(record.name)), masked(record, found)
     y = measured(clean)
     noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([clean])
     if noise <= 0 or slope == 0:

@@ -31,7 +31,7 @@ def with_fast(best: Fit, experiments: Sequence[Experiment], progress: Progress) 
     if not told:
         return best
     progress(f"base fit with {', '.join(told)}")
-    states = [best.start(r) for r in range(len(experiments))]
+    states = best.starts()
     try:
         wider = fit(best.model, experiments, [*free, *told], sigma=best.sigma, start_states=states)
     except PsaError:
@@ -85,7 +85,7 @@ def _from(
     """Fit from exchanged values, quickly, and to the end if that is near; None if it is not."""
     progress(f"exchanged: {what}")
     free = best.unknowns.names
-    states = [best.start(r) for r in range(len(experiments))]
+    states = best.starts()
     low_high = {n: best.model.parameter(n).bounds for n in values}
     moved = {n: min(max(v, low_high[n][0]), low_high[n][1]) for n, v in values.items()}
     try:
@@ -105,7 +105,7 @@ def _from(
             experiments,
             free,
             sigma=best.sigma,
-            start_states=[quick.start(r) for r in range(len(experiments))],
+            start_states=quick.starts(),
             evaluations=_LAST,
         )
     except PsaError:

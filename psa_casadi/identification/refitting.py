@@ -33,17 +33,13 @@ def noise_levels(experiments: Sequence[Experiment]) -> list[float]:
 
 def record_rms(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
     """Return the root mean square of every record's residual [m]."""
-    parts = [
-        previous.residuals[previous.of_record(experiments, r)] for r in range(len(experiments))
-    ]
+    parts = previous.residuals_of(experiments)
     return [max(float(np.sqrt(np.mean(p**2))), 1e-15) if len(p) else 1e-15 for p in parts]
 
 
 def residual_noise(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
     """Return the white noise of every record's residual [m], from its fast differences."""
-    parts = [
-        previous.residuals[previous.of_record(experiments, r)] for r in range(len(experiments))
-    ]
+    parts = previous.residuals_of(experiments)
     return [max(high_frequency_noise(p), 1e-15) for p in parts]
 
 
@@ -60,7 +56,7 @@ def refit(
         experiments,
         free,
         sigma=sigma or residual_noise(previous, experiments),
-        start_states=[previous.start(r) for r in range(len(experiments))],
+        start_states=previous.starts(),
         evaluations=POLISH,
     )
 

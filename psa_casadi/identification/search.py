@@ -150,7 +150,7 @@ def _quick_fits(
         if any(f.interrupted for _, f in found):
             break
         progress(f"base fit from {name}, continued")
-        states = [quick.start(r) for r in range(len(experiments))]
+        states = quick.starts()
         further = fit(
             quick.model, experiments, free, start_states=states, evaluations=rounds[1], **quickly
         )
