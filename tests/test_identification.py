@@ -161,7 +161,8 @@ def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
 def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any("cut off" in w for w in identified(2).warnings)
     record = plant(2)[1].slice(0, 600)
-    monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 3)
+    monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 1)
+    monkeypatch.setattr("psa_casadi.identification.refinement._LAST", 1)
     found = identify([record])
     assert found.warnings[0].startswith("The fit was cut off before it converged")
 

@@ -28,6 +28,7 @@ from psa_casadi.identification.paper.moments import (
 )
 from psa_casadi.identification.paper.shapes import find_loops, find_steps
 from psa_casadi.identification.refitting import noise_levels
+from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.report.phrases import number
@@ -175,7 +176,7 @@ def _loops() -> Table:
     time, voltage = loop_voltage(values, 1.0, 1.0)
     clean = Record("loop", time, voltage, response(values, time, voltage))
     step = find_steps([step_record(_values("P-885.51", {"R_s": 8e-3}), WINDOW)])[0]
-    compliance = 1.0 / values["k_P"] + 1.0 / values["k_B"]
+    compliance = static_compliance(values)
     rows = []
     for label, k in (("k_L/k_P + k_L/k_B", values["k_L"] * compliance), ("x_s of a step", step.k)):
         for noise in (0.0, 1e-4, 1e-3):

@@ -87,8 +87,10 @@ def suspects(record: Record) -> Suspects:
     rest = ~(stuck | dropped)
     outlying = np.zeros(valid.size, dtype=np.bool_)
     outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
-    for kind, found in (("outlier", outlying), ("drop-out", dropped), ("stuck", stuck)):
-        counts[kind] = int(found.sum())  # type: ignore[index]
+    kinds: dict[Kind, NDArray[np.bool_]]
+    kinds = {"outlier": outlying, "drop-out": dropped, "stuck": stuck}
+    for kind, found in kinds.items():
+        counts[kind] = int(found.sum())
         mask[valid[found]] = True
     return Suspects(mask, counts, quantum, record.displacement_unit)
 

@@ -6,6 +6,7 @@ from itertools import combinations, product
 
 import numpy as np
 
+from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.variables import Values
 
 
@@ -68,13 +69,13 @@ FORMULAS: tuple[Formula, ...] = (
         "k_L (1/k_P + 1/k_B)",
         "the static gain without hysteresis",
         ("k_L", "k_P", "k_B"),
-        lambda p: p["k_L"] * (1.0 / p["k_P"] + 1.0 / p["k_B"]),
+        lambda p: p["k_L"] * static_compliance(p),
     ),
     Formula(
         "(k_L + A) (1/k_P + 1/k_B)",
         "the slope after a reversal",
         ("k_L", "A", "k_P", "k_B"),
-        lambda p: (p["k_L"] + p["A"]) * (1.0 / p["k_P"] + 1.0 / p["k_B"]),
+        lambda p: (p["k_L"] + p["A"]) * static_compliance(p),
     ),
     _bend("beta"),
     _bend("gamma"),

@@ -39,6 +39,7 @@ class Identification:
     `starts` tells what became of every start of the search; `sentences` what was done to the
     records (samples masked, averaged), which is no warning. `combinations` holds what is known of
     parameters that trade off; `advice` the further records that would determine what is open.
+    `read_off` names parameters that were found without a fit (the paper's method).
     """
 
     model: Model
@@ -50,6 +51,7 @@ class Identification:
     sentences: tuple[str, ...] = ()
     combinations: tuple[Combination, ...] = ()
     advice: tuple[Advice, ...] = ()
+    read_off: tuple[str, ...] = ()
 
 
 def identify(

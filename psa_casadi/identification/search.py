@@ -89,31 +89,20 @@ def search(
     core = free_parameters(model)
     fastest = min(e.record.sample_time for e in experiments)
     told = resolved(model, linear, fastest)
-    found = _quick_fits(
-        model, experiments, [*core, *told], starting_points(model, linear, fastest), progress
-    )
+    starts = starting_points(model, linear, [e.record for e in experiments])
+    found = _quick_fits(model, experiments, [*core, *told], starts, progress)
     free = found[0][1].unknowns.names
     sigma = residual_noise(found[0][1], experiments)
-    polished: list[Fit | None] = [None] * len(found)
-    for k, (name, quick) in enumerate(found):
+    polished: list[Fit] = []
+    for name, quick in found[:2]:
         limit = (_NEAR if thorough else _CLOSE) * found[0][1].cost
-        followed = k == 0 or quick.cost < limit
-        if not followed or k > 1 or any(p is not None and p.interrupted for p in polished):
+        if polished and (quick.cost >= limit or polished[0].interrupted):
             break
         progress(f"base fit, {name} to the end")
-        polished[k] = quick if quick.interrupted else refit(quick, experiments, free, sigma=sigma)
-    ended = [p for p in polished if p is not None]
-    best = min(ended, key=lambda f: f.cost)
-    not_unique: set[str] = set()
-    outcomes = []
-    for (name, quick), final in zip(found, polished, strict=True):
-        shown = final or quick
-        agrees = None
-        if final is not None:
-            names = differing(best, final, experiments)
-            agrees = final is best or (names == () and equal(best, final))
-            not_unique |= set(names)
-        outcomes.append(StartOutcome(name, shown.cost, shown.rms, agrees))
+        ended = quick if quick.interrupted else refit(quick, experiments, free, sigma=sigma)
+        polished.append(ended)
+    best = min(polished, key=lambda f: f.cost)
+    outcomes, not_unique = _outcomes(found, polished, best, experiments)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
         best = without_blur(best, experiments)
@@ -121,7 +110,27 @@ def search(
         best, open_ones = exchanged(best, experiments, progress)
         not_unique |= set(open_ones)
     names = best.unknowns.names
-    return Search(best, tuple(outcomes), tuple(n for n in names if n in not_unique))
+    return Search(best, outcomes, tuple(n for n in names if n in not_unique))
+
+
+def _outcomes(
+    found: Sequence[tuple[str, Fit]],
+    polished: Sequence[Fit],
+    best: Fit,
+    experiments: Sequence[Experiment],
+) -> tuple[tuple[StartOutcome, ...], set[str]]:
+    """Tell what became of every start, and which parameters equally good fits differ in."""
+    outcomes, not_unique = [], set[str]()
+    for k, (name, quick) in enumerate(found):
+        if k >= len(polished):
+            outcomes.append(StartOutcome(name, quick.cost, quick.rms, None))
+            continue
+        final = polished[k]
+        names = differing(best, final, experiments)
+        agrees = final is best or (names == () and equal(best, final))
+        not_unique |= set(names)
+        outcomes.append(StartOutcome(name, final.cost, final.rms, agrees))
+    return tuple(outcomes), not_unique
 
 
 def _quick_fits(

@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
+from psa_casadi.experiment.record import Record
 from psa_casadi.identification.linear_start import LinearCandidate
+from psa_casadi.identification.loop_start import loop_start
 from psa_casadi.identification.starting import loop_starts
 from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.model.compose import Model
@@ -15,19 +17,25 @@ _MASSES = ("m_P", "m_B")
 
 
 def starting_points(
-    model: Model, linear: Sequence[LinearCandidate], sample_time: float
+    model: Model, linear: Sequence[LinearCandidate], records: Sequence[Record]
 ) -> list[tuple[str, dict[str, float]]]:
-    """Return the starts by name; static gain and loop keep their size where k_P moves."""
-    shapes = [("loop shape {}", shape) for shape in loop_starts(model)]
-    named = [(name.format(k + 1), dict(shape)) for k, (name, shape) in enumerate(shapes)]
-    if linear:
-        dynamics = _dynamics(model, linear, sample_time)
-        named = [(name, _moved(model, shape, dynamics[0])) for name, shape in named]
-        named += [
-            (f"dynamics {k}", _moved(model, shapes[0][1], other))
-            for k, other in enumerate(dynamics[1:], 2)
-        ]
-    return named
+    """Return the starts by name; static gain and loop keep their size where k_P moves.
+
+    The loop that the records show comes first, then shapes that loops usually have: fewer of them
+    where the records show a loop, and where they show dynamics to try.
+    """
+    shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
+    shown = loop_start(model, records)
+    if shown is not None:
+        shapes = [("the records' loops", shown), *shapes[: 1 if linear else 2]]
+    if not linear:
+        return shapes
+    dynamics = _dynamics(model, linear, min(r.sample_time for r in records))
+    named = [(name, _moved(model, shape, dynamics[0])) for name, shape in shapes]
+    return named + [
+        (f"dynamics {k}", _moved(model, shapes[0][1], other))
+        for k, other in enumerate(dynamics[1:], 2)
+    ]
 
 
 def resolved(

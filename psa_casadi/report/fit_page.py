@@ -85,6 +85,7 @@ def fit_page(
 
 _STATUS_STYLES = {
     "fit": "good",
+    "read off": "good",
     "fit, weak": "weak",
     "fit, undetermined": "bad",
     "fit, on its bound": "bad",

@@ -1,6 +1,6 @@
 """What a fit amounts to, in sentences."""
 
-from psa_casadi.report.grades import STRONG_CORRELATION, Grade, named
+from psa_casadi.report.grades import STRONG_CORRELATION, Degree, Grade, named
 from psa_casadi.report.phrases import Scale, listing, number, percent
 from psa_casadi.report.residuals import ResidualFigures
 
@@ -28,13 +28,13 @@ def determined_sentence(graded: tuple[Grade, ...]) -> str:
     good = len(named(graded, "determined"))
     count = "all" if good == len(fitted) else f"{good} of"
     parts = [f"The records determine {count} {len(fitted)} fitted parameters to 10 % or better"]
-    words = (
+    words: tuple[tuple[Degree, str, str], ...] = (
         ("weak", "weakly determined", "weakly determined"),
         ("undetermined", "undetermined", "undetermined"),
         ("on its bound", "on its bound", "on their bounds"),
     )
     for degree, one, several in words:
-        names = named(graded, degree)  # type: ignore[arg-type]
+        names = named(graded, degree)
         if names:
             parts.append(f"{listing(names)} {f'is {one}' if len(names) == 1 else f'are {several}'}")
     return f"{'; '.join(parts)}."

@@ -63,6 +63,8 @@ def parameter_table(model: Model, found: Identification | None = None) -> Table:
 
 
 def _status(model: Model, name: str, found: Identification | None) -> str:
+    if found is not None and name in found.read_off:
+        return "read off"
     if name not in model.provenance.free:
         return "not fitted"
     degree = grade(found, name).degree if found is not None else "determined"

@@ -7,6 +7,7 @@ import numpy as np
 
 from psa_casadi.identification.paper.factors import mechanics_of
 from psa_casadi.identification.paper.hysteresis import HysteresisPart
+from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.model.compose import Model
 
 
@@ -31,7 +32,7 @@ def in_forces(
     Without a loop f_H is 0; without factors the parts are damped critically, c >= 2 sqrt(k m),
     since nothing is known to ring. A value out of its bounds is refused, n is clipped.
     """
-    compliance = 1.0 / start.values["k_P"] + 1.0 / start.values["k_B"]
+    compliance = static_compliance(start.values)
     usual = _still(start)
     motion: dict[str, float] = {}
     sentences: tuple[str, ...] = ()

@@ -120,6 +120,7 @@ def identify_by_paper(
         determinacy=nothing,
         experiments=experiments,
         warnings=sentences,
+        read_off=found,
     )
 
 
