@@ -90,7 +90,8 @@ class Component:
     `tone` names a parameter that is the frequency of a tone: among the harmonics of a periodic
     drive it cannot be told from distortion. `belongs_to` is plant, drive, sensor or environment;
     the last two stay out of exported plants. `needs` names components without which this one
-    means nothing.
+    means nothing. `trial_starts` are starts of its memory states at which it is looked for, where
+    it does nothing at their ordinary start.
     """
 
     name: str
@@ -109,3 +110,4 @@ class Component:
     equation_text: str = ""
     belongs_to: str = "plant"
     needs: tuple[str, ...] = ()
+    trial_starts: tuple[Mapping[str, float], ...] = ()

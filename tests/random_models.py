@@ -52,5 +52,11 @@ def random_point(model: Model, generator: np.random.Generator) -> Point:
     """Return states of their ordinary size with either sign, and inputs within the ratings."""
     x = model.state_nominals() * generator.normal(size=len(model.state_names))
     rated = model.values["u_rated"]
-    u = np.array([generator.uniform(-0.3, 1.0) * rated, generator.uniform(-200.0, 200.0)])
+    drawn = {
+        "voltage": generator.uniform(-0.3, 1.0) * rated,
+        "load_force": generator.uniform(-200.0, 200.0),
+    }
+    if "temperature" in model.input_names:
+        drawn["temperature"] = generator.uniform(280.0, 310.0)
+    u = np.array([drawn[name] for name in model.input_names])
     return Point(float(generator.uniform(0.0, 10.0)), x, u)

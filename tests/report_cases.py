@@ -6,6 +6,8 @@ from functools import cache
 import numpy as np
 
 from psa_casadi.components import BASE
+from psa_casadi.diagnosis.misfit import Misfit, misfit
+from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
@@ -19,10 +21,11 @@ from psa_casadi.diagnosis.result import (
     Verdict,
 )
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment import Record, multisine, time_grid
+from psa_casadi.experiment import Record, multisine, sine, time_grid
 from psa_casadi.experiment.split import Experiment, split, whole
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.identification.prediction import measured
 from psa_casadi.identification.unknowns import unknowns_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.report.series import Curve, Series
@@ -44,6 +47,42 @@ def experiment(name: str, samples: int) -> tuple[Experiment, FloatArray, FloatAr
     y = clean + drift + NOISE * np.random.default_rng(1).standard_normal(len(time))
     y[40:50] = np.nan
     return split(Record(name, time, voltage, y)), clean, clean + drift
+
+
+@cache
+def misfits(name: str, samples: int) -> tuple[NoiseFloor, Misfit, Misfit]:
+    """Return the noise floor of a record, and what models without and with the drift leave."""
+    e, clean, drifting = experiment(name, samples)
+    without, with_drift = (measured(e.record) - y for y in (clean, drifting))
+    (floor,) = noise_floor([e.record], [with_drift])
+    return floor, misfit(e.record, without, floor), misfit(e.record, with_drift, floor)
+
+
+def periodic(counts: bool = False) -> tuple[Experiment, NoiseFloor, Misfit, Misfit]:
+    """Return a record of eight periods with an even error and hum, and its misfits without both."""
+    time = time_grid(4.0, 1e-3)
+    voltage = sine(time, 0.0, 100.0, 2.0)
+    clean = 1e-7 * voltage
+    bent = 4e-8 * ((voltage - 50.0) / 50.0) ** 2 + 3e-8 * np.sin(2.0 * np.pi * 51.0 * time)
+    noise = NOISE * np.random.default_rng(4).standard_normal(time.size)
+    size = 1e9 if counts else 1.0
+    quiet, record = (
+        Record("loops", time, voltage, size * y, displacement_unit="counts" if counts else "m")
+        for y in (clean + noise, clean + bent + noise)
+    )
+    # the noise is known from before the hum began
+    (floor,) = noise_floor([quiet], [size * noise])
+    before, after = (misfit(record, size * e, floor) for e in (bent + noise, noise))
+    return split(record), floor, before, after
+
+
+def with_periodic(d: Diagnosis, *, counts: bool = False) -> Diagnosis:
+    """Return a diagnosis of one record with another in its place, of a periodic voltage."""
+    e, floor, before, after = periodic(counts)
+    y = measured(e.record)
+    base = np.asarray((1e2 if counts else 1e-7) * e.record.voltage)
+    return replace(d, experiments=(e,), noise=(floor,), misfit=(before,), remainder=(after,),
+                   base=(base,), extended=(y,))  # fmt: skip
 
 
 def _fit(model: Model) -> Fit:
@@ -68,12 +107,13 @@ def diagnosis(
                    "creep_time": Estimate(0.3, "s", (0.2, 0.45))},
                   ("offset_drift",) if verdict == "ambiguous" else (), 0.9)  # fmt: skip
     errors = Errors(4e-8, 5e-8, 1.5e-7, 0.31)
+    seen = [misfits(n, samples) for n in names]
     return Diagnosis(
         verdict=verdict,
         causes=(cause,) if added else (),
         candidates=(
-            Candidate("slow_creep", 0.93, 1250.0, True),
-            Candidate("offset_drift", -40.0, -3000.0, True),
+            Candidate("slow_creep", 0.93, 1250.0, True, 0.91 if added else 0.0),
+            Candidate("offset_drift", -40.0, -3000.0, True, 0.08 if added else 0.0),
             Candidate("sensor_delay", 0.004, 0.2, False),
         ),
         noise_floor_rms_m=NOISE,
@@ -93,6 +133,9 @@ def diagnosis(
         base=base,
         extended=tuple(p[2] for p in parts) if added else base,
         model=model,
+        noise=tuple(s[0] for s in seen),
+        misfit=tuple(s[1] for s in seen),
+        remainder=tuple(s[2] if added else s[1] for s in seen),
     )
 
 

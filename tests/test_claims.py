@@ -1,7 +1,7 @@
 """Every effect's claims, measured: one test for all entries of the table."""
 
 import ctypes
-import itertools
+import random
 from collections.abc import Callable
 from functools import cache
 
@@ -17,6 +17,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.simulation.codegen import functions_of, generate_c
 from psa_casadi.simulation.compiler import shared_library
+from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import convert
 from psa_casadi.variables import Input, Output, Parameter, State
@@ -25,7 +26,12 @@ from tests.random_models import Point, random_model, random_point
 FloatArray = NDArray[np.float64]
 
 ALL = tuple(EFFECTS.values())
-SETS = [*((e,) for e in ALL), *itertools.combinations(ALL, 2), ALL]
+_draw = random.Random(20)  # pairs and triples: all of them would take too long
+SETS = [
+    *((e,) for e in ALL),
+    *(tuple(_draw.sample(ALL, size)) for size in (2, 3) for _ in range(15)),
+    ALL,
+]
 every_effect = pytest.mark.parametrize("effect", ALL, ids=lambda e: e.name)
 
 
@@ -71,11 +77,29 @@ def c_values(model: Model, name: str, point: Point, sizes: list[int]) -> list[Fl
     return results
 
 
-def drive(samples: int, sample_time: float, start: float) -> tuple[FloatArray, FloatArray]:
-    """Return times and (voltage, load) that begin at rest; two tones make minor loops."""
+def drive(
+    model: Model, samples: int, sample_time: float, start: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return times and inputs that begin at rest; two tones make minor loops."""
     t = np.linspace(0.0, (samples - 1) * sample_time, samples)
     voltage = 40.0 * (1.0 - np.cos(6e3 * t)) + 20.0 * np.sin(15e3 * t) ** 2
-    return start + t, np.column_stack([voltage, 50.0 * np.sin(4e3 * t)])
+    return start + t, inputs_of(model, t, voltage, 50.0 * np.sin(4e3 * t))
+
+
+def inputs_of(model: Model, t: FloatArray, voltage: FloatArray, load: FloatArray) -> FloatArray:
+    """Return the samples of all inputs; a temperature climbs by three kelvin."""
+    given = {"voltage": voltage, "load_force": load}
+    if "temperature" in model.input_names:
+        given["temperature"] = 293.15 + 3.0 * t / t[-1]
+    return input_samples(model, len(t), given)
+
+
+def start_of(effect: Component, model: Model) -> FloatArray:
+    """Return all states at 0, or at the first of the effect's trial starts."""
+    start = np.zeros(len(model.state_names))
+    for name, value in (effect.trial_starts[0] if effect.trial_starts else {}).items():
+        start[model.state_names.index(name)] = value
+    return start
 
 
 @pytest.mark.parametrize("effects", SETS, ids=name_of)
@@ -85,10 +109,12 @@ def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
         model = random_model(effects, generator, gains=False)
         base = model.without(e.name for e in effects)
         point = random_point(model, generator)
-        nx = len(base.state_names)
+        nx, nu = len(base.state_names), len(base.input_names)
         assert model.state_names[:nx] == base.state_names
+        assert model.input_names[:nu] == base.input_names
         rate, outputs = values_of(model, point)
-        base_rate, base_outputs = values_of(base, Point(point.time, point.x[:nx], point.u))
+        base_point = Point(point.time, point.x[:nx], point.u[:nu])
+        base_rate, base_outputs = values_of(base, base_point)
         assert np.isfinite(rate).all()
         np.testing.assert_array_equal(rate[:nx], base_rate)
         np.testing.assert_array_equal(outputs, base_outputs)
@@ -99,9 +125,10 @@ def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
     """Equal to the tolerance of 1e-8: Newton's stopping test sees the norm of all states."""
     model = random_model(effects, np.random.default_rng(2), gains=False)
     base = model.without(e.name for e in effects)
-    t, u = drive(10001, 1e-7, 0.0)
+    t, u = drive(model, 10001, 1e-7, 0.0)
+    _, base_u = drive(base, 10001, 1e-7, 0.0)
     extended = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
-    plain = run(base, t, u, np.zeros(len(base.state_names)), rtol=1e-8)
+    plain = run(base, t, base_u, np.zeros(len(base.state_names)), rtol=1e-8)
     assert len(t) - 1 <= plain.steps == extended.steps <= 1.01 * len(t)  # one a sample, and turns
     assert np.ptp(plain.y[:, 0]) > 1e-6
     for ours, base_values in ((extended.x, plain.x), (extended.y, plain.y)):
@@ -120,8 +147,8 @@ def test_a_gain_changes_what_is_measured(effect: Component) -> None:
     step = sizes[-1] * gain.typical(model.values)
     t = np.linspace(0.0, 2.0, 4001)
     voltage = 50.0 * (1.0 - np.cos(2 * np.pi * t)) + 20.0 * (t > 0.7)
-    u = np.column_stack([voltage, np.zeros_like(t)])
-    start = np.zeros(len(model.state_names))
+    u = inputs_of(model, t, voltage, np.zeros_like(t))
+    start = start_of(effect, model)
     shown = [run(model.with_values({gain.name: g}), t, u, start).y[:, -1] for g in (0.0, step)]
     assert np.abs(shown[1] - shown[0]).max() > 1e-4 * np.ptp(shown[0])
 
@@ -237,15 +264,21 @@ def test_sensitivities_are_differences_of_runs(effect: Component) -> None:
     """Steps that end at a reversal move with the parameters; their lengths count as constant."""
     model = random_model((effect,), np.random.default_rng(6), gains=True)
     unknowns = [*(p.name for p in effect.parameters), "k_L", "A", "beta", "gamma", "tau", "k_B"]
-    t, u = drive(4001, 5e-7, 5.0)
-    start = np.zeros(len(model.state_names))
+    t, u = drive(model, 4001, 5e-7, 5.0)
+    start = start_of(effect, model)
+    # what delays the voltage moves its reversals, where delta u sgn(u') jumps
+    allowed = 5e-3 if effect.belongs_to == "drive" else 5e-4
     exact = run(model, t, u, start, rtol=1e-8, unknowns=unknowns).sensitivity
     assert exact is not None
     for column, name in enumerate(unknowns):
-        step = 3e-4 * model.parameter(name).typical(model.values)
+        # a tone turns many times; a small gain would drown in the stepper's own error
+        share = 3e-6 if name == effect.tone else 3e-2 if name == effect.gain else 3e-4
+        step = share * model.parameter(name).typical(model.values)
         moved = [{**model.values, name: model.values[name] + h} for h in (step, -step)]
         ends = [run(model, t, u, start, rtol=1e-8, values=values).y for values in moved]
         found = (ends[0][:, -1] - ends[1][:, -1]) / (2 * step)
         size = np.abs(exact[:, column]).max()
         assert size > 0.0, name
-        np.testing.assert_allclose(found, exact[:, column], rtol=0, atol=5e-4 * size, err_msg=name)
+        np.testing.assert_allclose(
+            found, exact[:, column], rtol=0, atol=allowed * size, err_msg=name
+        )

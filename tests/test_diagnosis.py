@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.colour import colour_of
@@ -35,10 +36,26 @@ def ar1(correlation: float, rng: np.random.Generator) -> FloatArray:
 def test_colour_is_estimated_and_removed(correlation: float) -> None:
     noise = ar1(correlation, np.random.default_rng(3))
     colour = colour_of(noise, [N])
-    assert colour.correlation == pytest.approx(correlation, abs=0.05)
+    assert sum(colour.autoregression[0]) == pytest.approx(correlation, abs=0.05)
+    assert colour.inflation == pytest.approx((1 + correlation) / (1 - correlation), rel=0.2)
     assert colour.level == pytest.approx(1.0, rel=0.05)
     white = colour.whiten(noise)
     assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.05
+
+
+def test_a_known_colour_is_taken_and_the_level_follows() -> None:
+    """Two records, one of known second-order colour: the other's is estimated from itself."""
+    rng = np.random.default_rng(8)
+    a = np.array([0.9, -0.5])
+    coloured = np.asarray(lfilter([1.0], [1.0, -a[0], -a[1]], rng.standard_normal(N)))
+    both = np.concatenate([coloured, ar1(0.6, rng)])
+    colour = colour_of(both, [N, N], [a, None])
+    assert colour.autoregression[1] == pytest.approx([0.6], abs=0.05)
+    assert colour.level == pytest.approx(1.0, rel=0.03)
+    white = colour.whiten(both[:, None])[:, 0]
+    for part in (white[:N], white[N:]):
+        r = [np.corrcoef(part[k:], part[:-k])[0, 1] for k in (1, 2, 3)]
+        assert max(np.abs(r)) < 0.05
 
 
 def _test(residual: FloatArray) -> float:
@@ -113,7 +130,7 @@ def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> 
         "holdout_max_m",
         "holdout_nrmse_percent",
     }
-    assert {c["effect"] for c in content["candidates"]} == set(psa.EFFECTS)
+    assert {c["effect"] for c in content["candidates"]} == set(psa.EFFECTS) - {"temperature"}
     assert content["next_experiment"]["why"]
 
 

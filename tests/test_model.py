@@ -17,6 +17,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file import dumps, load_model, loads, save_model
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Interval, Output, Parameter, Provenance, State
 from tests.random_models import random_model
@@ -120,7 +121,7 @@ def test_the_plant_has_no_sensor() -> None:
     assert plant.values["creep_gain"] == 0.02
     point = model.state_nominals()
     kept = [model.state_names.index(n) for n in plant.state_names]
-    whole = model.structure.f(1.0, point, [50.0, 10.0], model.parameter_vector())
+    whole = model.structure.f(1.0, point, [50.0, 10.0, 293.15], model.parameter_vector())
     part = plant.structure.f(1.0, point[kept], [50.0, 10.0], plant.parameter_vector())
     assert np.array_equal(np.array(whole[0])[kept], np.array(part[0]))
 
@@ -131,7 +132,8 @@ def test_velocity_is_the_rate_of_the_displacement(components: tuple[Component, .
     gains = {"creep_gain": 0.05, "mode_gain": 0.2}
     model = model.with_values({k: v for k, v in gains.items() if k in model.values})
     t = np.linspace(0.0, 2e-3, 4001)
-    u = np.column_stack([50.0 * (1.0 - np.cos(4e3 * t)), 20.0 * np.sin(3e3 * t)])
+    given = {"voltage": 50.0 * (1.0 - np.cos(4e3 * t)), "load_force": 20.0 * np.sin(3e3 * t)}
+    u = input_samples(model, len(t), given)
     y = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-9).y
     x, v = (y[:, model.output_names.index(n)] for n in ("displacement", "velocity"))
     slope = (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * 5e-7)

@@ -53,12 +53,13 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
     assert "measured" not in page.text
     assert d.experiments[0].record.sha256 in page.text
     assert "The record is slow <and> short." in page.text
-    assert len(figures(text)) == 8
+    # at the top 1, views 3, evidence 1, record 7; signature and data 2
+    assert len(figures(text)) == (14 if verdict in ADDED else 12)
     assert "The residual of the" in page.text
     shown = story(d, origin="synthetic")
     assert SENTENCES[verdict] in " ".join(shown.split())
     assert ("extended" in shown) == (verdict in ADDED)
-    assert 8 <= len(shown.splitlines()) <= 16
+    assert 8 <= len(shown.splitlines()) <= 15
     assert max(map(len, shown.splitlines())) <= 100
     json.loads(d.to_json())
 
@@ -101,7 +102,7 @@ def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:
     assert float(np.sqrt(np.mean(density[5:] ** 2))) == pytest.approx(
         noise_density(series), rel=0.05
     )
-    assert noise_density(series) == pytest.approx(NOISE * np.sqrt(2e-3))
+    assert noise_density(series) == pytest.approx(NOISE * np.sqrt(2e-3), rel=0.02)
 
 
 def test_tables_show_display_units_and_say_what_is_not_known() -> None:
@@ -110,7 +111,7 @@ def test_tables_show_display_units_and_say_what_is_not_known() -> None:
     assert rows["tau"][1:4] == ("0.1000", "not determined", "ms")
     assert rows["k_L"][2:5] == ("9.90 to 10.1", "N/V", "fit")
     assert rows["m_P"][4] == "not fitted"
-    assert [row[1] for row in blind_table(d).rows] == ["0.00200 s", "at no size"]
+    assert [row[1] for row in blind_table(d).rows] == ["at no size", "0.00200 s"]
     assert [row[0] for row in error_table(d, "nm", 1e9).rows] == ["base", "extended", "noise"]
     assert error_table(d, "nm", 1e9).rows[1][2] == "8.50"
     assert [r[0] for r in error_table(diagnosis("adequate"), "nm", 1e9).rows] == ["base", "noise"]

@@ -20,8 +20,9 @@ def test_rest_is_rest(name: str, effects: tuple[str, ...]) -> None:
         model = model.with_effect(EFFECTS[effect])
     model = model.with_values({k: v for k, v in gains.items() if k in model.values})
     memory = {"f_H": 0.3 * model.values["h_ref"]}
-    start = start_state(model, [80.0, 50.0], memory=memory)
-    rate = np.array(model.structure.f(0.0, start.x, [80.0, 50.0], model.parameter_vector())[0])
+    inputs = [{"voltage": 80.0, "load_force": 50.0}.get(n, 293.15) for n in model.input_names]
+    start = start_state(model, inputs, memory=memory)
+    rate = np.array(model.structure.f(0.0, start.x, inputs, model.parameter_vector())[0])
     size = model.state_nominals()
     assert start.x[model.state_names.index("u")] == pytest.approx(80.0, rel=1e-12)
     assert start.x[model.state_names.index("f_H")] == memory["f_H"]

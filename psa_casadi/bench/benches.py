@@ -37,6 +37,11 @@ BENCHES: dict[str, Bench] = {
             "the measured micromanipulator: held-out error of the paper's model and of two effects",
         ),
         _later(
+            "hidden",
+            "diagnose",
+            "hidden causes on independent plants: what is named, how surely, and how often rightly",
+        ),
+        _later(
             "verification",
             "verification",
             "the paper's figures 6 to 10 (loops, steps, other voltages), and three mechanics",

@@ -1,32 +1,69 @@
 """`psa effects`: what real stacks do that the base model does not."""
 
 import difflib
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import show, show_table, width
+from psa_casadi.cli.screen import show, show_table, tell_written, width
 
 
 def effects(
     name: Annotated[str | None, typer.Argument(help="Name of one effect.")] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="PNG picture of the effect's signature to write; needs NAME."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print names only.")] = False,
 ) -> None:
-    """List the effects that a diagnosis looks for; show one with equation, signature and source."""
+    """List the effects that a diagnosis looks for; show one with equation, signature and source.
+
+    Example: psa effects slow_creep --figure creep.png
+    """
     from psa_casadi.effects import EFFECTS
-    from psa_casadi.errors import InputError
     from psa_casadi.report.tables import effects_table
     from psa_casadi.report.text import effect_page
 
-    if name is None:
+    wanted = _known(name, list(EFFECTS), figure)
+    if wanted is None:
         if quiet:
             show("\n".join(EFFECTS))
         else:
             show_table(effects_table(EFFECTS.values()))
         return
-    wanted = name.strip().lower().replace("-", "_").replace(" ", "_")
-    if wanted not in EFFECTS:
-        near = difflib.get_close_matches(wanted, EFFECTS, n=3, cutoff=0.4)
-        meant = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(EFFECTS)}."
-        raise InputError(f"There is no effect named '{name}'; {meant}")
+    if figure is not None:
+        _draw(wanted, figure)
     show(wanted if quiet else effect_page(EFFECTS[wanted], width()))
+    tell_written(figure, quiet=quiet)
+
+
+def _known(name: str | None, names: list[str], figure: Path | None) -> str | None:
+    """Return the effect that is meant; InputError with every mistake if it or the path is bad."""
+    from psa_casadi.cli.inputs import Given
+
+    given, wanted = Given(), None
+    given.outputs({"--figure": figure}, [])
+    if name is None and figure is not None:
+        given.add(
+            "--figure draws one effect and none is named; say which, as in"
+            f" `psa effects {names[0]} --figure {figure}`."
+        )
+    if name is not None:
+        wanted = name.strip().lower().replace("-", "_").replace(" ", "_")
+        if wanted not in names:
+            near = difflib.get_close_matches(wanted, names, n=3, cutoff=0.4)
+            meant = (
+                f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names)}."
+            )
+            given.add(f"There is no effect named '{name}'; {meant}")
+    given.check()
+    return wanted
+
+
+def _draw(name: str, path: Path) -> None:
+    from psa_casadi.diagnosis.signature import signature
+    from psa_casadi.effects import EFFECTS
+    from psa_casadi.report.signature_figure import save_signature
+
+    save_signature(EFFECTS[name], signature(EFFECTS[name]), path)

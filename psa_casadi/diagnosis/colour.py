@@ -1,10 +1,11 @@
-"""The noise of a record: its level and its colour, as a first-order autoregression."""
+"""The noise of the records: its level and its colour, as an autoregression for each record."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -13,44 +14,82 @@ _WHITE = 0.05
 _LARGEST = 0.95
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Colour:
-    """Noise e_k = correlation e_(k-1) + w_k, with w white of standard deviation `level` [m].
+    """Noise e_k = a_1 e_(k-1) + ... + w_k, with w white of standard deviation `level` [m].
 
-    An autoregression of first order can describe the noise of a sensor with a filter, but neither a
-    tone nor a slow misfit on top of white noise: those remain visible after whitening.
+    `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
+    records' numbers of samples.
     """
 
-    correlation: float
+    autoregression: tuple[FloatArray, ...]
     level: float
     lengths: tuple[int, ...]
 
+    @property
+    def inflation(self) -> float:
+        """Factor by which the colour inflates the variance of a mean, over all records.
+
+        The noise's density at frequency 0 over its mean density: (1 + r)/(1 - r) of a first-order
+        autoregression.
+        """
+        each = [_at_rest(a) / _power(a) for a in self.autoregression]
+        return max(1.0, float(np.average(each, weights=self.lengths)))
+
     def whiten(self, signal: FloatArray) -> FloatArray:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
-        if not self.correlation:
+        if not any(a.size for a in self.autoregression):
             return signal
         white = signal.copy()
         first = 0
-        for length in self.lengths:
+        for a, length in zip(self.autoregression, self.lengths, strict=True):
             part = signal[first : first + length]
-            white[first + 1 : first + length] = part[1:] - self.correlation * part[:-1]
-            white[first] = part[0] * np.sqrt(1.0 - self.correlation**2)
+            if a.size and length > a.size:
+                filtered = np.asarray(lfilter(np.concatenate([[1.0], -a]), [1.0], part, axis=0))
+                filtered[: a.size] = part[: a.size] / np.sqrt(_power(a))
+                white[first : first + length] = filtered
             first += length
         return white
 
 
-def colour_of(remainder: FloatArray, lengths: Sequence[int]) -> Colour:
-    """Estimate colour and level from what no model and no candidate explains."""
+def colour_of(
+    remainder: FloatArray,
+    lengths: Sequence[int],
+    known: Sequence[FloatArray | None] | None = None,
+) -> Colour:
+    """Return colour and level of what no model and no candidate explains.
+
+    `known` holds the autoregression of records whose noise is known without a model (repeats,
+    holds). The others share one of first order, estimated from the remainder: it can describe the
+    noise of a sensor with a filter, but neither a tone nor a slow misfit on top of white noise, so
+    that those remain visible after whitening.
+    """
+    given = list(known or [None] * len(lengths))
     top = bottom = 0.0
     first = 0
-    for length in lengths:
+    for length, own in zip(lengths, given, strict=True):
         part = remainder[first : first + length]
-        top += float(part[1:] @ part[:-1])
-        bottom += float(part @ part)
+        if own is None:
+            top += float(part[1:] @ part[:-1])
+            bottom += float(part @ part)
         first += length
     correlation = float(np.clip(top / bottom, 0.0, _LARGEST)) if bottom > 0 else 0.0
-    if correlation < _WHITE:
-        correlation = 0.0
-    colour = Colour(correlation, 1.0, tuple(lengths))
+    shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
+    each = tuple(shared if own is None else own for own in given)
+    colour = Colour(each, 1.0, tuple(lengths))
     level = float(np.sqrt(np.mean(colour.whiten(remainder) ** 2)))
-    return Colour(correlation, max(level, 1e-15), tuple(lengths))
+    return Colour(each, max(level, 1e-15), tuple(lengths))
+
+
+def _at_rest(a: FloatArray) -> float:
+    """Density of the noise at frequency 0 over that of w."""
+    return float(1.0 / max((1.0 - np.sum(a)) ** 2, 1e-6))
+
+
+def _power(a: FloatArray) -> float:
+    """Variance of the noise over that of w: the sum of squares of its impulse response."""
+    if not a.size:
+        return 1.0
+    impulse = np.zeros(4096)
+    impulse[0] = 1.0
+    return float(np.sum(np.asarray(lfilter([1.0], np.concatenate([[1.0], -a]), impulse)) ** 2))

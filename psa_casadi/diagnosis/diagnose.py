@@ -1,64 +1,44 @@
 """Diagnose: fit the base, screen the effects, fit the leading ones, choose, repeat, judge."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.backward import without_needless
 from psa_casadi.diagnosis.errors_of import held_out_rms
-from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
-from psa_casadi.diagnosis.probes import directions
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.screening import Screening, screen
-from psa_casadi.diagnosis.selection import (
-    FURTHER,
-    NOTICEABLE,
-    Extension,
-    choose,
-    extend,
-    extend_afresh,
-    leading,
-    polish,
+from psa_casadi.diagnosis.retries import (
+    BETTER_BASE,
+    from_band,
+    from_extension,
+    from_mode,
+    from_resonances,
 )
-from psa_casadi.diagnosis.verdict import conclude
+from psa_casadi.diagnosis.rounds import Round, examine, search_cause
+from psa_casadi.diagnosis.selection import OF_FIRST
+from psa_casadi.diagnosis.verdict import PARTLY, conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment, split, whole
 from psa_casadi.experiment.suspects import cleaned
 from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
+from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.refitting import Progress, refit
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import starting_model
 from psa_casadi.model.compose import Model
 
-FloatArray = npt.NDArray[np.float64]
-
 #: Most causes that are named for one set of records.
 MOST_CAUSES = 3
-#: An extension whose residual is within this factor of the noise needs no further starts.
-SETTLED = 1.05
-#: How many extensions are fitted to the end, if their evidence is this share of the best one's.
-FINALISTS, RUNNER_UP = 2, 0.8
-#: Share of the residual's power above the noise from which a further cause is looked for.
-REMAINDER = 0.35
-#: A base fit retried from the extension's parameters counts if its rms falls to this share.
-BETTER_BASE = 0.95
-
-
-@dataclass(eq=False)
-class Round:
-    """One step of the search: the model so far, its screening and test, the extensions tried."""
-
-    fit: Fit
-    predicted: tuple[FloatArray, ...]
-    screening: Screening
-    test: Omnibus
-    extensions: list[Extension] = field(default_factory=list)
-    chosen: Extension | None = None
-    rivals: list[Extension] = field(default_factory=list)
+#: A further cause must promise this share of what it has to remove, linearly estimated, unless
+#: this share of the residual's power is still above the noise.
+PROMISE, REMAINDER = 0.5, 0.35
+#: A better base replaces an effect if it leaves at most this much more of the residual.
+AS_GOOD = 1.005
+#: Sampling interval [s] below which a stack may ring within the record's band.
+FAST = 5e-4
 
 
 def diagnose(
@@ -83,11 +63,18 @@ def diagnose(
         c.name for c in table if c.gain is not None
     )
     there = {c.name for c in start.components}
-    table = [effect for effect in table if set(effect.needs) <= there]
+    table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
     base = fit_base(start, experiments, progress=progress)
     rounds = _search(base, experiments, table, progress)
     progress("judging")
     return conclude(rounds, experiments, table, stiffness is not None)
+
+
+def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:
+    """Whether a record has the columns that an effect follows (a temperature)."""
+    return all(
+        any(getattr(e.record, i.name, None) is not None for e in experiments) for i in effect.inputs
+    )
 
 
 def _experiments(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Experiment, ...]:
@@ -104,26 +91,105 @@ def _experiments(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[
 def _search(
     base: Fit, experiments: Sequence[Experiment], table: Sequence[Component], progress: Progress
 ) -> list[Round]:
-    """Forward selection: add the best effect until the rest is noise or nothing helps."""
-    rounds = [_examine(base, tuple(base.predicted(experiments)), experiments, table, progress)]
-    retried = False
+    """Forward selection: add the best effect until nothing is seen or nothing helps."""
+    rounds = _forward(base, experiments, table, progress)
+    if _open(rounds):
+        better = from_resonances(rounds[0].fit, experiments, progress)
+        if better is not None and better.rms < BETTER_BASE * rounds[0].fit.rms:
+            rounds = _forward(better, experiments, table, progress)
+    if _open(rounds):
+        resonant = from_band(rounds[0].fit, rounds[-1].fit, experiments, progress)
+        if resonant is not None:
+            other = _forward(resonant, experiments, table, progress)
+            if other[-1].fit.rms < rounds[-1].fit.rms:
+                rounds = other
+    rounds = without_needless(rounds, experiments, progress)
+    return _settle(rounds, experiments, progress)
+
+
+def _open(rounds: Sequence[Round]) -> bool:
+    """Whether structure remains and the causes found explain less than a partly one must."""
+    first, last = rounds[0].fit.rms ** 2, rounds[-1].fit.rms ** 2
+    excess = first - high_frequency_noise(rounds[-1].fit.residuals) ** 2
+    return rounds[-1].test.alarm and first - last < PARTLY * excess
+
+
+def _forward(
+    base: Fit, experiments: Sequence[Experiment], table: Sequence[Component], progress: Progress
+) -> list[Round]:
+    """Make sure of the base where something is missing, then add causes."""
+    first = _round(base, experiments, table, progress)
+    fast = min(e.record.sample_time for e in experiments) < FAST
+    if fast and first.test.alarm:
+        resonant = from_resonances(first.fit, experiments, progress)
+        if resonant is not None and resonant.rms < BETTER_BASE * first.fit.rms:
+            first = _round(resonant, experiments, table, progress)
+    return _causes(first, experiments, table, progress, retry=True)
+
+
+def _causes(
+    start: Round,
+    experiments: Sequence[Experiment],
+    table: Sequence[Component],
+    progress: Progress,
+    *,
+    retry: bool,
+) -> list[Round]:
+    """Add the best effect until nothing is seen or nothing helps.
+
+    With `retry` the base is fitted again from where an effect led; that base replaces the effect,
+    unless it leaves structure that the effect would have explained.
+    """
+    rounds, tried = [start], set[str]()
     while len(rounds) <= MOST_CAUSES and _worth_searching(rounds):
         current = rounds[-1]
-        _extend(current, len(rounds), experiments, progress)
-        if current.chosen is None:
+        first = rounds[0].chosen if len(rounds) > 1 else None
+        search_cause(current, len(rounds), experiments, progress, first)
+        chosen = current.chosen
+        if chosen is None:
             break
-        if len(rounds) == 1 and not retried:
-            retried = True
-            better = _retry_base(current, experiments, progress)
-            if better is not None:
-                predicted = tuple(better.predicted(experiments))
-                rounds = [_examine(better, predicted, experiments, table, progress)]
-                continue
-        left = [c for c in table if c not in current.chosen.fit.model.components]
+        better = _retried(rounds, tried, experiments, progress) if retry else None
+        if better is not None:
+            again = _round(better, experiments, table, progress)
+            other = _causes(again, experiments, table, progress, retry=False)
+            if not other[-1].test.alarm or other[-1].fit.rms < AS_GOOD * chosen.fit.rms:
+                return other
+        left = [c for c in table if c not in chosen.fit.model.components]
         rounds.append(
-            _examine(current.chosen.fit, current.chosen.predicted, experiments, left, progress)
+            examine(chosen.fit, chosen.predicted, experiments, left, progress, current.trials)
         )
-    return _settle(rounds, experiments, progress)
+    return rounds
+
+
+def _retried(
+    rounds: Sequence[Round],
+    tried: set[str],
+    experiments: Sequence[Experiment],
+    progress: Progress,
+) -> Fit | None:
+    """Fit the base from where the last round led, once in each way; None if it is not better."""
+    base, current = rounds[0].fit, rounds[-1]
+    chosen = current.chosen
+    if chosen is None:
+        return None
+    rings = chosen.effect.tone is not None and chosen.effect.belongs_to == "plant"
+    if rings and "mode" not in tried:
+        tried.add("mode")
+        own = from_mode(base, current.fit, chosen, experiments, progress)
+        if own is not None:
+            return own
+    if len(rounds) > 1 or "extension" in tried:
+        return None
+    tried.add("extension")
+    progress("base fit, from the extension's parameters")
+    again = from_extension(base, chosen, experiments)
+    return again if again.rms < BETTER_BASE * base.rms else None
+
+
+def _round(
+    base: Fit, experiments: Sequence[Experiment], table: Sequence[Component], progress: Progress
+) -> Round:
+    return examine(base, tuple(base.predicted(experiments)), experiments, table, progress)
 
 
 def _settle(
@@ -143,73 +209,15 @@ def _settle(
 
 
 def _worth_searching(rounds: Sequence[Round]) -> bool:
-    """A direction above the threshold; after a first cause also a remainder beyond the noise."""
-    current = rounds[-1]
+    """Whether a direction is above the threshold.
+
+    For a further cause the test must alarm too, and much of the residual's power be above the noise
+    or the direction promise a share of what the first one removed.
+    """
+    current, first = rounds[-1], rounds[0].chosen
     best = max((s.decrease for s in current.screening.scores), default=0.0)
-    if best < current.screening.threshold:
-        return False
-    return len(rounds) == 1 or (current.test.alarm and current.test.excess > REMAINDER)
-
-
-def _extend(
-    current: Round, number: int, experiments: Sequence[Experiment], progress: Progress
-) -> None:
-    """Fit the leading effects, the best ones to the end, and choose among them."""
-    inflation = correlation_inflation(current.fit.residuals) if number > 1 else 1.0
-    floor = high_frequency_noise(current.fit.residuals)
-    for name, scores in leading(current.screening):
-        progress(f"cause {number}: fitting {name}")
-        extension = extend(current.fit, experiments, scores, inflation)
-        if extension is not None:
-            current.extensions.append(extension)
-    current.extensions.sort(key=lambda e: -e.evidence)
-    lost = [k for k, e in enumerate(current.extensions) if k == 0 or e.evidence < 0]
-    for k in lost if current.extensions and current.extensions[0].fit.rms > SETTLED * floor else ():
-        progress(f"cause {number}: {current.extensions[k].effect.name} afresh")
-        again = extend_afresh(current.fit, experiments, current.extensions[k], inflation)
-        current.extensions[k] = again
-    current.extensions.sort(key=lambda e: -e.evidence)
-    for k, extension in enumerate(current.extensions[:FINALISTS]):
-        if extension.evidence > RUNNER_UP * current.extensions[0].evidence:
-            progress(f"cause {number}: {extension.effect.name} to the end")
-            current.extensions[k] = polish(current.fit, extension, experiments, inflation)
-    before = held_out_rms(experiments, current.predicted)
-    ranked = choose(
-        current.extensions,
-        experiments,
-        current.fit,
-        before,
-        floor,
-        NOTICEABLE if number == 1 else FURTHER,
-    )
-    if ranked:
-        current.chosen, current.rivals = ranked[0], ranked[1:]
-
-
-def _examine(
-    fit: Fit,
-    predicted: tuple[FloatArray, ...],
-    experiments: Sequence[Experiment],
-    table: Sequence[Component],
-    progress: Progress,
-) -> Round:
-    progress("screening effects")
-    lengths = [int(e.used.sum()) for e in experiments]
-    screening = screen(fit, directions(fit, experiments, table), lengths)
-    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
-    time = np.concatenate([e.record.time[e.used] for e in experiments])
-    floor = high_frequency_noise(fit.residuals)
-    test = omnibus(fit.residuals, voltage, time, screening.colour, floor)
-    return Round(fit, predicted, screening, test)
-
-
-def _retry_base(first: Round, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
-    """Fit the base once more from the best extension's parameters; return it if clearly better."""
-    if first.chosen is None:
-        return None
-    progress("base fit, from the extension's parameters")
-    names = first.fit.unknowns.names
-    values = {n: first.chosen.fit.model.values[n] for n in names}
-    moved = replace(first.fit, model=first.fit.model.with_values(values))
-    again = refit(moved, experiments, names)
-    return again if again.rms < BETTER_BASE * first.fit.rms else None
+    if best < current.screening.threshold or first is None:
+        return best >= current.screening.threshold
+    promised = best * current.screening.colour.level**2 / len(current.fit.residuals)
+    enough = current.test.excess > REMAINDER or promised > PROMISE * OF_FIRST * first.removed
+    return current.test.alarm and enough

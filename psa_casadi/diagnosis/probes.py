@@ -1,6 +1,8 @@
 """Trial directions: what each effect would add to the prediction at its trial values."""
 
+import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 
@@ -44,13 +46,18 @@ class Direction:
 def directions(
     fit: Fit, experiments: Sequence[Experiment], effects: Sequence[Component]
 ) -> list[Direction]:
-    """Return the directions of all effects over their probe values, at the fitted model."""
-    found = []
+    """Return the directions of all effects over their probe values, at the fitted model.
+
+    They are simulated side by side: the stepper does not hold Python's lock.
+    """
     peaks = residual_peaks(fit, experiments)
-    for effect in effects:
-        for values in _probe_values(effect, experiments, peaks):
-            found += list(_directions_at(fit, experiments, effect, values))
-    return found
+    tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
+
+    def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
+        return list(_directions_at(fit, experiments, *task))
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        return [d for found in pool.map(one, tasks) for d in found]
 
 
 def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
@@ -124,6 +131,8 @@ def _histories(
             y = measured(e.record)[e.used]
             cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
         variants.append(tuple(cycled))
+    if effect.trial_starts:
+        return [tuple({**k, **trial} for k in known) for trial in effect.trial_starts]
     return variants
 
 

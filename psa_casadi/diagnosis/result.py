@@ -8,6 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.diagnosis.misfit import Misfit
+from psa_casadi.diagnosis.noise_floor import NoiseFloor
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
 from psa_casadi.model.compose import Model
@@ -41,12 +43,17 @@ class Cause:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that was tried: share of the excess it explains, and its evidence over the base."""
+    """An effect that was tried: share of the excess it explains, and its evidence over the base.
+
+    `evidence` is ln of the Bayes factor, estimated from the screening where nothing was `fitted`;
+    `probability` that of being the cause, given that one effect of the table is.
+    """
 
     effect: str
     explained_share: float
     evidence: float
     fitted: bool
+    probability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -100,7 +107,9 @@ class Diagnosis:
     """A diagnosis: verdict, causes, the base and the extended model, errors, and what remains.
 
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` are the
-    predictions [m] of every record in full, in the order of `experiments`.
+    predictions [m] of every record in full, in the order of `experiments`. `noise` is the floor of
+    every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
+    records with enough samples.
     """
 
     verdict: Verdict
@@ -120,6 +129,9 @@ class Diagnosis:
     base: tuple[FloatArray, ...]
     extended: tuple[FloatArray, ...]
     model: Model
+    noise: tuple[NoiseFloor, ...] = ()
+    misfit: tuple[Misfit, ...] = ()
+    remainder: tuple[Misfit, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of DIAGNOSIS.json."""
@@ -138,6 +150,12 @@ class Diagnosis:
             "remaining": asdict(self.remaining),
             "next_experiment": asdict(self.next_experiment),
             "notes": list(self.notes),
+            "noise": [
+                {"record": n.record, "rms": n.level, "source": n.source, "sentence": n.sentence}
+                for n in self.noise
+            ],
+            "misfit": [_misfit(m) for m in self.misfit],
+            "remainder": [_misfit(m) for m in self.remainder],
             "records": [
                 {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments
             ],
@@ -146,3 +164,14 @@ class Diagnosis:
     def to_json(self) -> str:
         """Return the text of DIAGNOSIS.json."""
         return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _misfit(m: Misfit) -> dict[str, Any]:
+    """Return what is seen in one record's residual: shares of its power above the noise."""
+    return {
+        "record": m.record,
+        "rms": m.rms,
+        "excess": m.excess,
+        "views": {v.name: v.share for v in m.views},
+        "sentences": list(m.sentences),
+    }

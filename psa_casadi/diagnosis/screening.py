@@ -60,11 +60,20 @@ class Screening:
         return best
 
 
-def screen(fit: Fit, trials: Sequence[Direction], lengths: Sequence[int]) -> Screening:
-    """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples."""
+def screen(
+    fit: Fit,
+    trials: Sequence[Direction],
+    lengths: Sequence[int],
+    known: Sequence[FloatArray | None] | None = None,
+) -> Screening:
+    """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples.
+
+    `known` is the colour of the records' noise where it is known without a model.
+    """
     basis = _basis(fit.jacobian)
-    columns = np.column_stack([d.column for d in trials])
-    colour = colour_of(_remainder(fit.residuals, basis, columns), lengths)
+    none: FloatArray = np.zeros((len(fit.residuals), 0))
+    columns = np.hstack([none, *(d.column[:, None] for d in trials)])
+    colour = colour_of(_remainder(fit.residuals, basis, columns), lengths, known)
     white_basis = _basis(colour.whiten(fit.jacobian))
     residual = _project(colour.whiten(fit.residuals), white_basis)
     white = _project(colour.whiten(columns), white_basis)
@@ -89,6 +98,47 @@ def screen(fit: Fit, trials: Sequence[Direction], lengths: Sequence[int]) -> Scr
     return Screening(tuple(scores), _threshold(unit), colour)
 
 
+@dataclass(frozen=True, eq=False)
+class Copy:
+    """How well an effect can copy what another one adds.
+
+    `share` of the contribution's power, with all of the effect's directions; the `direction` that
+    does best alone, and the `gain` at which it does.
+    """
+
+    share: float
+    direction: Direction
+    gain: float
+
+
+def copies(
+    fit: Fit, added: FloatArray, trials: Sequence[Direction], colour: Colour
+) -> tuple[float, dict[str, Copy]]:
+    """Return the power of a contribution over the noise's, and how each effect can copy it.
+
+    `added` (samples,) [m] is what another effect adds to the prediction. The fitted parameters are
+    projected out of it and of the trial directions.
+    """
+    basis = _basis(colour.whiten(fit.jacobian))
+    target = _project(colour.whiten(added), basis)
+    power = float(target @ target)
+    found: dict[str, Copy] = {}
+    for name in dict.fromkeys(d.effect.name for d in trials):
+        own = [d for d in trials if d.effect.name == name]
+        columns = np.column_stack([d.column for d in own])
+        free = _project(colour.whiten(columns), basis)
+        norms = np.linalg.norm(free, axis=0)
+        large = np.flatnonzero(norms > 1e-6 * np.linalg.norm(columns, axis=0))
+        if power <= 0 or not large.size:
+            continue
+        share = float(np.sum((_basis(free[:, large]).T @ target) ** 2)) / power
+        along = free[:, large].T @ target / norms[large]
+        best = int(np.argmax(np.abs(along)))
+        direction, norm = own[int(large[best])], float(norms[large[best]])
+        found[name] = Copy(share, direction, float(along[best]) / norm * direction.unit_gain)
+    return power / colour.level**2, found
+
+
 def _basis(columns: FloatArray) -> FloatArray:
     """Orthonormal basis of the columns' span, scaled columns first; tiny directions dropped."""
     norm = np.linalg.norm(columns, axis=0)
@@ -111,6 +161,8 @@ def _remainder(residual: FloatArray, basis: FloatArray, columns: FloatArray) -> 
 
 def _threshold(unit: FloatArray) -> float:
     """Quantile of the largest squared projection of white noise on the unit directions."""
+    if not unit.shape[1]:
+        return np.inf
     gram = unit.T @ unit
     values, vectors = np.linalg.eigh(gram)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))

@@ -7,8 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.errors_of import held_out_rms
-from psa_casadi.diagnosis.screening import Score, Screening
+from psa_casadi.diagnosis.evidence import evidence
+from psa_casadi.diagnosis.screening import Copy, Score, Screening
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.drive import among_harmonics
 from psa_casadi.experiment.split import Experiment
@@ -19,33 +21,40 @@ from psa_casadi.identification.starting import ordinary_values
 FloatArray = npt.NDArray[np.float64]
 
 #: How many effects are fitted fully in each round, and how many starts each gets.
-FULL_FITS = 3
+FULL_FITS = 4
 _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
-_QUICK, _AFRESH = 8, 25
+_QUICK, _COPY, _AFRESH = 8, 12, 25
 #: Tolerance of the stepper in quick fits, then of stepper and fit, and evaluations, to the end.
 _QUICK_RTOL = 1e-4
 _POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
-#: Evidence (in units of the log-likelihood) within which two effects cannot be told apart.
-MARGIN = 10.0
-#: Share of the excess power that an effect must remove to be added.
-WORTHWHILE = 0.25
-#: ... and the held-out rms must fall at least to this share: less is of no use to anybody.
-NOTICEABLE = 0.98
-#: ... and for a second or third cause to this share: small gains invite wrong names.
-FURTHER = 0.95
+#: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
+MARGIN = 3.0
+#: Share of the excess power that a first and a further effect must remove to be added.
+WORTHWHILE, FURTHER = 0.25, 0.5
+#: Gain in log-likelihood of the held-out samples that a first and a further effect must bring.
+HELD_OUT, HELD_OUT_FURTHER = 1.0, 4.0
+#: A further effect must remove this share of what the first one did: less may be the first one's
+#: form, which is not the true one.
+OF_FIRST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Extension:
-    """One more effect, fitted: its fit, evidence over the model before, held-out rms [m]."""
+    """One more effect, fitted: its fit, evidence over the model before, held-out rms [m].
+
+    `removed` is the power that it takes from the residual [m^2]; `final` says that the fit went on
+    to its end.
+    """
 
     effect: Component
     fit: Fit
     evidence: float
     holdout_rms: float
     predicted: tuple[FloatArray, ...]
+    removed: float
+    final: bool = False
 
 
 def leading(screening: Screening) -> list[tuple[str, list[Score]]]:
@@ -56,24 +65,26 @@ def leading(screening: Screening) -> list[tuple[str, list[Score]]]:
     top = next(iter(best.values())).decrease
     limit = max(screening.threshold, _WORTH * top)
     chosen = [name for name, score in best.items() if score.decrease >= limit][:FULL_FITS]
-    starts: dict[str, list[Score]] = {name: [] for name in chosen}
-    for score in screening.scores:
-        name = score.direction.effect.name
-        if name not in starts or len(starts[name]) >= _STARTS:
-            continue
-        known = [s.direction.values for s in starts[name]]
-        if score.decrease >= 0.3 * best[name].decrease and (
-            score.direction.values not in known or score.direction.finite
-        ):
-            starts[name].append(score)
-    return list(starts.items())
+    return [(name, starts_of(screening, name)) for name in chosen]
+
+
+def starts_of(screening: Screening, name: str) -> list[Score]:
+    """Return the best directions of one effect, from which its fits start."""
+    own = [s for s in screening.scores if s.direction.effect.name == name]
+    starts: list[Score] = []
+    for score in own:
+        known = [s.direction.values for s in starts]
+        new = score.direction.values not in known or score.direction.finite
+        if new and len(starts) < _STARTS and score.decrease >= 0.3 * own[0].decrease:
+            starts.append(score)
+    return starts
 
 
 _Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
 
 
 def extend(
-    before: Fit, experiments: Sequence[Experiment], scores: Sequence[Score], inflation: float
+    before: Fit, experiments: Sequence[Experiment], scores: Sequence[Score], colour: Colour
 ) -> Extension | None:
     """Fit quickly with one more effect from its best directions; None if every fit fails."""
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
@@ -81,12 +92,34 @@ def extend(
     return (
         None
         if quick is None
-        else _extension(before, quick, scores[0].direction.effect, experiments, inflation)
+        else _extension(before, quick, scores[0].direction.effect, experiments, colour)
     )
 
 
+def extend_like(
+    before: Fit,
+    best: Extension,
+    experiments: Sequence[Experiment],
+    copy: Copy,
+    screening: Screening,
+) -> Extension | None:
+    """Fit an effect from where the best one has led the base, with the gain that copies that one.
+
+    The base without either is bent to imitate them; beside the best one it is nearly right.
+    """
+    effect, direction = copy.direction.effect, copy.direction
+    values = best.fit.model.values
+    base = {n: values[n] for n in before.unknowns.names}
+    usable = copy.gain > 0 or not direction.one_sided
+    start = (direction.values, copy.gain if usable else direction.unit_gain, direction.memory)
+    quick = _quick(before, experiments, effect, [start], base, _COPY)
+    if quick is None:
+        return None
+    return _extension(before, quick, effect, experiments, screening.colour)
+
+
 def extend_afresh(
-    before: Fit, experiments: Sequence[Experiment], first: Extension, inflation: float
+    before: Fit, experiments: Sequence[Experiment], first: Extension, colour: Colour
 ) -> Extension:
     """Fit an effect again from an ordinary base and both signs of its gain; return the better.
 
@@ -95,7 +128,7 @@ def extend_afresh(
     """
     effect = first.effect
     gain = next(p for p in effect.parameters if p.name == effect.gain)
-    size = 2.5 * gain.typical({**before.model.values, gain.name: 0.0})
+    size = 2.5 * gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
     values = {
         n: first.fit.model.values[n] if isinstance(grid, str) else _declared(effect, n)
         for n, grid in effect.probe.items()
@@ -108,11 +141,11 @@ def extend_afresh(
     quick = _quick(before, experiments, effect, starts, ordinary, _AFRESH)
     if quick is None or quick.cost >= first.fit.cost:
         return first
-    return _extension(before, quick, effect, experiments, inflation)
+    return _extension(before, quick, effect, experiments, colour)
 
 
 def polish(
-    before: Fit, extension: Extension, experiments: Sequence[Experiment], inflation: float
+    before: Fit, extension: Extension, experiments: Sequence[Experiment], colour: Colour
 ) -> Extension:
     """Continue an extension's fit until it converges, loosely first, then at full tolerance."""
     current = extension.fit
@@ -130,7 +163,7 @@ def polish(
             )
         except PsaError:
             return extension
-    return _extension(before, current, extension.effect, experiments, inflation)
+    return _extension(before, current, extension.effect, experiments, colour, final=True)
 
 
 def _declared(effect: Component, name: str) -> float:
@@ -142,15 +175,19 @@ def _extension(
     found: Fit,
     effect: Component,
     experiments: Sequence[Experiment],
-    inflation: float,
+    colour: Colour,
+    *,
+    final: bool = False,
 ) -> Extension:
     predicted = tuple(found.predicted(experiments))
     return Extension(
         effect=effect,
         fit=found,
-        evidence=evidence(before, found, inflation),
+        evidence=evidence(before, found, colour),
         holdout_rms=held_out_rms(experiments, predicted),
         predicted=predicted,
+        removed=before.rms**2 - found.rms**2,
+        final=final,
     )
 
 
@@ -175,16 +212,6 @@ def _quick(
         last = _fit_from(before, experiments, effect, nested, {}, 3 * _QUICK)
         found += [last] if last is not None else []
     return min(found, key=lambda f: f.cost) if found else None
-
-
-def evidence(before: Fit, after: Fit, inflation: float) -> float:
-    """Return the gain in log-likelihood less Schwarz' penalty for the unknowns added.
-
-    n/2 ln(S_before/S_after) - k/2 ln n, n being divided by the inflation for correlated noise.
-    """
-    n = len(before.residuals) / inflation
-    added = after.unknowns.size - before.unknowns.size
-    return 0.5 * n * float(np.log(before.cost / after.cost)) - 0.5 * added * float(np.log(n))
 
 
 def _fit_from(
@@ -223,23 +250,27 @@ def choose(
     before: Fit,
     before_holdout: float,
     floor: float,
-    noticeable: float,
+    colour: Colour,
+    first: Extension | None,
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
-    Worth having: evidence; the effect in character; at least `WORTHWHILE` of the training
-    residual's power above the noise `floor` removed; and held-out data predicted better, to the
-    share `noticeable`. The order is that of the evidence; within the margin the better prediction
-    leads.
+    Worth having: evidence; the effect in character; a share of the training residual's power above
+    the noise `floor` removed; and held-out data predicted better. A further cause, beside the
+    `first`, is asked for more of both. The order is that of the evidence; within the margin the
+    better prediction leads.
     """
     excess = before.rms**2 - floor**2
+    share, needed = (WORTHWHILE, HELD_OUT) if first is None else (FURTHER, HELD_OUT_FURTHER)
+    held = sum(int(e.held_out.sum()) for e in experiments) / colour.inflation
     good = [
         e
         for e in extensions
         if e.evidence > 0
         and not out_of_character(e, experiments)
-        and before.rms**2 - e.fit.rms**2 > WORTHWHILE * excess
-        and e.holdout_rms < noticeable * before_holdout
+        and e.removed > share * excess
+        and (first is None or e.removed > OF_FIRST * first.removed)
+        and held * np.log(before_holdout / max(e.holdout_rms, 1e-300)) > needed
     ]
     good.sort(key=lambda e: -e.evidence)
     close = [e for e in good if good[0].evidence - e.evidence < MARGIN]

@@ -1,12 +1,15 @@
 """From the rounds of the search to verdict, confidence, blind spots and what to do next."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.errors_of import errors_of, gain_of, held_out_rms
+from psa_casadi.diagnosis.evidence import credible_set
+from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
+from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
@@ -17,27 +20,25 @@ from psa_casadi.diagnosis.result import (
     Remaining,
     Verdict,
 )
-from psa_casadi.diagnosis.selection import MARGIN, Extension
+from psa_casadi.diagnosis.rounds import Round
+from psa_casadi.diagnosis.selection import Extension
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
-from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
-from psa_casadi.variables import nominal_value
+from psa_casadi.identification.noise import high_frequency_noise
+from psa_casadi.identification.prediction import measured
 
-if TYPE_CHECKING:
-    from psa_casadi.diagnosis.diagnose import Round
+FloatArray = npt.NDArray[np.float64]
 
 #: Share of the held-out excess error that a closest known cause must remove.
 PARTLY = 0.8
-#: A second effect within this factor of the winner's held-out rms is as good on held-out data.
-_AS_GOOD = 1.02
-#: A cause that removes less than this share of what was left is named with less confidence.
-_CLEAR = 0.5
+#: The set of effects that cannot be told apart holds the cause with this probability.
+CREDIBLE = 0.95
 
 
 def conclude(
-    rounds: Sequence["Round"],
+    rounds: Sequence[Round],
     experiments: Sequence[Experiment],
     table: Sequence[Component],
     stiffness_given: bool,
@@ -45,7 +46,9 @@ def conclude(
     """Judge the rounds of a search and return the diagnosis."""
     first, last = rounds[0], rounds[-1]
     chosen = [r for r in rounds if r.chosen is not None]
-    floor = high_frequency_noise(last.fit.residuals)
+    errors = _whole_residuals(experiments, last.predicted)
+    noise = noise_floor([e.record for e in experiments], errors)
+    floor = _pooled(noise, errors)
     share = _explained_share(experiments, first, last, floor)
     missing = first.test.alarm or first.chosen is not None
     verdict: Verdict
@@ -63,13 +66,19 @@ def conclude(
     final = last if named else first
     found = determinacy(final.fit, experiments)
     causes = tuple(
-        _cause(r, last.fit, found, share, _explained_share(experiments, r, after, floor))
+        _cause(
+            r,
+            last.fit,
+            found,
+            _explained_share(experiments, r, after, floor),
+            partly=verdict == "partly_explained",
+        )
         for r, after in zip(named, rounds[1:], strict=False)
     )
     return Diagnosis(
         verdict=verdict,
         causes=causes,
-        candidates=_candidates(first, floor),
+        candidates=_candidates(first, floor, named=bool(named)),
         noise_floor_rms_m=floor,
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
@@ -89,11 +98,47 @@ def conclude(
             [e.record for e in experiments],
             stiffness_given,
         ),
+        noise=noise,
+        misfit=_misfits(experiments, first.predicted, noise),
+        remainder=_misfits(experiments, final.predicted, noise),
+    )
+
+
+def _whole_residuals(
+    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return measured minus predicted [m] of every record, nan where nothing was measured."""
+    return [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
+
+
+def _pooled(noise: Sequence[NoiseFloor], errors: Sequence[FloatArray]) -> float:
+    """Return the rms of the noise over all records [m].
+
+    Where no voltage was repeated that of the residual's fast differences counts: a hold may ring.
+    """
+    counts = [np.count_nonzero(np.isfinite(e)) for e in errors]
+    powers = [
+        n.level**2 if n.source == "repeats" else high_frequency_noise(e[np.isfinite(e)]) ** 2
+        for n, e in zip(noise, errors, strict=True)
+    ]
+    return float(np.sqrt(np.average(powers, weights=counts)))
+
+
+def _misfits(
+    experiments: Sequence[Experiment],
+    predicted: Sequence[FloatArray],
+    noise: Sequence[NoiseFloor],
+) -> tuple[Misfit, ...]:
+    errors = _whole_residuals(experiments, predicted)
+    return tuple(
+        misfit(e.record, error, floor)
+        for e, error, floor in zip(experiments, errors, noise, strict=True)
+        if np.count_nonzero(np.isfinite(error)) >= FEWEST
     )
 
 
 def _explained_share(
-    experiments: Sequence[Experiment], first: "Round", last: "Round", floor: float
+    experiments: Sequence[Experiment], first: Round, last: Round, floor: float
 ) -> float:
     """Share of the held-out excess power that the extension removes, between 0 and 1."""
     before = held_out_rms(experiments, first.predicted)
@@ -102,21 +147,19 @@ def _explained_share(
     return float(np.clip((before**2 - after**2) / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
 
-def _told_from(r: "Round") -> tuple[str, ...]:
-    """Rivals whose evidence and held-out prediction are as good as the chosen effect's."""
+def _told_from(r: Round) -> tuple[str, ...]:
+    """Effects that may as well be the cause: with the chosen one, the credible set."""
     if r.chosen is None:
         return ()
-    chosen = r.chosen
-    return tuple(
-        rival.effect.name
-        for rival in r.rivals
-        if abs(chosen.evidence - rival.evidence) < MARGIN
-        and rival.holdout_rms < _AS_GOOD * chosen.holdout_rms
-    )
+    within = credible_set(r.probability, CREDIBLE)
+    return tuple(name for name in within if name != r.chosen.effect.name)
 
 
-def _cause(r: "Round", final: Fit, found: Determinacy, share: float, own: float) -> Cause:
-    """State a cause: `share` is what all causes explain, `own` what this one did of its round's."""
+def _cause(r: Round, final: Fit, found: Determinacy, own: float, *, partly: bool) -> Cause:
+    """State a cause; `own` is the share that it explains of what was left before it.
+
+    The confidence is the probability of the effect, times that share where structure remains.
+    """
     chosen: Extension = r.chosen  # type: ignore[assignment]
     estimates = {
         p.name: Estimate(
@@ -127,35 +170,43 @@ def _cause(r: "Round", final: Fit, found: Determinacy, share: float, own: float)
         for p in chosen.effect.parameters
         if p.name in found.intervals
     }
-    inflation = correlation_inflation(chosen.fit.residuals)
-    weights = [np.exp(min(0.0, (e.evidence - chosen.evidence) / inflation)) for e in r.rivals]
+    probability = r.probability[chosen.effect.name] * (own if partly else 1.0)
     return Cause(
         effect=chosen.effect.name,
         belongs_to=chosen.effect.belongs_to,
-        confidence=float(min(0.99, share) * min(1.0, own / _CLEAR) / (1.0 + sum(weights))),
+        confidence=float(min(0.99, probability)),
         parameters=estimates,
         cannot_be_told_from=_told_from(r),
         explained_share=own,
     )
 
 
-def _candidates(first: "Round", floor: float) -> tuple[Candidate, ...]:
-    """Every effect tried, with its share of the training excess; estimated if not fitted."""
-    base = float(np.sum(first.fit.residuals**2))
-    excess = max(base - len(first.fit.residuals) * floor**2, 1e-300)
+def _candidates(first: Round, floor: float, *, named: bool) -> tuple[Candidate, ...]:
+    """Every effect tried, with its share of the training excess; estimated if not fitted.
+
+    Where nothing is named no effect of the table has a probability.
+    """
+    base = float(np.mean(first.fit.residuals**2))
+    excess = max(base - floor**2, 1e-300)
     fitted = {e.effect.name: e for e in first.extensions}
     rows = []
     for name, score in first.screening.best_by_effect().items():
-        if name in fitted:
-            gone = base - float(np.sum(fitted[name].fit.residuals ** 2))
-            rows.append(Candidate(name, min(1.0, gone / excess), fitted[name].evidence, True))
-        else:
-            gone = score.decrease * first.screening.colour.level**2
-            rows.append(Candidate(name, min(1.0, gone / excess), 0.5 * score.decrease, False))
+        known = fitted.get(name)
+        gone = score.decrease * first.screening.colour.level**2 / len(first.fit.residuals)
+        gone = gone if known is None else known.removed
+        rows.append(
+            Candidate(
+                effect=name,
+                explained_share=float(np.clip(gone / excess, 0.0, 1.0)),
+                evidence=first.evidence[name],
+                fitted=known is not None,
+                probability=first.probability.get(name, 0.0) if named else 0.0,
+            )
+        )
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 
 
-def _blind_spots(final: "Round", table: Sequence[Component]) -> tuple[BlindSpot, ...]:
+def _blind_spots(final: Round, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
     """Effects whose smallest detectable gain on these records exceeds their ordinary size."""
     spots = []
     present = {c.name for c in final.fit.model.components}
@@ -164,24 +215,26 @@ def _blind_spots(final: "Round", table: Sequence[Component]) -> tuple[BlindSpot,
             continue
         scores = [s for s in final.screening.scores if s.direction.effect is effect]
         gain = next(p for p in effect.parameters if p.name == effect.gain)
-        practical = nominal_value(gain.scale or 1.0, final.fit.model.values)
+        extended = final.fit.model.with_effect(effect, {gain.name: 0.0})
+        practical = gain.typical(extended.values)
         factor = np.sqrt(final.screening.threshold)
         smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
         if smallest > practical:
-            shown = f"{smallest:.3g} {gain.unit}" if np.isfinite(smallest) else "nothing finite"
+            unit = "" if gain.unit == "1" else f" {gain.unit}"
+            seen = f"only from {smallest:.3g}{unit} on" if np.isfinite(smallest) else "at no size"
             spots.append(
                 BlindSpot(
                     effect.name,
                     float(min(smallest, 1e300)),
                     gain.unit,
-                    f"These records show {effect.name} only from {shown} on, while {practical:.3g}"
-                    f" {gain.unit} is an ordinary size.",
+                    f"These records show {effect.name} {seen} ({gain.name}), while"
+                    f" {practical:.3g}{unit} is an ordinary size.",
                 )
             )
     return tuple(spots)
 
 
-def _where(r: "Round") -> str:
+def _where(r: Round) -> str:
     if r.test.alarm:
         return f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
     return "What remains cannot be told from noise."

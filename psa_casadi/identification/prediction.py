@@ -13,6 +13,7 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.unknowns import Unknowns
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import (
     initial_slope,
     memory_names,
@@ -43,15 +44,6 @@ def measured(record: Record) -> FloatArray:
     return record.displacement
 
 
-def inputs_of(model: Model, record: Record, stop: int) -> FloatArray:
-    """Return the input samples (stop, nu) of a record."""
-    u = np.zeros((stop, len(model.input_names)))
-    u[:, model.input_names.index("voltage")] = record.voltage[:stop]
-    if record.load_force is not None:
-        u[:, model.input_names.index("load_force")] = record.load_force[:stop]
-    return u
-
-
 def predict_record(
     model: Model,
     record: Record,
@@ -64,10 +56,10 @@ def predict_record(
     """Return displacement (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
 
     `start` holds deviations of the initial states from where the first inputs and their rates put
-    them, in the states' units.
+    them, in the states' units. Time counts from the record's first sample.
     """
     names = model.state_names
-    t, u = record.time[:stop], inputs_of(model, record, stop)
+    t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
     rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
     memories = memory_names(model.structure)
     found = start_state(
@@ -102,7 +94,7 @@ def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
     gain |v(t+T) - 2 v(t) + v(t-T)| > 3 noise. Sizes are what a steady motion at the record's rms
     rate changes, in the states' units. Empty for a record that starts at rest or changes slowly.
     """
-    u = inputs_of(model, record, record.n)
+    u = record_inputs(model, record, record.n)
     v, column = record.voltage, model.input_names.index("voltage")
     settling = settling_time(model)
     lag = int(settling / record.sample_time)

@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
 from psa_casadi.identification.identify import Identification
 from psa_casadi.report.grades import DEGREES, WEAK_ERROR, Degree, Grade
-from psa_casadi.report.phrases import number, percent, plain
+from psa_casadi.report.phrases import number, percent, plain, probability_text
 from psa_casadi.report.series import BASE_COLOUR, EXTENDED_COLOUR, NOISE_COLOUR, bar_colour
 from psa_casadi.report.theme import (
     AXIS,
@@ -133,10 +133,11 @@ def evidence_plot(d: Diagnosis) -> Plot:
     # the figures stand to the right of bar and zero, clear of the names
     plot.add_scatter(
         x=[max(v, 0.0) for v in values], y=names, mode="text", textposition="middle right",
-        text=[f" {c.evidence:,.0f}; {_share(c)}" for c in rows], cliponaxis=False, hoverinfo="skip",
+        text=[f" {c.evidence:,.0f}; {_figure(c, d)}" for c in rows], cliponaxis=False,
+        hoverinfo="skip",
     )  # fmt: skip
     largest = max([abs(v) for v in values], default=1.0) or 1.0
-    styled(plot, 110 + 40 * len(rows))
+    styled(plot, 110 + 30 * len(rows))
     plot.update_layout(margin={"l": 10, "r": 8, "t": 16, "b": 44})
     plot.update_xaxes(
         title_text="evidence [ln units], compressed",
@@ -148,6 +149,9 @@ def evidence_plot(d: Diagnosis) -> Plot:
     return plot.update_yaxes(showgrid=False, ticks="", automargin=True)
 
 
-def _share(candidate: Candidate) -> str:
+def _figure(candidate: Candidate, d: Diagnosis) -> str:
+    """Return the probability of an effect; where nothing is named, the share it explains."""
+    if d.causes:
+        return probability_text(candidate.probability)
     share = candidate.explained_share
     return percent(share) if share >= 0 else "fits worse"

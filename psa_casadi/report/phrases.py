@@ -1,12 +1,15 @@
 """Numbers and findings in words: the sentences that every report shares."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.units import convert
+
+_MICRO = re.compile(r"(?<=\d) um\b")
 
 #: What a record may be: measured on a device, or computed.
 ORIGINS = ("measured", "synthetic")
@@ -58,6 +61,18 @@ def number(value: float, digits: int = 3) -> str:
 def percent(share: float) -> str:
     """Return a share as a percentage, such as "97 %"."""
     return f"{100.0 * share:.0f} %"
+
+
+def micro(sentence: str) -> str:
+    """Return a sentence with "um" after a number written as "µm", as the pages write it."""
+    return _MICRO.sub(" µm", sentence)
+
+
+def probability_text(probability: float) -> str:
+    """Return a probability as a percentage that is neither 0 nor 100."""
+    if probability < 0.005:
+        return "< 1 %"
+    return percent(probability) if probability < 0.995 else "> 99 %"
 
 
 def share_text(candidate: Candidate) -> str:

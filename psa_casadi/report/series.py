@@ -76,11 +76,12 @@ class Series:
 def series_of(d: Diagnosis) -> tuple[Series, ...]:
     """Return the records of a diagnosis with the base and, if something was added, the extended."""
     rows = []
-    for e, base, extended in zip(d.experiments, d.base, d.extended, strict=True):
+    levels = [n.level for n in d.noise] or [d.noise_floor_rms_m] * len(d.experiments)
+    for e, base, extended, noise in zip(d.experiments, d.base, d.extended, levels, strict=True):
         curves = [Curve("base model", BASE_COLOUR, base)]
         if added(d):
             curves.append(Curve("extended model", EXTENDED_COLOUR, extended))
-        rows.append(_series(e, curves, d.noise_floor_rms_m))
+        rows.append(_series(e, curves, noise))
     return tuple(rows)
 
 

@@ -4,7 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
+from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.export.check import CheckReport, CheckRow
 from psa_casadi.identification.identify import Identification
@@ -18,6 +19,7 @@ from psa_casadi.report.phrases import (
     interval_text,
     number,
     plain,
+    probability_text,
     share_text,
     shown_in,
     with_unit,
@@ -72,9 +74,14 @@ def _status(model: Model, name: str, found: Identification | None) -> str:
 
 
 def candidate_table(d: Diagnosis) -> Table:
-    """Return every effect that was tried with evidence and the share of the excess explained."""
-    rows = [(plain(c.effect), number(c.evidence), share_text(c)) for c in d.candidates]
-    return _table(("effect", "evidence over the base [ln]", "explains of the excess"), rows)
+    """Return every effect tried: evidence, share of the excess, and probability if one is named."""
+    head = ["effect", "evidence over the base [ln]", "explains of the excess"]
+    rows = [[plain(c.effect), number(c.evidence), share_text(c)] for c in d.candidates]
+    if added(d):
+        head.append("probability")
+        for row, c in zip(rows, d.candidates, strict=True):
+            row.append(probability_text(c.probability))
+    return _table(head, rows)
 
 
 def error_table(d: Diagnosis, unit: str, factor: float) -> Table:
@@ -141,10 +148,24 @@ def record_table(experiments: Sequence[Experiment], origin: str) -> Table:
     )
 
 
+def blindest(d: Diagnosis) -> tuple[BlindSpot, ...]:
+    """Return the blind spots, the largest detectable gain over its ordinary size first."""
+
+    def excess(spot: BlindSpot) -> float:
+        effect = EFFECTS.get(spot.effect)
+        if effect is None or effect.gain is None:
+            return 0.0
+        extended = d.model.with_effect(effect)
+        ordinary = extended.parameter(effect.gain).typical({**extended.values, effect.gain: 0.0})
+        return spot.smallest_detectable_gain / ordinary
+
+    return tuple(sorted(d.blind_to, key=excess, reverse=True))
+
+
 def blind_table(d: Diagnosis) -> Table:
     """Return the effects of practical size that the records could not have shown."""
     rows = []
-    for b in d.blind_to:
+    for b in blindest(d):
         # a screening without any direction for the effect reports the largest number there is
         seen = b.smallest_detectable_gain < 1e100
         size = with_unit(number(b.smallest_detectable_gain), b.unit) if seen else "at no size"

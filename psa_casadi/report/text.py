@@ -1,14 +1,16 @@
 """The results as plain text for a terminal."""
 
+import re
 import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis, Errors
+from psa_casadi.diagnosis.result import Cause, Diagnosis, Errors
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.export.check import CheckReport
 from psa_casadi.identification.identify import Identification
+from psa_casadi.report.misfit_part import strongest_sentence
 from psa_casadi.report.phrases import (
     VERDICTS,
     Scale,
@@ -17,37 +19,76 @@ from psa_casadi.report.phrases import (
     length_scale,
     listing,
     number,
+    percent,
     plain,
+    probability_text,
     rest_sentence,
     verdict_sentence,
 )
-from psa_casadi.report.tables import blind_table, effect_parameter_table, parameter_table
+from psa_casadi.report.tables import blindest, effect_parameter_table, parameter_table
 
 _LABEL = 10
+#: Blind spots that a terminal names.
+_NAMES = 5
+#: Where the first sentence of a note ends; how a sentence on a view ends.
+_FIRST = re.compile(r"(?<=\.) ")
+_EXPLAINS = re.compile(r"; this(?: view)? explains (\d+ %) of the excess(?=\.)")
 
 
 def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
-    """Return a diagnosis in about ten lines: verdict, errors, cause, what remains, what to do."""
+    """Return a diagnosis in ten to fifteen lines: verdict with gain, errors, cause, rest."""
     scale = _scale(d.experiments, d.base_errors.holdout_rms_m)
-    lines = [
-        ("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}"),
+    lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
+    wrong = _EXPLAINS.sub(r" (\1 of the excess)", strongest_sentence(d.misfit))
+    lines += [("wrong", wrong)] if wrong else []
+    sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
+    lines += [
         ("records", _records(d.experiments, origin)),
-        ("noise", f"{scale.text(d.noise_floor_rms_m)} rms"),
+        ("noise", f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"),
         ("base", _errors(d.base_errors, scale)),
     ]
     if added(d):
         lines.append(("extended", _errors(d.extended_errors, scale)))
     for cause in d.causes:
-        lines.append(("cause", f"{plain(cause.effect)}: {'; '.join(cause_estimates(d, cause))}"))
-        if cause.cannot_be_told_from:
-            rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
-            lines.append(("", f"{plain(cause.effect)} cannot be told from {rivals} on these data"))
+        lines.append(("cause", _cause(d, cause)))
+        lines.append(("rivals", _rivals(d, cause)))
     lines.append(("remains", rest_sentence(d)))
-    blind = [f"{effect} (shows from {size})" for effect, size, _ in blind_table(d).rows]
-    lines.append(("blind to", "; ".join(blind) or "no effect of ordinary size in the table"))
+    lines.append(("blind to", _blind(d)))
     lines.append(("next", d.next_experiment.why))
-    lines.extend(("note", note) for note in d.notes)
+    lines.extend(("note", _FIRST.split(note, maxsplit=1)[0]) for note in d.notes)
     return "\n".join(_line(label, text, width) for label, text in lines)
+
+
+def _cause(d: Diagnosis, cause: Cause) -> str:
+    """Return a cause with place, confidence and parameters."""
+    sure = f"{cause.belongs_to}, {percent(cause.confidence)}"
+    return f"{plain(cause.effect)} ({sure}): {', '.join(cause_estimates(d, cause))}"
+
+
+def _rivals(d: Diagnosis, cause: Cause) -> str:
+    """Return what a cause cannot be told from, else the next most probable effect."""
+    known = {c.effect: c.probability for c in d.candidates}
+    if cause.cannot_be_told_from:
+        rivals = [
+            f"{plain(n)} ({probability_text(known[n])})" if known.get(n) else plain(n)
+            for n in cause.cannot_be_told_from
+        ]
+        return f"these data cannot tell it from {listing(rivals, 'or')}"
+    named = {c.effect for c in d.causes}
+    others = [(p, n) for n, p in known.items() if n not in named]
+    if not others:
+        return "none"
+    probability, name = max(others)
+    return f"none left open; the next is {plain(name)} ({probability_text(probability)})"
+
+
+def _blind(d: Diagnosis) -> str:
+    """Name the effects that the records could not have shown, those furthest out of sight first."""
+    names = [plain(b.effect) for b in blindest(d)]
+    if not names:
+        return "no effect of ordinary size in the table"
+    more = f" and {len(names) - _NAMES} more" if len(names) > _NAMES else ""
+    return f"{', '.join(names[:_NAMES])}{more}" if more else listing(names)
 
 
 def identification_text(
@@ -94,14 +135,15 @@ def check_sentence(report: CheckReport) -> str:
 
 
 def _line(label: str, text: str, width: int) -> str:
+    # a percent sign stays with its number
     return textwrap.fill(
-        text,
+        text.replace(" %", "\u00a0%"),
         max(width, 40),
         initial_indent=f"{label:<{_LABEL}} ",
         subsequent_indent=" " * (_LABEL + 1),
         break_long_words=False,
         break_on_hyphens=False,
-    )
+    ).replace("\u00a0", " ")
 
 
 def _scale(experiments: Iterable[Experiment], size: float) -> Scale:

@@ -38,6 +38,7 @@ def simulate(
     voltage: npt.ArrayLike,
     *,
     load_force: npt.ArrayLike | None = None,
+    temperature: npt.ArrayLike | None = None,
     memory: Mapping[str, float] | None = None,
     from_rest_at_zero: bool = False,
     rtol: float = 1e-6,
@@ -45,7 +46,9 @@ def simulate(
 ) -> Trajectory:
     """Simulate a model over samples of voltage [V] at strictly increasing times [s].
 
-    Between samples the voltage is linear (`hold="linear"`) or constant (`hold="zero"`). The model
+    `load_force` [N] and `temperature` [K] are samples of further inputs, each constant at its start
+    value where not given. Between samples the voltage is linear (`hold="linear"`) or constant
+    (`hold="zero"`). The model
     starts in the state that the first voltage and its rate imply, with `memory` deviations
     (see `start_state`), or with every state at 0 if `from_rest_at_zero`. `rtol` is the relative
     tolerance of the error-controlled stepper.
@@ -54,17 +57,30 @@ def simulate(
     """
     t, v = np.asarray(time, dtype=float), np.asarray(voltage, dtype=float)
     given = {"voltage": v}
-    if load_force is not None:
-        given["load_force"] = np.asarray(load_force, dtype=float)
+    for name, samples in (("load_force", load_force), ("temperature", temperature)):
+        if samples is not None:
+            given[name] = np.asarray(samples, dtype=float)
     _check(model, t, given)
-    u = np.zeros((len(t), len(model.input_names)))
-    for name, samples in given.items():
-        u[:, model.input_names.index(name)] = samples
+    u = input_samples(model, len(t), given)
     x0 = np.zeros(len(model.state_names))
     if not from_rest_at_zero:
         rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
         x0 = start_state(model, list(u[0]), rates, memory, float(t[0])).x
     return _trajectory(model, t, v, run(model, t, u, x0, rtol=rtol, hold=hold))
+
+
+def input_samples(model: Model, n: int, given: Mapping[str, FloatArray]) -> FloatArray:
+    """Return the samples (n, nu) of a model's inputs; those not given stay at their start value."""
+    u = np.tile([i.start for i in model.structure.inputs], (n, 1))
+    for name, samples in given.items():
+        u[:, model.input_names.index(name)] = samples[:n]
+    return u
+
+
+def record_inputs(model: Model, record: Record, n: int) -> FloatArray:
+    """Return the first n samples (n, nu) of a model's inputs that a record has columns for."""
+    columns = {name: getattr(record, name, None) for name in model.input_names}
+    return input_samples(model, n, {k: v for k, v in columns.items() if v is not None})
 
 
 def _check(model: Model, t: FloatArray, given: Mapping[str, FloatArray]) -> None:
@@ -87,10 +103,12 @@ def _check(model: Model, t: FloatArray, given: Mapping[str, FloatArray]) -> None
 def simulate_record(
     model: Model, record: Record, memory: Mapping[str, float] | None = None, rtol: float = 1e-6
 ) -> Trajectory:
-    """Simulate a model on the voltage, and the load force if there is one, of a record."""
-    return simulate(
-        model, record.time, record.voltage, load_force=record.load_force, memory=memory, rtol=rtol
-    )
+    """Simulate a model on the voltage, and the load and temperature if there are any, of a record.
+
+    Columns that are no input of the model have no influence.
+    """
+    extra = {n: getattr(record, n) for n in ("load_force", "temperature") if n in model.input_names}
+    return simulate(model, record.time, record.voltage, memory=memory, rtol=rtol, **extra)
 
 
 def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps) -> Trajectory:

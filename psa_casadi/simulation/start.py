@@ -75,11 +75,14 @@ def start_state(
 
 
 def settling_time(model: Model) -> float:
-    """Return the slowest time constant [s] of the states without memory, at rest at zero inputs."""
+    """Return the slowest time constant [s] of the states without memory, at rest.
+
+    The inputs have their start values.
+    """
     p = model.parameter_vector()
     memory = np.zeros(len(memory_names(model.structure)))
-    zeros = np.zeros(len(model.input_names))
-    jacobian = np.array(_fast_jacobian(model.structure)(0.0, 0.0, zeros, p, memory))
+    inputs = np.array([i.start for i in model.structure.inputs])
+    jacobian = np.array(_fast_jacobian(model.structure)(0.0, 0.0, inputs, p, memory))
     decay = -np.linalg.eigvals(jacobian).real
     return float(1.0 / np.min(decay)) if np.all(decay > 0) else float("inf")
 

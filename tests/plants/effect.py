@@ -19,7 +19,10 @@ class HiddenEffect:
     unit: what scales it. draw: random secondary parameters, SI. contribution: (run, secondary
     parameters, gain) -> displacement with the effect minus without it at the samples, (N,) [m];
     exactly zero at gain 0. plausible: smallest and largest gain that a real set-up could have.
-    linear: the contribution is proportional to the gain.
+    linear: the contribution is proportional to the gain. room: (times, secondary parameters) ->
+    temperature at the samples, (N,) [degC], where the effect needs a thermometer in the record.
+    refit: the base swallows it far beyond its linearisation (a lag: R_s C_p and tau take it over),
+    so its visible ratio is that of a base fitted again.
     """
 
     name: str
@@ -30,3 +33,5 @@ class HiddenEffect:
     plausible: tuple[float, float]
     linear: bool
     foreign: bool = False
+    room: Callable[[FloatArray, Parameters], FloatArray] | None = None
+    refit: bool = False

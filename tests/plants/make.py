@@ -1,4 +1,4 @@
-"""Synthetic records with one hidden effect, or none, and the truth behind them.
+"""Synthetic records with one hidden effect, or none, or two, and the truth behind them.
 
     python -m tests.plants.make demo OUT.csv
     python -m tests.plants.make EFFECT SEED OUT.csv
@@ -13,20 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import brentq
+import numpy.typing as npt
 
 from tests.plants.base import Run, simulate_base
-from tests.plants.effect import HiddenEffect
-from tests.plants.excitation import draw_voltage
+from tests.plants.excitations import EXCITATIONS, ExcitationKind, draw_excitation
+from tests.plants.hide import RATIO, Hidden, Visible, effect_called, hide
+from tests.plants.noise import NOISES, Noise, NoiseKind, disturb, draw_noise
 from tests.plants.stack import FloatArray, Stack, draw_stack
 from tests.plants.table import HIDDEN_EFFECTS
-from tests.plants.visibility import base_directions, visible_ratio
+from tests.plants.visibility import base_directions
 
+__all__ = ["HEADER", "RATIO", "Truth", "Visible", "make_demo", "make_record"]
 HEADER = "time [s],voltage [V],displacement [um]"
-RATIO = (1.5, 4.0)
-"""Visible ratio (tests/plants/visibility.py) that is drawn at strength 1."""
-SEARCH = 12
-"""Sub-intervals while a gain is searched; the record itself has the full number."""
+THERMOMETER = ",temperature [degC]"
 DEMO_EFFECT, DEMO_SEED = "slow_creep", 2015
 
 
@@ -35,10 +34,13 @@ class Truth:
     """What is behind a record.
 
     effect: the hidden effect or None; foreign: True where the project's table has no such effect.
-    gain and parameters: the effect's own, SI. stack: the base. sigma, quantum: noise and count of
-    the sensor [m]. visible: rms of what the base cannot absorb over sigma. times, voltage,
-    displacement, base_displacement: (N,) clean [s, V, m], the last without the effect.
-    gain_limited: the gain wanted was beyond the effect's plausible range and was clipped.
+    gain and parameters: the effect's own, SI. stack: the base. sigma, quantum: rms of the noise and
+    count of the sensor [m]. visible: rms of what the base cannot absorb over sigma. gain_limited:
+    the gain wanted was beyond the effect's plausible range and was clipped. times, voltage,
+    displacement, base_displacement: (N,) clean [s, V, m], the last without any effect. noise: kind
+    and figures of the noise; lost: (N,) True where a sample is missing or stuck. excitation: class
+    of the voltage. temperature: (N,) [degC] where the record has a thermometer. second: a second
+    hidden effect, added to the first.
     """
 
     effect: str | None
@@ -54,100 +56,120 @@ class Truth:
     voltage: FloatArray
     displacement: FloatArray
     base_displacement: FloatArray
+    noise: Noise
+    lost: npt.NDArray[np.bool_]
+    excitation: ExcitationKind
+    temperature: FloatArray | None
+    second: Hidden | None
 
 
-def make_record(effect: str | None, seed: int, path: Path, strength: float = 1.0) -> Truth:
+def make_record(
+    effect: str | None,
+    seed: int,
+    path: Path,
+    strength: float = 1.0,
+    *,
+    noise: NoiseKind = "white",
+    excitation: ExcitationKind = "rich",
+    visible: Visible | None = None,
+    second: str | None = None,
+    second_strength: float = 1.0,
+    second_visible: Visible | None = None,
+) -> Truth:
     """Write a synthetic record as CSV and return the truth; the same seed gives the same bytes.
 
     effect: a name of `HIDDEN_EFFECTS` or None. strength scales the drawn visible ratio (1.5 to 4);
-    0 removes the effect. The same seed gives the same stack, voltage and noise with every effect.
+    0 removes the effect; `visible` (a ratio or a range) replaces it. The same seed gives the same
+    stack, voltage and noise with every effect, and the same stack with every excitation. second: a
+    further effect with its own strength; what the two add is summed, because their interaction is
+    the product of two small shares of the stroke, far below the noise.
     """
-    if effect is not None and effect not in HIDDEN_EFFECTS:
-        raise KeyError(f"No hidden effect is called {effect}; there are {sorted(HIDDEN_EFFECTS)}.")
-    base_rng, effect_rng, noise_rng = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
+    _check(noise, excitation)
+    chosen = [None if name is None else effect_called(name) for name in (effect, second)]
+    base_rng, effect_rng, noise_rng, second_rng = (
+        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(4)
     )
     stack = draw_stack(base_rng)
-    run = simulate_base(stack, *draw_voltage(base_rng, stack.u_rated))
-    sigma = float(np.ptp(run.displacement)) * float(noise_rng.uniform(0.001, 0.002))
-    quantum = sigma * float(noise_rng.uniform(0.25, 0.5))
-    truth = _hide(effect, run, effect_rng, strength, sigma, quantum)
-    noisy = truth.displacement + sigma * noise_rng.standard_normal(run.times.size)
-    write_csv(path, run.times, run.command, quantum * np.round(noisy / quantum) + 0.0)
+    run = simulate_base(stack, *draw_excitation(base_rng, excitation, stack.u_rated))
+    kind = draw_noise(noise_rng, noise, float(np.ptp(run.displacement)))
+    directions = np.empty((run.times.size, 0)) if chosen == [None, None] else base_directions(run)
+    orders = (
+        (chosen[0], effect_rng, strength, visible),
+        (chosen[1], second_rng, second_strength, second_visible),
+    )
+    first, other = (
+        None if one is None else hide(one, run, rng, directions, kind.rms, size, ratio)
+        for one, rng, size, ratio in orders
+    )
+    clean = run.displacement
+    for found in (first, other):
+        clean = clean if found is None else clean + found.added
+    read, lost = disturb(noise_rng, kind, clean)
+    truth = _truth(run, clean, kind, lost, excitation, first, other)
+    write_csv(path, run.times, run.command, read, truth.temperature)
     return truth
 
 
-def _hide(
-    effect: str | None,
+def _check(noise: str, excitation: str) -> None:
+    for value, known in ((noise, NOISES), (excitation, EXCITATIONS)):
+        if value not in known:
+            raise KeyError(f"There is no {value!r}; there are {', '.join(known)}.")
+
+
+def _truth(
     run: Run,
-    rng: np.random.Generator,
-    strength: float,
-    sigma: float,
-    quantum: float,
+    clean: FloatArray,
+    noise: Noise,
+    lost: npt.NDArray[np.bool_],
+    excitation: ExcitationKind,
+    first: Hidden | None,
+    second: Hidden | None,
 ) -> Truth:
-    added = np.zeros_like(run.times)
-    gain, visible, limited = 0.0, 0.0, False
-    parameters: dict[str, float] = {}
-    hidden = None if effect is None else HIDDEN_EFFECTS[effect]
-    if hidden is not None:
-        parameters = hidden.draw(rng, run)
-        wanted = strength * float(rng.uniform(*RATIO))
-        directions = base_directions(run)
-        gain, limited = find_gain(hidden, run, parameters, directions, wanted * sigma)
-        added = hidden.contribution(run, parameters, gain)
-        visible = visible_ratio(directions, added, sigma)
+    temperature = None
+    for found in (first, second):
+        if found is not None and found.effect.room is not None:
+            temperature = found.effect.room(run.times, found.parameters)
     return Truth(
-        effect=effect,
-        foreign=hidden is not None and hidden.foreign,
-        gain=gain,
-        parameters=parameters,
+        effect=None if first is None else first.effect.name,
+        foreign=first is not None and first.effect.foreign,
+        gain=0.0 if first is None else first.gain,
+        parameters={} if first is None else first.parameters,
         stack=run.stack,
-        sigma=sigma,
-        quantum=quantum,
-        visible=visible,
-        gain_limited=limited,
+        sigma=noise.rms,
+        quantum=noise.quantum,
+        visible=0.0 if first is None else first.visible,
+        gain_limited=first is not None and first.gain_limited,
         times=run.times,
         voltage=run.command,
-        displacement=run.displacement + added,
+        displacement=clean,
         base_displacement=run.displacement,
+        noise=noise,
+        lost=lost,
+        excitation=excitation,
+        temperature=temperature,
+        second=second,
     )
 
 
-def find_gain(
-    hidden: HiddenEffect,
-    run: Run,
-    parameters: Mapping[str, float],
-    directions: FloatArray,
-    wanted: float,
-) -> tuple[float, bool]:
-    """Gain at which the part that the base cannot absorb has the rms `wanted` [m], and whether it
-    was clipped.
+def write_csv(
+    path: Path,
+    times: FloatArray,
+    voltage: FloatArray,
+    displacement: FloatArray,
+    temperature: FloatArray | None = None,
+) -> None:
+    """Write a record: times to 1 us, voltage to 1 mV, displacement [m] in um to 1 pm (an empty cell
+    where it is nan), temperature [degC] to 1 mK.
     """
-    if wanted <= 0.0:
-        return 0.0, False
-
-    trial = run if hidden.linear else simulate_base(run.stack, run.times, run.command, SEARCH)
-
-    def excess(log_gain: float) -> float:
-        added = hidden.contribution(trial, parameters, math.exp(log_gain))
-        return math.log(max(visible_ratio(directions, added, wanted), 1e-9))
-
-    low, high = (math.log(edge) for edge in hidden.plausible)
-    if hidden.linear:
-        log_gain = low - excess(low)
-        return math.exp(min(max(log_gain, low), high)), not low <= log_gain <= high
-    if excess(low) >= 0.0 or excess(high) <= 0.0:
-        return math.exp(low if excess(low) >= 0.0 else high), True
-    return math.exp(float(brentq(excess, low, high, xtol=0.02))), False
-
-
-def write_csv(path: Path, times: FloatArray, voltage: FloatArray, displacement: FloatArray) -> None:
-    """Write a record: times to 1 us, voltage to 1 mV, displacement [m] in um to 1 pm."""
     rows = [
-        f"{t:.6f},{v:.3f},{x * 1e6:.6f}"
+        f"{t:.6f},{v:.3f}," + ("" if math.isnan(x) else f"{x * 1e6:.6f}")
         for t, v, x in zip(times.tolist(), voltage.tolist(), displacement.tolist(), strict=True)
     ]
-    path.write_text("\n".join([HEADER, *rows]) + "\n", encoding="utf-8")
+    header = HEADER
+    if temperature is not None:
+        header += THERMOMETER
+        rows = [f"{row},{t:.3f}" for row, t in zip(rows, temperature.tolist(), strict=True)]
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
 
 
 def make_demo(path: Path) -> Truth:

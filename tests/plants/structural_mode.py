@@ -21,7 +21,7 @@ from tests.plants.stack import FloatArray
 def draw(rng: np.random.Generator, run: Run) -> dict[str, float]:
     """A frequency in the band of the record (25 Hz to 0.2 of the sampling rate), damping 1-5 %."""
     rate = 1.0 / float(run.times[1] - run.times[0])
-    frequency = math.exp(rng.uniform(math.log(25.0), math.log(0.2 * rate)))
+    frequency = math.exp(rng.uniform(math.log(min(25.0, 0.1 * rate)), math.log(0.2 * rate)))
     return {"frequency": float(frequency), "zeta": float(rng.uniform(0.01, 0.05))}
 
 

@@ -11,6 +11,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from tests.plants.base import Run, simulate_base
 from tests.plants.stack import FloatArray, Stack
@@ -46,3 +47,22 @@ def left_over(directions: FloatArray, contribution: FloatArray) -> FloatArray:
 def visible_ratio(directions: FloatArray, contribution: FloatArray, sigma: float) -> float:
     """Rms of what is left over the noise's sigma [1]."""
     return math.sqrt(float(np.mean(left_over(directions, contribution) ** 2))) / sigma
+
+
+def refitted_ratio(run: Run, contribution: FloatArray, sigma: float) -> float:
+    """As `visible_ratio`, with the base fitted again instead of linearised: what a lag leaves once
+    R_s C_p and tau have taken over what they can. A few seconds; coarse grid.
+    """
+    start = simulate_base(run.stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+
+    def rest(logs: FloatArray) -> FloatArray:
+        factors = dict(zip((*FREE, "k_l"), np.exp(logs).tolist(), strict=True))
+        moved = {name: getattr(run.stack, name) * factor for name, factor in factors.items()}
+        stack: Stack = replace(run.stack, **moved)
+        fitted = simulate_base(stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+        left = (contribution + start - fitted) / sigma
+        return np.asarray(left - left.mean(), dtype=np.float64)
+
+    start_logs = np.zeros(len(FREE) + 1)
+    found = least_squares(rest, start_logs, bounds=(-4.0, 4.0), diff_step=[1e-3], max_nfev=12)
+    return math.sqrt(2.0 * float(found.cost) / run.times.size)

@@ -1,0 +1,136 @@
+"""Records with hidden causes, and what a diagnosis makes of one of them.
+
+The plants that make the records are part of the source tree (`tests/plants`), share no code with
+the package and have other equations than its effects. The strength of an effect is rho: rms of what
+the base's parameters cannot absorb, over the rms of the noise.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis, Verdict
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.experiment.reading import read_record
+
+Kind = Literal["known", "weak", "clean", "left out", "foreign", "two"]
+
+#: Ranges of rho, from which a case's is drawn evenly in its logarithm.
+ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One record: what is hidden in it, with which noise, from which seed."""
+
+    kind: Kind
+    effect: str | None
+    seed: int
+    rho: tuple[float, float] = ORDINARY
+    second: str | None = None
+    noise: str = "white"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a diagnosis said of a case.
+
+    `rho` was reached, 0 where nothing is hidden; `named` are the causes, `within` the named ones
+    with what they cannot be told from. `probability` is that of each effect in the first step;
+    `ratio` the held-out rms over that of the noise; `seconds` the wall time.
+    """
+
+    case: Case
+    rho: float
+    verdict: Verdict
+    named: tuple[str, ...]
+    within: tuple[str, ...]
+    confidence: float
+    probability: Mapping[str, float]
+    ratio: float
+    seconds: float
+
+    @property
+    def alone(self) -> str | None:
+        """The cause that was named alone and without a remainder, if there is one."""
+        one = self.verdict == "cause_named" and len(self.named) == 1
+        return self.named[0] if one else None
+
+
+def plants() -> tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]:
+    """Return the maker of records, and the names of known and of foreign effects."""
+    root = Path(__file__).resolve().parent.parent.parent
+    if not (root / "tests" / "plants" / "make.py").is_file():
+        raise InputError(
+            "The plants of this benchmark (tests/plants) are not part of an installed package; run"
+            " it in a checkout of the source."
+        )
+    if str(root) not in sys.path:
+        sys.path.insert(0, str(root))
+    table = import_module("tests.plants.table")
+    return import_module("tests.plants.make").make_record, table.KNOWN, table.FOREIGN
+
+
+def run_case(case: Case) -> Found:
+    """Make the record of a case, diagnose the file, and compare."""
+    make_record, _, _ = plants()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "record.csv"
+        truth = make_record(
+            case.effect,
+            case.seed,
+            path,
+            noise=case.noise,
+            visible=case.rho if case.effect else None,
+            second=case.second,
+            second_visible=case.rho if case.second else None,
+        )
+        record = read_record(path)
+    table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.effect]
+    begin = time.perf_counter()
+    d = diagnose([record], effects=table)
+    return _found(case, d, truth, time.perf_counter() - begin)
+
+
+def _found(case: Case, d: Diagnosis, truth: Any, seconds: float) -> Found:
+    named = tuple(c.effect for c in d.causes)
+    alike = tuple(n for c in d.causes for n in c.cannot_be_told_from)
+    held = d.experiments[0].held_out
+    noise = np.asarray(d.experiments[0].record.displacement) - truth.displacement
+    level = float(np.sqrt(np.mean(noise[held] ** 2)))
+    return Found(
+        case=case,
+        rho=float(truth.visible),
+        verdict=d.verdict,
+        named=named,
+        within=tuple(dict.fromkeys((*named, *alike))),
+        confidence=d.causes[0].confidence if d.causes else 0.0,
+        probability={c.effect: c.probability for c in d.candidates},
+        ratio=d.extended_errors.holdout_rms_m / level,
+        seconds=seconds,
+    )
+
+
+def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: int) -> list[Case]:
+    """Return the cases of a study: every effect with `seeds` seeds, and clean records to match."""
+    draws = range(first, first + seeds)
+    cases = [Case("known", e, s) for e in known for s in draws]
+    cases += [Case("weak", e, s, WEAK) for e in known for s in draws[: max(1, seeds // 2)]]
+    cases += [Case("clean", None, first + k) for k in range(5 * seeds)]
+    cases += [Case("clean", None, first + 1000 + k, noise="ar") for k in range(5 * seeds)]
+    cases += [Case("left out", e, s) for e in known for s in draws[: max(1, seeds // 2)]]
+    cases += [Case("foreign", e, s) for e in foreign for s in draws]
+    rng = np.random.default_rng(first)
+    for k in range(4 * seeds):
+        one, other = rng.choice(known, 2, replace=False)
+        cases.append(Case("two", str(one), first + k, STRONG, str(other)))
+    return cases

@@ -1,0 +1,60 @@
+"""The backward step: a cause that a later one made needless is dropped."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.evidence import evidence
+from psa_casadi.diagnosis.rounds import Round, examine
+from psa_casadi.diagnosis.selection import extend, polish, starts_of
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.refitting import Progress, refit
+
+
+def without_needless(
+    rounds: list[Round], experiments: Sequence[Experiment], progress: Progress
+) -> list[Round]:
+    """Return the rounds without causes for which, beside the later ones, there is no evidence.
+
+    Every cause but the last is taken out in turn, the rest fitted again. Where one is dropped the
+    rounds are built anew from the causes that stay.
+    """
+    causes = [r.chosen.effect for r in rounds if r.chosen is not None]
+    last = rounds[-1]
+    for cause in causes[:-1]:
+        progress(f"without {cause.name}")
+        less = _without(last.fit, cause, experiments)
+        if evidence(less, last.fit, last.screening.colour) < 0.0:
+            kept = [c for c in causes if c is not cause]
+            rebuilt = _rebuilt(rounds[0], kept, experiments, progress)
+            if rebuilt is not None:
+                return without_needless(rebuilt, experiments, progress)
+    return rounds
+
+
+def _without(final: Fit, cause: Component, experiments: Sequence[Experiment]) -> Fit:
+    model = final.model.without([cause.name])
+    names = [n for n in final.unknowns.names if n in model.values]
+    return refit(replace(final, model=model), experiments, names)
+
+
+def _rebuilt(
+    first: Round, causes: Sequence[Component], experiments: Sequence[Experiment], progress: Progress
+) -> list[Round] | None:
+    """Return rounds with the causes in their order; None where one of them cannot be fitted."""
+    rounds = [replace(first, extensions=list(first.extensions), chosen=None, rivals=[])]
+    for cause in causes:
+        current = rounds[-1]
+        colour = current.screening.colour
+        scores = starts_of(current.screening, cause.name)
+        found = extend(current.fit, experiments, scores, colour) if scores else None
+        if found is None:
+            return None
+        current.chosen = polish(current.fit, found, experiments, colour)
+        current.evidence = {**current.evidence, cause.name: current.chosen.evidence}
+        table = {d.effect.name: d.effect for d in current.trials}
+        left = [e for name, e in table.items() if name != cause.name]
+        fit, predicted = current.chosen.fit, current.chosen.predicted
+        rounds.append(examine(fit, predicted, experiments, left, progress, current.trials))
+    return rounds

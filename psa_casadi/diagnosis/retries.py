@@ -1,0 +1,163 @@
+"""Further attempts at the base fit: a base that is lost looks like a base that lacks something."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from psa_casadi.diagnosis.selection import Extension
+from psa_casadi.errors import PsaError
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.linear_start import linear_start
+from psa_casadi.identification.refitting import QUICK_RTOL, Progress, refit
+from psa_casadi.identification.search import search
+from psa_casadi.identification.starting_points import resolved
+
+#: A base fit tried again counts if its rms falls to this share.
+BETTER_BASE = 0.95
+#: Log-likelihood by which a resonance of the stack's own may fall short of a further mode.
+_AS_GOOD = 10.0
+#: ... and to what share of the rms one beside the causes found must lead.
+_MUCH = 0.985
+#: Log-likelihood by which a fit with a further mass must be better to count.
+_CLEAR = 15.0
+#: Multiples of the sampling rate about which the images of a tone are tried.
+_IMAGES = (0, 1, 2, 3)
+_QUICK, _FIRST, _BEST = 8, 4, 2
+#: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band, the
+#: resonances over the rate that are tried there, and their damping ratio.
+_NEAR_BAND, _GRID, _DAMPING = (300.0, 10_000.0), (0.4, 0.7, 1.0, 1.4, 2.0, 2.8), 0.15
+
+
+def from_extension(first: Fit, extension: Extension, experiments: Sequence[Experiment]) -> Fit:
+    """Fit the base once more from an extension's parameters."""
+    names = first.unknowns.names
+    values = {n: extension.fit.model.values[n] for n in names}
+    moved = replace(first, model=first.model.with_values(values))
+    return refit(moved, experiments, names)
+
+
+def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
+    """Fit the base from the resonances and lags that fast records show; None without any.
+
+    Ordinary lags lead nowhere for a stack that rings within the record's band.
+    """
+    records = [e.record for e in experiments]
+    progress("resonances and lags that the records show")
+    linear = linear_start(records, base.model.values)
+    fastest = min(r.sample_time for r in records)
+    if linear is None or not resolved(base.model, linear.candidates, fastest):
+        return None
+    return search(base.model, experiments, linear=linear.candidates, progress=progress).best
+
+
+def from_band(
+    base: Fit, before: Fit, experiments: Sequence[Experiment], progress: Progress
+) -> Fit | None:
+    """Fit the base with a resonance near or above the band; None where none explains much more.
+
+    `before` is the model with the causes found so far. Steps excite such a resonance, and what a
+    slow record shows of its ringing looks like noise after each step.
+    """
+    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
+        return None
+    progress("base fit, with resonances near the sampling rate")
+    starts = list(_masses(before.model.values, [g * rate for g in _GRID], _DAMPING))
+    found = _with_masses(before, starts, experiments)
+    if found is None or found.rms > _MUCH * before.rms:
+        return None
+    return _in_base(base, before, found, experiments)
+
+
+def from_mode(
+    base: Fit,
+    before: Fit,
+    mode: Extension,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+) -> Fit | None:
+    """Fit the base with a resonance of its own where a further mode was found.
+
+    `before` is the model, perhaps with causes named before, to which the mode was added. A stack
+    that rings near the sampling rate shows a tone at one of its images, |k f_s + f| and
+    |k f_s - f|. None where no mass explains the data about as well as the mode.
+    """
+    progress("base fit, with the mode as a resonance of the stack's own")
+    found, values = mode.fit.model.values, before.model.values
+    tone, damping = found[mode.effect.tone or ""], found["mode_damping"]
+    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    images = {abs(k * rate + sign * tone) for k in _IMAGES for sign in (1.0, -1.0)}
+    final = _with_masses(before, list(_masses(values, sorted(images), damping)), experiments)
+    if final is None:
+        return None
+    short = len(before.residuals) * float(np.log(final.rms / mode.fit.rms))
+    if short >= _AS_GOOD:
+        return None
+    return _in_base(base, before, final, experiments)
+
+
+def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experiment]) -> Fit:
+    """Return the base fitted from where a fit with more masses, and perhaps causes, has led."""
+    if before is base:
+        return found
+    names = [n for n in found.unknowns.names if n in base.model.values]
+    values = {n: found.model.values[n] for n in names}
+    return refit(replace(base, model=base.model.with_values(values)), experiments, names)
+
+
+def _masses(
+    p: Mapping[str, float], frequencies: Sequence[float], damping: float
+) -> Iterator[dict[str, float]]:
+    """Yield mass and damping of wafers or bonding layers for resonances [Hz] at a damping ratio."""
+    for part in ("_P", "_B") if "k_B" in p else ("",):
+        for frequency in frequencies:
+            mass = p[f"k{part}"] / (2.0 * np.pi * frequency) ** 2
+            lost = 2.0 * damping * float(np.sqrt(mass * p[f"k{part}"]))
+            yield {f"m{part}": mass, f"c{part}": lost}
+
+
+def _with_masses(
+    before: Fit, starts: Sequence[Mapping[str, float]], experiments: Sequence[Experiment]
+) -> Fit | None:
+    """Fit with one mass free from several starts; None where none explains clearly more."""
+    found: list[Fit] = []
+    for start in starts:
+        free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
+        tried = _try(before, free, start, before.starts(), _FIRST, experiments)
+        if tried is not None:
+            found.append(tried)
+    best: Fit | None = None
+    for quick in sorted(found, key=lambda f: f.cost)[:_BEST]:
+        further = _try(quick, quick.unknowns.names, {}, quick.starts(), _QUICK, experiments)
+        if further is not None and (best is None or further.cost < best.cost):
+            best = further
+    if best is None:
+        return None
+    final = refit(best, experiments, best.unknowns.names)
+    gained = len(before.residuals) * float(np.log(before.rms / final.rms))
+    return final if gained > _CLEAR else None
+
+
+def _try(
+    before: Fit,
+    free: Sequence[str],
+    start: Mapping[str, float],
+    states: Sequence[Mapping[str, float]],
+    evaluations: int,
+    experiments: Sequence[Experiment],
+) -> Fit | None:
+    try:
+        return fit(
+            before.model,
+            experiments,
+            free,
+            sigma=before.sigma,
+            start=start,
+            start_states=states,
+            evaluations=evaluations,
+            rtol=QUICK_RTOL,
+        )
+    except PsaError:
+        return None

@@ -1,0 +1,193 @@
+"""One step of the search for causes: screen, fit the leading effects, ask for imitators, choose."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.errors_of import held_out_rms
+from psa_casadi.diagnosis.evidence import estimated, probabilities
+from psa_casadi.diagnosis.noise_floor import known_colour
+from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
+from psa_casadi.diagnosis.probes import Direction, directions
+from psa_casadi.diagnosis.screening import Screening, copies, screen
+from psa_casadi.diagnosis.selection import (
+    Extension,
+    choose,
+    extend,
+    extend_afresh,
+    extend_like,
+    leading,
+    polish,
+)
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.noise import high_frequency_noise
+from psa_casadi.identification.refitting import Progress
+
+FloatArray = npt.NDArray[np.float64]
+
+#: An extension whose residual is within this factor of the noise needs no further starts.
+SETTLED = 1.05
+#: How many extensions are fitted to the end, if their evidence is this share of the best one's or
+#: this close to it.
+FINALISTS, RUNNER_UP, NEAR = 3, 0.8, 30.0
+#: How many extensions are fitted afresh: the best one and those that lost themselves.
+AFRESH = 2
+#: How many effects that could stand in the best one's place are fitted besides, at most.
+IMITATORS = 3
+
+
+@dataclass(eq=False)
+class Round:
+    """One step of the search: the model so far, its screening and test, the extensions tried.
+
+    `evidence` is ln B of every effect over the model so far, of a full fit where there was one;
+    `probability` that of being the cause, given that one effect of the table is.
+    """
+
+    fit: Fit
+    predicted: tuple[FloatArray, ...]
+    trials: tuple[Direction, ...]
+    screening: Screening
+    test: Omnibus
+    extensions: list[Extension] = field(default_factory=list)
+    chosen: Extension | None = None
+    rivals: list[Extension] = field(default_factory=list)
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    probability: Mapping[str, float] = field(default_factory=dict)
+
+
+def examine(
+    fit: Fit,
+    predicted: tuple[FloatArray, ...],
+    experiments: Sequence[Experiment],
+    table: Sequence[Component],
+    progress: Progress,
+    known: Sequence[Direction] = (),
+) -> Round:
+    """Screen the effects at a fit and test its residual.
+
+    Directions that are `known` from the fit before are used again: what an effect adds hardly
+    changes with another effect beside it, and a full fit judges.
+    """
+    progress("screening effects")
+    kept = [d for d in known if d.effect in table]
+    if known:
+        lines = [e for e in table if e.tone is not None]  # the residual's lines are new ones
+        kept = [d for d in kept if d.effect not in lines] + directions(fit, experiments, lines)
+    else:
+        kept = directions(fit, experiments, table)
+    lengths = [int(e.used.sum()) for e in experiments]
+    screening = screen(fit, kept, lengths, [known_colour(e.record) for e in experiments])
+    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    time = np.concatenate([e.record.time[e.used] for e in experiments])
+    floor = high_frequency_noise(fit.residuals)
+    test = omnibus(fit.residuals, voltage, time, screening.colour, floor)
+    guess = estimated(fit, screening)
+    return Round(
+        fit,
+        predicted,
+        tuple(kept),
+        screening,
+        test,
+        evidence=guess,
+        probability=probabilities(guess),
+    )
+
+
+def search_cause(
+    current: Round,
+    number: int,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+    first: Extension | None = None,
+) -> None:
+    """Fit the leading effects and what could imitate the best, and choose among them.
+
+    `first` is the first cause where this is a further one.
+    """
+    colour = current.screening.colour
+    for name, scores in leading(current.screening):
+        progress(f"cause {number}: fitting {name}")
+        extension = extend(current.fit, experiments, scores, colour)
+        if extension is not None:
+            current.extensions.append(extension)
+    _sort(current)
+    floor = high_frequency_noise(current.fit.residuals)
+    lost = [k for k, e in enumerate(current.extensions) if k == 0 or e.evidence < 0][:AFRESH]
+    for k in lost if current.extensions and current.extensions[0].fit.rms > SETTLED * floor else ():
+        progress(f"cause {number}: {current.extensions[k].effect.name} afresh")
+        again = extend_afresh(current.fit, experiments, current.extensions[k], colour)
+        current.extensions[k] = again
+    _sort(current)
+    _polish(current, number, experiments, progress)
+    if current.extensions:
+        _imitators(current, number, experiments, progress)
+        _polish(current, number, experiments, progress)
+    before = held_out_rms(experiments, current.predicted)
+    ranked = choose(current.extensions, experiments, current.fit, before, floor, colour, first)
+    fitted = {e.effect.name: e.evidence for e in current.extensions}
+    refused = {name for name in fitted if name not in {e.effect.name for e in ranked}}
+    current.evidence = estimated(current.fit, current.screening) | fitted
+    current.probability = probabilities(
+        {name: v for name, v in current.evidence.items() if name not in refused}
+    )
+    if ranked:
+        current.chosen, current.rivals = ranked[0], ranked[1:]
+
+
+def _sort(current: Round) -> None:
+    current.extensions.sort(key=lambda e: -e.evidence)
+
+
+def _polish(
+    current: Round, number: int, experiments: Sequence[Experiment], progress: Progress
+) -> None:
+    """Fit the best extensions to the end, where that is not done yet."""
+    if not current.extensions:
+        return
+    best = current.extensions[0].evidence
+    limit = min(RUNNER_UP * best, best - NEAR)
+    for k, extension in enumerate(current.extensions[:FINALISTS]):
+        if extension.evidence > limit and not extension.final:
+            progress(f"cause {number}: {extension.effect.name} to the end")
+            current.extensions[k] = polish(
+                current.fit, extension, experiments, current.screening.colour
+            )
+    _sort(current)
+
+
+def _imitators(
+    current: Round, number: int, experiments: Sequence[Experiment], progress: Progress
+) -> None:
+    """Fit the effects that could copy what the best one adds, the base being free to follow.
+
+    A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is below
+    `NEAR` might explain the data as well; a fit much worse than its copy was lost.
+    """
+    best = current.extensions[0]
+    added = np.concatenate(
+        [
+            (p - q)[e.used]
+            for p, q, e in zip(best.predicted, current.predicted, experiments, strict=True)
+        ]
+    )
+    fitted = {e.effect.name: e for e in current.extensions}
+    others = [d for d in current.trials if d.effect is not best.effect]
+    power, found = copies(current.fit, added, others, current.screening.colour)
+    left = {n: 0.5 * power * (1.0 - copy.share) for n, copy in found.items()}
+    near = [n for n in left if n not in fitted and left[n] < NEAR]
+    lost = [n for n in left if n in fitted and fitted[n].evidence < best.evidence - left[n] - NEAR]
+    for name in sorted([*near, *lost], key=lambda n: left[n])[:IMITATORS]:
+        progress(f"cause {number}: fitting {name}, which could look like {best.effect.name}")
+        extension = extend_like(current.fit, best, experiments, found[name], current.screening)
+        if extension is None:
+            continue
+        if name not in fitted:
+            current.extensions.append(extension)
+        elif extension.evidence > fitted[name].evidence:
+            current.extensions[current.extensions.index(fitted[name])] = extension
+    _sort(current)

@@ -1,0 +1,60 @@
+"""Temperature: the stack's length and its gain follow the record's temperature column.
+
+Sizes: a stack of length L moves 1.0e-3 to 1.3e-3 L at rated voltage. Poled multilayer ceramic
+expands by -3.5e-6 L per kelvin along its length (co-fired) or +11e-6 L (glued high-voltage discs),
+a steel frame by 11e-6 L: some -0.4 to +1.4 % of the stroke per kelvin. The piezoelectric
+coefficient of soft PZT grows by one or a few tenths of a percent per kelvin. A kelvin is an
+ordinary change in a laboratory and 0.1 % of the stroke is noticeable: 1e-3 per kelvin is ordinary.
+"""
+
+from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.effects.sizes import stroke
+from psa_casadi.variables import Input, Parameter
+
+_ROOM = 293.15
+
+
+def _equations(s: Symbols) -> Equations:
+    expansion = s.expansion_gain * (s.temperature - s.temperature_reference)
+    return Equations(
+        add={
+            "measured_displacement": expansion * stroke(s),
+            "free_force": expansion * s.temperature_gain_ratio * s.k_L * s.u,
+        }
+    )
+
+
+TEMPERATURE = Component(
+    name="temperature",
+    description="length and gain of the stack follow its temperature",
+    source="Physik Instrumente, piezo tutorial, Temperature Effects: expansion and piezo gain",
+    belongs_to="environment",
+    gain="expansion_gain",
+    equation_text=(
+        "x_m gains expansion_gain (T - temperature_reference) stroke,  f_L gains"
+        " temperature_gain_ratio expansion_gain (T - temperature_reference) k_L u"
+    ),
+    parameters=(
+        Parameter("expansion_gain", 0.0, "1/K", (-0.1, 0.1), "expansion over stroke", scale=1e-3),
+        Parameter(
+            "temperature_gain_ratio",
+            0.0,
+            "1",
+            (-100.0, 100.0),
+            "relative change of the gain over the expansion over stroke",
+            scale=1.0,
+        ),
+        Parameter(
+            "temperature_reference",
+            _ROOM,
+            "K",
+            (0.0, 1000.0),
+            "temperature at which nothing changes",
+            scale=1.0,
+        ),
+    ),
+    inputs=(Input("temperature", "K", "temperature of the stack", start=_ROOM, nominal=300.0),),
+    equations=_equations,
+    probe={"temperature_gain_ratio": (-1.0, 0.0, 1.0)},
+    looks_like="the residual follows the temperature, by an offset and in proportion to the stroke",
+)

@@ -1,0 +1,105 @@
+"""What holds for every plant effect: finite slopes, ordinary costs, no run-away, rest at a hold."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi.component import Component, Symbols
+from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.effects.ageing import AGEING
+from psa_casadi.effects.backlash import BACKLASH
+from psa_casadi.effects.field_dependent_gain import FIELD_DEPENDENT_GAIN
+from psa_casadi.effects.load_stiffness import LOAD_STIFFNESS
+from psa_casadi.effects.preload_loss import PRELOAD_LOSS
+from psa_casadi.effects.rate_dependent_hysteresis import RATE_DEPENDENT_HYSTERESIS
+from psa_casadi.effects.saturation_of_strain import SATURATION_OF_STRAIN
+from psa_casadi.effects.self_heating import SELF_HEATING
+from psa_casadi.effects.sizes import static_stiffness, stroke
+from psa_casadi.model.compose import compose
+from psa_casadi.scales import stiffness_scale, stroke_scale
+from psa_casadi.simulation.codegen import functions_of
+from psa_casadi.simulation.simulate import simulate
+from tests.effect_runs import (
+    HYSTERESIS,
+    driven,
+    linear,
+    ordinary,
+    sine_and_steps,
+)
+from tests.random_models import random_model, random_point
+from tests.stack_models import stack
+
+FloatArray = NDArray[np.float64]
+
+PLANT = (
+    RATE_DEPENDENT_HYSTERESIS,
+    FIELD_DEPENDENT_GAIN,
+    SATURATION_OF_STRAIN,
+    LOAD_STIFFNESS,
+    PRELOAD_LOSS,
+    BACKLASH,
+    SELF_HEATING,
+    AGEING,
+)
+every_effect = pytest.mark.parametrize("effect", PLANT, ids=lambda e: e.name)
+every_base = pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
+
+
+@every_base
+def test_sizes_are_those_of_the_nominals(base: tuple[Component, ...]) -> None:
+    values = compose(base).values
+    assert static_stiffness(Symbols(values)) == pytest.approx(stiffness_scale(values))
+    assert stroke(Symbols(values)) == pytest.approx(stroke_scale(values))
+
+
+@every_effect
+@every_base
+def test_slopes_are_finite(effect: Component, base: tuple[Component, ...]) -> None:
+    """At random points, at rest, and far away before time zero; with gain and without."""
+    generator = np.random.default_rng(11)
+    for gains in (False, True):
+        model = random_model((effect,), generator, gains=gains, base=base)
+        point = random_point(model, generator)
+        for time, size in ((point.time, 1.0), (0.0, 0.0), (-5.0, 100.0)):
+            p = ca.DM(model.parameter_vector())
+            at = [ca.DM(time), ca.DM(size * point.x), ca.DM(size * point.u), p]
+            for function in functions_of(model.structure, sensitivities=True).values():
+                slopes = function.call(at)
+                assert all(np.isfinite(np.array(part)).all() for part in slopes)
+
+
+@every_effect
+def test_ordinary_size_shows_and_costs_little(effect: Component) -> None:
+    """Between 0.05 and 10 % of the range, at no more than 1.5 times the steps, at any probe."""
+    t, voltage = sine_and_steps()
+    base = driven(stack("P-885.51"), t, voltage)
+    grid = [{n: float(v)} for n, values in effect.probe.items() for v in values]
+    for values in grid or [{}]:
+        found = driven(ordinary(effect, **values), t, voltage)
+        change = np.abs(found.y[:, -1] - base.y[:, -1]).max() / np.ptp(base.y[:, -1])
+        assert 5e-4 < change < 0.1, values
+        assert found.steps <= 1.5 * base.steps, values
+
+
+@pytest.mark.parametrize(
+    "effect", [e for e in PLANT if e is not SELF_HEATING], ids=lambda e: e.name
+)
+@pytest.mark.parametrize("end", [0, 1])
+def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> None:
+    """Self-heating's bounds are wide for want of a common size of joule; it is linear in x."""
+    t, voltage = sine_and_steps()
+    bound = ordinary(effect).parameter(str(effect.gain)).bounds[end]
+    model = ordinary(effect).with_values({str(effect.gain): bound})
+    x = driven(model, t, voltage).y[:, -1]
+    assert np.abs(x).max() < 3.0 * stroke_scale(model.values)
+
+
+@pytest.mark.parametrize("effect", PLANT[:-1], ids=lambda e: e.name)
+@every_base
+def test_a_held_voltage_holds_the_output(effect: Component, base: tuple[Component, ...]) -> None:
+    """The start at 100 V is an equilibrium of the extended model; ageing alone goes on."""
+    model = linear(effect, 0.3, base, **HYSTERESIS)
+    x = simulate(model, np.arange(11) * 10.0, np.full(11, 100.0)).displacement
+    assert x[0] > 0.3 * stroke_scale(model.values)
+    assert np.ptp(x) < 1e-6 * x[0]

@@ -1,0 +1,250 @@
+"""Effects of drive, sensor and environment: each one's signature against a closed form."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi.component import Component
+from psa_casadi.components import SIMPLIFIED
+from psa_casadi.effects.charge_leakage import CHARGE_LEAKAGE
+from psa_casadi.effects.drive_lag import DRIVE_LAG
+from psa_casadi.effects.mains_hum import MAINS_HUM
+from psa_casadi.effects.sensor_lag import SENSOR_LAG
+from psa_casadi.effects.sensor_nonlinearity import SENSOR_NONLINEARITY
+from psa_casadi.effects.temperature import TEMPERATURE
+from psa_casadi.effects.voltage_saturation import VOLTAGE_SATURATION
+from psa_casadi.identification.unknowns import static_compliance
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.simulation.start import start_state
+from psa_casadi.simulation.stepper import run
+from tests.stack_models import LINEAR, stack
+
+FloatArray = NDArray[np.float64]
+
+STACK = "P-885.51"
+ROOM = 293.15
+
+
+def with_effect(effect: Component, **values: float) -> Model:
+    return stack(STACK).with_effect(effect, values)
+
+
+def simulated(
+    model: Model,
+    t: FloatArray,
+    voltage: FloatArray,
+    *,
+    temperature: FloatArray | None = None,
+    memory: Mapping[str, float] | None = None,
+    rtol: float = 1e-8,
+) -> dict[str, FloatArray]:
+    """Return states and outputs by name; the record starts at rest at its first voltage."""
+    inputs = {"voltage": voltage, "load_force": np.zeros_like(t)}
+    if temperature is not None:
+        inputs["temperature"] = temperature
+    u = np.column_stack([inputs[name] for name in model.input_names])
+    x0 = start_state(model, list(u[0]), None, memory).x
+    steps = run(model, t, u, x0, rtol=rtol)
+    states = dict(zip(model.state_names, steps.x.T, strict=True))
+    return states | dict(zip(model.output_names, steps.y.T, strict=True))
+
+
+def stroke(model: Model) -> float:
+    return model.values["k_L"] * model.values["u_rated"] * static_compliance(model.values)
+
+
+def tone(t: FloatArray, signal: FloatArray, frequency: float) -> complex:
+    """Return the complex amplitude of one frequency in a signal, beside its mean."""
+    angle = 2 * np.pi * frequency * t
+    columns = np.column_stack([np.cos(angle), np.sin(angle), np.ones_like(t)])
+    a, b, _ = np.linalg.lstsq(columns, signal, rcond=None)[0]
+    return complex(a, -b)
+
+
+@pytest.mark.parametrize("level", [0.7, 0.85])
+def test_a_clip_makes_flat_tops_at_its_level(level: float) -> None:
+    """Behind a hard clip the stack does what it does at the clipped command: twice a flat top."""
+    t = np.linspace(0.0, 1.0, 2001)
+    voltage = 60.0 * (1.0 - np.cos(4 * np.pi * t))
+    hard = simulated(with_effect(VOLTAGE_SATURATION, clip_gain=1.0, clip_level=level), t, voltage)
+    clipped = simulated(stack(STACK), t, np.minimum(voltage, 120.0 * level))
+    width, excess = 0.005 * 120.0, voltage - 120.0 * level
+    rounding = width * np.log1p(np.exp(-np.abs(excess) / width))  # of the corner [V]
+    assert rounding.max() > 0.3
+    np.testing.assert_allclose(clipped["u"] - hard["u"], rounding, rtol=0, atol=0.02)
+    for half in (t < 0.5, t > 0.5):
+        top = half & (excess > 10 * width)
+        assert np.count_nonzero(top) > 150
+        assert np.ptp(voltage[top]) > 0.05 * 120.0
+        assert np.abs(hard["u"][top] - 120.0 * level).max() < 1e-3 * 120.0 * level
+        assert np.ptp(hard["measured_displacement"][top]) < 1e-4 * stroke(stack(STACK))
+
+
+def test_a_soft_clip_loses_its_share_of_the_excess_and_nothing_below() -> None:
+    t = np.linspace(0.0, 1.0, 1001)
+    voltage = 60.0 * (1.0 - np.cos(2 * np.pi * t))
+    found = simulated(
+        with_effect(VOLTAGE_SATURATION, clip_gain=0.3, clip_level=0.7), t, voltage, rtol=1e-10
+    )
+    plain = simulated(stack(STACK), t, voltage, rtol=1e-10)
+    lost, excess = plain["u"] - found["u"], voltage - 0.7 * 120.0
+    high, low = excess > 0.05 * 120.0, excess < -0.19 * 120.0
+    np.testing.assert_allclose(lost[high], 0.3 * excess[high], rtol=0, atol=2e-3)
+    np.testing.assert_allclose(lost[low], 0.0, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("frequency", [50.0, 300.0, 1500.0])
+@pytest.mark.parametrize("amplitude", [1.0, 30.0])
+def test_a_drive_lag_is_a_pole_beside_the_base_at_every_amplitude(
+    frequency: float, amplitude: float
+) -> None:
+    """Without hysteresis the response is the base's over 1 + i w T, at any amplitude."""
+    lag = 2e-4
+    t = np.linspace(0.0, 40.0 / frequency, 8001)
+    voltage = amplitude * np.sin(2 * np.pi * frequency * t)
+    late = t > 20.0 / frequency
+    responses = []
+    for model in (with_effect(DRIVE_LAG, drive_lag_time=lag), stack(STACK)):
+        shown = simulated(model.with_values(LINEAR), t, voltage)["measured_displacement"]
+        responses.append(tone(t[late], shown[late], frequency))
+    ratio = responses[0] / responses[1]
+    angle = 2 * np.pi * frequency * lag
+    assert np.angle(ratio) == pytest.approx(-np.arctan(angle), rel=0.01)
+    assert abs(ratio) == pytest.approx(1 / np.hypot(1.0, angle), rel=0.01)
+
+
+@pytest.mark.parametrize("frequency", [50.0, 300.0, 5000.0])
+def test_a_sensor_lag_turns_the_phase_of_a_first_order_lag(frequency: float) -> None:
+    """The reading is the displacement, with its hysteresis, over 1 + i w T; the plant is alike."""
+    lag = 2e-4
+    model = with_effect(SENSOR_LAG, sensor_lag_time=lag)
+    t = np.linspace(0.0, 40.0 / frequency, 8001)
+    voltage = 30.0 * np.sin(2 * np.pi * frequency * t)
+    found = simulated(model, t, voltage)
+    late = t > 20.0 / frequency
+    shown, true = (
+        tone(t[late], found[name][late], frequency)
+        for name in ("measured_displacement", "displacement")
+    )
+    angle, floor = 2 * np.pi * frequency * lag, 2 * np.pi * frequency * 1e-6
+    expected = (1 + 1j * floor) / (1 + 1j * (angle + floor))
+    assert shown / true == pytest.approx(expected, rel=1e-3)
+    assert np.angle(shown / true) == pytest.approx(-np.arctan(angle), rel=0.03)
+
+
+def test_a_leaking_charge_drive_droops_to_what_does_not_leak() -> None:
+    """u = G v (1 - g (1 - exp(-t/T))) after a step from rest, and G v (1 - g) long after one."""
+    gain, time = 0.3, 2.0
+    model = with_effect(CHARGE_LEAKAGE, leak_gain=gain, leak_time=time).with_values(LINEAR)
+    t = np.linspace(0.0, 20.0, 4001)
+    voltage = np.where(t > 0.0, 100.0, 0.0)
+    late = t > 0.02
+    expected = 1 - gain * (1 - np.exp(-(t[late] - 0.0025) / time))  # the ramp's middle
+    found = simulated(model, t, voltage)
+    np.testing.assert_allclose(found["u"][late], 100.0 * expected, rtol=1e-4)
+    shown = found["measured_displacement"][late] / (stroke(model) * 100.0 / 120.0)
+    np.testing.assert_allclose(shown, expected, rtol=3e-4)
+    settled = simulated(model, t, np.full_like(t, 100.0))["u"]
+    np.testing.assert_allclose(settled, 70.0, rtol=1e-9)
+
+
+def test_a_record_may_begin_before_the_leakage_has_settled() -> None:
+    """A start of the leaked part of -60 V is a voltage too high by g 60 V that droops away."""
+    model = with_effect(CHARGE_LEAKAGE, leak_gain=0.3, leak_time=2.0)
+    t = np.linspace(0.0, 5.0, 1001)
+    found = simulated(model, t, np.full_like(t, 100.0), memory={"leak_voltage": -60.0})
+    np.testing.assert_allclose(found["u"], 70.0 + 18.0 * np.exp(-t / 2.0), rtol=1e-4)
+
+
+@pytest.mark.parametrize("cubic", [0.0, -2 / 3])
+def test_a_bent_sensor_reads_a_function_of_the_displacement_alone(cubic: float) -> None:
+    model = with_effect(SENSOR_NONLINEARITY, nonlinearity_gain=0.05, nonlinearity_cubic=cubic)
+    t = np.linspace(0.0, 2.0, 2001)
+    voltage = 60.0 * (1.0 - np.cos(4 * np.pi * t)) * (0.5 + 0.25 * t)
+    found = simulated(model, t, voltage)
+    x, size = found["displacement"], stroke(model)
+    residual = found["measured_displacement"] - x
+    expected = 0.05 * ((x / size) ** 2 + cubic * (x / size) ** 3) * size
+    np.testing.assert_allclose(residual, expected, rtol=0, atol=1e-9 * size)
+    assert 0.01 * size < residual.max() < 0.05 * size
+    # the branches lie apart against the voltage, and on each other against the displacement
+    rising = np.gradient(x) > 0
+    at = np.linspace(0.2, 0.6, 9)
+    apart = [
+        np.interp(at * top, np.sort(axis[branch]), residual[branch][np.argsort(axis[branch])])
+        for axis, top in ((voltage, 120.0), (x, size))
+        for branch in (rising & (t < 0.5), ~rising & (t < 0.5))
+    ]
+    assert np.abs(apart[0] - apart[1]).max() > 50 * np.abs(apart[2] - apart[3]).max()
+
+
+def test_hum_is_a_sine_that_keeps_amplitude_and_phase_for_a_thousand_periods() -> None:
+    """At the fit's tolerance and a sample rate below the line, moving voltage or not."""
+    model = with_effect(MAINS_HUM, hum_gain=2e-8, hum_frequency=50.0)
+    t: FloatArray = 0.3 + 0.011 * np.arange(
+        2001.0
+    )  # 90.9 samples per second: 50 Hz shows at its alias
+    voltage = np.where(t < 10.0, 40.0, 40.0 * (1.0 + 0.5 * np.sin(t - 10.0)))
+    found = simulated(model, t, voltage, memory={"hum_cosine": 0.6, "hum_sine": -0.8}, rtol=1e-6)
+    hum = found["measured_displacement"] - found["displacement"]
+    angle = 100 * np.pi * t
+    expected = 2e-8 * (0.6 * np.cos(angle) - 0.8 * np.sin(angle))
+    assert t[-1] - t[0] > 1000 / 50.0
+    np.testing.assert_allclose(hum, expected, rtol=0, atol=1e-4 * 2e-8)
+
+
+def test_hum_costs_no_steps_and_is_nothing_without_a_start() -> None:
+    """The plant's trajectory has the same bits with and without the hum."""
+    t: FloatArray = 1e-3 * np.arange(2001.0)
+    u = np.column_stack([40.0 * (1.0 - np.cos(2 * np.pi * t)), np.zeros_like(t)])
+    model = with_effect(MAINS_HUM, hum_gain=2e-8, hum_frequency=457.0)
+    rest = np.zeros(len(model.state_names) - 2)
+    quiet, loud = (run(model, t, u, np.append(rest, start)) for start in ((0, 0), (1, 0)))
+    np.testing.assert_array_equal(quiet.x[:, :-2], loud.x[:, :-2])
+    assert loud.steps == quiet.steps <= 1.01 * run(stack(STACK), t, u, rest).steps
+    shown, true = (model.output_names.index(n) for n in ("measured_displacement", "displacement"))
+    np.testing.assert_array_equal(quiet.y[:, shown], quiet.y[:, true])
+    assert np.ptp(loud.y[:, shown] - loud.y[:, true]) == pytest.approx(4e-8, rel=1e-3)
+
+
+@pytest.mark.parametrize("single", [False, True], ids=["cascade", "single mass"])
+def test_expansion_is_proportional_to_the_temperature(single: bool) -> None:
+    base = stack(STACK)
+    if single:
+        kept = {n: v for n, v in base.values.items() if n in compose(SIMPLIFIED).values}
+        base = compose(SIMPLIFIED, kept)
+    model = base.with_effect(TEMPERATURE, {"expansion_gain": 2e-3})
+    t = np.linspace(0.0, 1000.0, 1001)
+    rise = 3.0 * np.sin(0.01 * t)
+    found = simulated(model, t, np.zeros_like(t), temperature=ROOM + rise)
+    shown = found["measured_displacement"]
+    np.testing.assert_allclose(shown, 2e-3 * rise * stroke(model), rtol=1e-9, atol=1e-20)
+    assert not np.any(found["displacement"])
+
+
+def test_the_gain_grows_with_temperature() -> None:
+    """Without hysteresis, a slow voltage gives stroke v/u_rated (1 + ratio g dT) + g dT stroke."""
+    values = {"expansion_gain": 2e-3, "temperature_gain_ratio": 1.5}
+    model = with_effect(TEMPERATURE, **values).with_values(LINEAR)
+    t = np.linspace(0.0, 1000.0, 1001)
+    rise, voltage = 0.01 * t, 60.0 * (1.0 - np.cos(0.1 * t))
+    shown = simulated(model, t, voltage, temperature=ROOM + rise)["measured_displacement"]
+    g = 2e-3 * rise
+    expected = stroke(model) * (voltage / 120.0 * (1 + 1.5 * g) + g)
+    np.testing.assert_allclose(shown, expected, rtol=0, atol=1e-4 * stroke(model))
+
+
+def test_at_the_reference_temperature_nothing_changes() -> None:
+    """Exactly: state derivatives and outputs have the base's bits, whatever the gains."""
+    model = with_effect(TEMPERATURE, expansion_gain=0.05, temperature_gain_ratio=3.0)
+    base = stack(STACK)
+    generator = np.random.default_rng(7)
+    for _ in range(10):
+        x = base.state_nominals() * generator.normal(size=len(base.state_names))
+        u = [generator.uniform(-30.0, 120.0), generator.uniform(-200.0, 200.0)]
+        warm = model.structure.f(0.0, x, [*u, ROOM], model.parameter_vector())
+        plain = base.structure.f(0.0, x, u, base.parameter_vector())
+        for ours, theirs in zip(warm, plain, strict=True):
+            np.testing.assert_array_equal(np.array(ours), np.array(theirs))

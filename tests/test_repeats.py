@@ -1,0 +1,191 @@
+"""Noise that is measured without a model: from a voltage played again, and from a held one."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from psa_casadi.diagnosis.noise_floor import noise_floor
+from psa_casadi.experiment import Record, excitation, read_record
+from psa_casadi.experiment.repeats import holds, repeats
+from psa_casadi.experiment.repetitions import held, repetitions
+
+FloatArray = NDArray[np.float64]
+
+LEVEL = 1e-8
+STEP = 1e-3
+
+
+def noise(samples: int, correlation: float, seed: int = 0) -> FloatArray:
+    white = np.random.default_rng(seed).standard_normal(samples + 500)
+    coloured: FloatArray = lfilter([np.sqrt(1 - correlation**2)], [1, -correlation], white)
+    return LEVEL * coloured[500:]
+
+
+def grid(samples: int) -> FloatArray:
+    return STEP * np.arange(samples, dtype=np.float64)
+
+
+def record(voltage: FloatArray, displacement: FloatArray) -> Record:
+    return Record("r", grid(voltage.size), voltage, displacement)
+
+
+def sine(samples: int, period: float = 500.0) -> FloatArray:
+    voltage: FloatArray = 50.0 * (1.0 - np.cos(2 * np.pi * np.arange(samples) / period))
+    return voltage
+
+
+def loop_error(voltage: FloatArray) -> FloatArray:
+    """Return an error thirty times the noise that every period repeats, branches apart."""
+    error: FloatArray = 3e-7 * np.sin(voltage / 9.0) + 2e-7 * np.tanh(10.0 * np.gradient(voltage))
+    return error
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+@pytest.mark.parametrize("seed", range(4))
+def test_periods_show_level_and_colour_beside_a_large_repeated_error(
+    correlation: float, seed: int
+) -> None:
+    v = sine(20_000)
+    n = np.arange(v.size)
+    drift = 5e-7 * (n / n.size) ** 2
+    first = np.where(n < 500, 4e-7 * np.exp(-n / 200.0), 0.0)  # the virgin curve
+    y = 1e-7 * v + loop_error(v) + drift + first + noise(v.size, correlation, seed)
+    found = repeats(record(v, y))
+    assert found is not None
+    assert found.level == pytest.approx(LEVEL, rel=0.05)
+    ratio = found.autocovariance[:6] / found.autocovariance[0]
+    assert ratio == pytest.approx(correlation ** np.arange(6), abs=0.06)
+    assert found.distances[0] == pytest.approx(0.5)
+    assert 10_000 < found.samples <= v.size
+    if correlation:
+        assert found.autoregression[0] == pytest.approx(correlation, abs=0.05)
+    else:
+        assert np.all(np.abs(found.autoregression) < 0.05)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_missing_samples_change_nothing(correlation: float) -> None:
+    v = sine(20_000)
+    y = 1e-7 * v + loop_error(v) + noise(v.size, correlation)
+    y[np.random.default_rng(1).random(v.size) < 0.2] = np.nan
+    y[7_000:8_000] = np.nan
+    found = repeats(record(v, y))
+    assert found is not None
+    assert found.level == pytest.approx(LEVEL, rel=0.05)
+    assert found.autocovariance[1] / found.autocovariance[0] == pytest.approx(correlation, abs=0.05)
+
+
+def test_a_period_of_no_whole_number_of_samples() -> None:
+    v = sine(30_000, 777.3)
+    found = repeats(record(v, 1e-7 * v + loop_error(v) * 0.1 + noise(v.size, 0.0)))
+    assert found is not None
+    assert found.level == pytest.approx(LEVEL, rel=0.05)
+
+
+def segment() -> FloatArray:
+    t = np.arange(6_000) / 6_000
+    v: FloatArray = 50.0 + 40.0 * np.sin(2 * np.pi * 7 * t) * np.cos(2 * np.pi * 1.5 * t)
+    return v
+
+
+def test_a_segment_played_twice_counts_from_where_its_history_is_the_same() -> None:
+    part = segment()
+    v = np.concatenate([np.linspace(0, 50, 400), part, np.linspace(50, 5, 900), part, part[:1]])
+    y = 1e-7 * v + loop_error(v) + noise(v.size, 0.0)
+    (found,) = repetitions(record(v, y))
+    assert found.lag == 6_900
+    assert abs(found.stop - 6_400) < 6
+    both = max(int(np.argmax(part)), int(np.argmin(part)))
+    assert found.settled >= 400 + min(both, 1_500)
+    level = repeats(record(v, y))
+    assert level is not None
+    assert level.level == pytest.approx(LEVEL, rel=0.05)
+
+
+def test_what_is_not_repeated_shows_nothing() -> None:
+    time = grid(8_000)
+    once = excitation.multisine(time, 0.0, 100.0, (0.125, 20.0), seed=1)
+    ramp = np.linspace(0.0, 100.0, 8_000)
+    decay = excitation.decaying_triangle(time, 0.0, 100.0, 6)
+    for v in (once, ramp, decay, np.full(8_000, 30.0)):
+        assert repeats(record(v, 1e-7 * v + noise(v.size, 0.0))) is None
+    assert repeats(replace(record(ramp, ramp), displacement=None)) is None
+
+
+def test_another_load_is_no_repeat() -> None:
+    v = sine(4_000)
+    r = record(v, 1e-7 * v + noise(v.size, 0.0))
+    ramped = replace(r, load_force=np.linspace(0.0, 10.0, v.size))
+    assert repeats(r) is not None
+    assert repeats(ramped) is None
+
+
+def held_levels() -> tuple[FloatArray, FloatArray]:
+    levels = np.array([0.0, 50.0, 20.0, 80.0])
+    v = np.repeat(levels, 5_000)
+    since = np.tile(np.arange(5_000), 4)
+    change = np.repeat(np.diff(levels, prepend=0.0), 5_000)
+    creep: FloatArray = 1e-7 * v + 2e-9 * change * np.log10(1.0 + since / 30.0)
+    return v, creep
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_holds_show_the_noise_around_a_creep(correlation: float) -> None:
+    v, creep = held_levels()
+    found = holds(record(v, creep + noise(v.size, correlation)))
+    assert found is not None
+    assert found.count == 4
+    assert found.level == pytest.approx(LEVEL, rel=0.05)
+    assert found.autocovariance[1] / found.autocovariance[0] == pytest.approx(correlation, abs=0.05)
+
+
+def test_held_spans_are_no_ramps() -> None:
+    v, _ = held_levels()
+    assert held(record(v, v)) == [(k, k + 5_000) for k in range(0, 20_000, 5_000)]
+    slow = np.linspace(0.0, 100.0, 100_000)
+    assert held(record(slow, slow)) == []
+    assert held(record(sine(20_000), sine(20_000))) == []
+
+
+def test_the_noise_floor_takes_the_best_source() -> None:
+    rng = np.random.default_rng(3)
+    v, creep = held_levels()
+    time = grid(v.size)
+    once = excitation.multisine(time, 0.0, 100.0, (0.05, 20.0), seed=1)
+    rows = [(sine(v.size), 1e-7 * sine(v.size)), (v, creep), (once, 1e-7 * once)]
+    records = [record(u, y + LEVEL * rng.standard_normal(u.size)) for u, y in rows]
+    residuals = [r.displacement - y for r, (_, y) in zip(records, rows, strict=True)]  # type: ignore[operator]
+    floors = noise_floor(records, residuals)
+    assert [f.source for f in floors] == ["repeats", "holds", "fast differences"]
+    for floor in floors:
+        assert floor.level == pytest.approx(LEVEL, rel=0.05)
+        assert floor.autocovariance[0] == pytest.approx(floor.level**2)
+        assert "nm rms" in floor.sentence
+        assert floor.quantum is None
+
+
+def test_a_coarse_sensor_has_at_least_the_noise_of_rounding() -> None:
+    time = grid(6_000)
+    v = excitation.multisine(time, 0.0, 100.0, (0.2, 2.0), seed=1)
+    step = 1e-7
+    y = step * np.round((1e-7 * v + 1e-9 * np.random.default_rng(0).standard_normal(6_000)) / step)
+    (floor,) = noise_floor([record(v, y)], [y - 1e-7 * v])
+    assert floor.quantum == pytest.approx(step, rel=1e-3)
+    assert floor.level >= step / np.sqrt(12.0) * 0.999
+    assert floor.autocovariance[0] == pytest.approx(floor.level**2)
+    assert "steps of 0.1 um" in floor.sentence
+
+
+@pytest.mark.parametrize(("file", "samples"), [("sine_1hz.csv", 5_000), ("minor_loops.csv", 1_500)])
+def test_the_micromanipulator_repeats(measured_data: Path, file: str, samples: int) -> None:
+    r = read_record(measured_data / "micromanipulator" / file)
+    found = repeats(r)
+    assert found is not None
+    assert found.distances[0] == pytest.approx(1.0, abs=0.006)
+    assert found.level == pytest.approx(0.07e-6, rel=0.1)
+    assert found.samples >= samples
+    assert holds(r) is None

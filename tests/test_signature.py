@@ -1,0 +1,119 @@
+"""The signature of an effect: told along a coordinate that physics gives, for every effect."""
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.diagnosis.signature import signature, standard_voltage
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.report.signature_figure import save_signature, size_sentence
+
+#: Coordinates along which physics says that an effect is to be seen.
+TOLD = {
+    "slow_creep": {"holds"},
+    "hysteresis_memory": {"from_reversal"},
+    "rate_independent_asymmetry": {"from_reversal"},
+    "field_dependent_gain": {"voltage", "displacement"},
+    "saturation_of_strain": {"voltage", "displacement"},
+    "structural_mode": {"spectrum"},
+    "load_stiffness": {"displacement"},
+    "preload_loss": {"displacement"},
+    "backlash": {"from_reversal"},
+    "voltage_saturation": {"voltage", "displacement"},
+    "drive_lag": {"rate"},
+    "sensor_delay": {"rate"},
+    "sensor_lag": {"rate"},
+    "sensor_nonlinearity": {"displacement"},
+    "offset_drift": {"time"},
+    "ageing": {"time"},
+    "mains_hum": {"spectrum"},
+    "temperature": {"temperature"},
+}
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_the_telling_coordinate_is_the_physical_one(name: str) -> None:
+    seen = signature(EFFECTS[name])
+    assert seen.telling.name in TOLD[name]
+    assert 0.5 < seen.telling.share <= 1.0
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_every_effect_has_a_signature_of_a_telling_size(name: str) -> None:
+    seen = signature(EFFECTS[name])
+    d = seen.difference
+    assert np.isfinite(d).all()
+    assert 1e-3 < np.std(d) / seen.stroke < 0.05
+    # offset and slope of the base are fitted: what is left is orthogonal to both
+    for known in (np.ones_like(d), seen.base - np.mean(seen.base)):
+        assert abs(d @ known) < 1e-6 * np.linalg.norm(d) * np.linalg.norm(known)
+    assert seen.telling.x.size == seen.telling.mean.size >= 3
+    assert seen.coordinate.shape == seen.counted.shape
+    low, high = EFFECTS[name].parameters[0].bounds
+    assert low <= seen.size <= high or seen.gain != EFFECTS[name].parameters[0].name
+
+
+def test_creep_grows_during_holds_and_hum_is_a_line_at_its_frequency() -> None:
+    creep = signature(EFFECTS["slow_creep"])
+    assert np.all(np.diff(creep.telling.mean[creep.telling.x > 0.01]) > 0)
+    hum = signature(EFFECTS["mains_hum"]).telling
+    assert hum.x[np.argmax(hum.mean)] == pytest.approx(50.0, abs=0.5)
+    delay = signature(EFFECTS["sensor_delay"])
+    # a reading that lags by T differs by -T times its rate
+    slope = np.polyfit(delay.telling.x, delay.telling.mean, 1)[0]
+    gain = delay.stroke / np.ptp(delay.voltage)
+    assert slope == pytest.approx(-delay.size * gain, rel=0.25)
+
+
+def test_a_signature_is_that_of_the_stack_given() -> None:
+    stack = stack_model("PTBS200")
+    seen = signature(EFFECTS["sensor_nonlinearity"], stack)
+    assert seen.stack == stack.name
+    assert np.ptp(seen.voltage) == pytest.approx(200.0)
+    assert seen.telling.name == "displacement"
+
+
+def test_the_standard_voltage_has_two_amplitudes_two_rates_and_holds() -> None:
+    time, voltage = standard_voltage(0.25, 120.0)
+    assert 1.0 < time[-1] < 2.5
+    assert voltage.min() == 0.0
+    assert voltage.max() == pytest.approx(120.0)
+    still = np.count_nonzero(np.diff(voltage) == 0.0) / voltage.size
+    assert 0.3 < still < 0.6
+
+
+@pytest.mark.parametrize("name", ["slow_creep", "mains_hum"])
+def test_the_picture_is_written_whole(tmp_path: Path, name: str) -> None:
+    seen = signature(EFFECTS[name])
+    save_signature(EFFECTS[name], seen, tmp_path / "s.png")
+    data = (tmp_path / "s.png").read_bytes()
+    assert struct.unpack(">II", data[16:24]) == (1300, 620)
+    assert len(data) > 20_000
+    assert f"{seen.gain} = " in size_sentence(replace(seen, size=0.5))
+    with pytest.raises(InputError, match="does not exist"):
+        save_signature(EFFECTS[name], seen, tmp_path / "absent" / "s.png")
+
+
+def test_the_command_draws_one_effect_and_says_what_it_cannot_draw(tmp_path: Path) -> None:
+    path = tmp_path / "delay.png"
+    drawn = CliRunner().invoke(app, ["effects", "sensor-delay", "--figure", str(path)])
+    assert drawn.exit_code == 0, drawn.output
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert "phase linear in frequency" in " ".join(drawn.stdout.split())
+    assert f"written: {path}" in drawn.stdout
+    nameless = CliRunner().invoke(app, ["effects", "--figure", str(tmp_path / "x.png")])
+    assert nameless.exit_code == 2
+    assert "none is named" in nameless.stderr
+    absent = str(tmp_path / "absent" / "x.png")
+    both = CliRunner().invoke(app, ["effects", "slow_crep", "--figure", absent])
+    assert both.exit_code == 2
+    assert "did you mean slow_creep" in both.stderr
+    assert "does not exist" in " ".join(both.stderr.split())
+    assert [p.name for p in tmp_path.iterdir()] == ["delay.png"]
