@@ -7,6 +7,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.evidence import evidence
 from psa_casadi.diagnosis.rounds import Round, examine
 from psa_casadi.diagnosis.selection import extend, polish, starts_of
+from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.refitting import Progress, refit
@@ -25,7 +26,7 @@ def without_needless(
     for cause in causes[:-1]:
         progress(f"without {cause.name}")
         less = _without(last.fit, cause, experiments)
-        if evidence(less, last.fit, last.screening.colour) < 0.0:
+        if less is not None and evidence(less, last.fit, last.screening.colour) < 0.0:
             kept = [c for c in causes if c is not cause]
             rebuilt = _rebuilt(rounds[0], kept, experiments, progress)
             if rebuilt is not None:
@@ -33,10 +34,14 @@ def without_needless(
     return rounds
 
 
-def _without(final: Fit, cause: Component, experiments: Sequence[Experiment]) -> Fit:
+def _without(final: Fit, cause: Component, experiments: Sequence[Experiment]) -> Fit | None:
+    """Fit without a cause; None where the other values cannot even be simulated without it."""
     model = final.model.without([cause.name])
     names = [n for n in final.unknowns.names if n in model.values]
-    return refit(replace(final, model=model), experiments, names)
+    try:
+        return refit(replace(final, model=model), experiments, names)
+    except PsaError:
+        return None
 
 
 def _rebuilt(

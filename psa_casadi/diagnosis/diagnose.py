@@ -20,6 +20,7 @@ from psa_casadi.diagnosis.rounds import Round, examine, search_cause
 from psa_casadi.diagnosis.selection import OF_FIRST
 from psa_casadi.diagnosis.verdict import PARTLY, conclude
 from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import PsaError
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment, split, whole
 from psa_casadi.experiment.suspects import cleaned
@@ -183,7 +184,7 @@ def _retried(
     tried.add("extension")
     progress("base fit, from the extension's parameters")
     again = from_extension(base, chosen, experiments)
-    return again if again.rms < BETTER_BASE * base.rms else None
+    return again if again is not None and again.rms < BETTER_BASE * base.rms else None
 
 
 def _round(
@@ -200,7 +201,10 @@ def _settle(
     if len(rounds) < 3 or not last.test.alarm:
         return rounds
     progress("all causes together, to the end")
-    again = refit(last.fit, experiments, last.fit.unknowns.names)
+    try:
+        again = refit(last.fit, experiments, last.fit.unknowns.names)
+    except PsaError:
+        return rounds
     predicted = tuple(again.predicted(experiments))
     before = held_out_rms(experiments, last.predicted)
     if held_out_rms(experiments, predicted) < before:

@@ -20,9 +20,10 @@ from psa_casadi.identification.unknowns import LINEAR_PRIOR
 
 FloatArray = npt.NDArray[np.float64]
 
-#: ln B is divided by this before it becomes a probability: effects of the table are not the true
-#: equations, so that their evidence differs by more than noise. Calibrated by `psa bench diagnose`.
-TEMPERATURE = 3.0
+#: ln B is divided by this, or by this share of the largest, before it becomes a probability: the
+#: effects are not the true equations, so that their evidence differs by more than noise, and the
+#: more the stronger the effect is. Checked by the reliability table of `psa bench diagnose`.
+TEMPERATURE, FORM = 3.0, 0.007
 
 
 def evidence(before: Fit, after: Fit, colour: Colour) -> float:
@@ -62,7 +63,8 @@ def probabilities(evidences: Mapping[str, float]) -> dict[str, float]:
     """Return the probability of each effect, given that one of them is the cause."""
     if not evidences:
         return {}
-    values = np.array(list(evidences.values())) / TEMPERATURE
+    given = np.array(list(evidences.values()))
+    values = given / max(TEMPERATURE, FORM * float(np.max(given)))
     weights = np.exp(values - np.logaddexp.reduce(values))
     return dict(zip(evidences, weights.tolist(), strict=True))
 

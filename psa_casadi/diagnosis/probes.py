@@ -21,7 +21,8 @@ from psa_casadi.simulation.start import memory_names
 
 FloatArray = npt.NDArray[np.float64]
 
-_PEAKS = 4
+#: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
+_PEAKS, _FINER = 4, 8
 _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
 
 
@@ -63,15 +64,19 @@ def directions(
 def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
     """Frequencies [Hz] of the highest peaks in the spectrum of the first record's residual.
 
-    The range of a periodic drive's harmonics is left out: it may be distortion.
+    Samples that do not count are 0, so that a line keeps its phase across them. The range of a
+    periodic drive's harmonics is left out: it may be distortion.
     """
     experiment = experiments[0]
-    count = int(experiment.used.sum())
-    residual = fit.residuals[:count] - np.mean(fit.residuals[:count])
-    power = np.abs(np.fft.rfft(residual * np.hanning(count))) ** 2
-    frequency = np.fft.rfftfreq(count, experiment.record.sample_time)
-    lowest = max(8, count // 200)
-    where, _ = find_peaks(power[lowest:], distance=max(3, count // 200))
+    count = experiment.stop
+    used = experiment.used[:count]
+    residual = np.zeros(count)
+    residual[used] = fit.residuals[: int(used.sum())]
+    residual[used] -= np.mean(residual[used])
+    power = np.abs(np.fft.rfft(residual * np.hanning(count), _FINER * count)) ** 2
+    frequency = np.fft.rfftfreq(_FINER * count, experiment.record.sample_time)
+    lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
+    where, _ = find_peaks(power[lowest:], distance=apart)
     order = where[np.argsort(power[lowest:][where])[::-1]] + lowest
     tones = [k for k in order[: 5 * _PEAKS] if not among_harmonics(frequency[k], experiment.record)]
     strongest = np.array(tones[:_PEAKS], dtype=int)

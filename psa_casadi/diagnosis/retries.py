@@ -30,12 +30,11 @@ _QUICK, _FIRST, _BEST = 8, 4, 2
 _NEAR_BAND, _GRID, _DAMPING = (300.0, 10_000.0), (0.4, 0.7, 1.0, 1.4, 2.0, 2.8), 0.15
 
 
-def from_extension(first: Fit, extension: Extension, experiments: Sequence[Experiment]) -> Fit:
-    """Fit the base once more from an extension's parameters."""
-    names = first.unknowns.names
-    values = {n: extension.fit.model.values[n] for n in names}
-    moved = replace(first, model=first.model.with_values(values))
-    return refit(moved, experiments, names)
+def from_extension(
+    first: Fit, extension: Extension, experiments: Sequence[Experiment]
+) -> Fit | None:
+    """Fit the base again from an extension's parameters; None where that cannot be simulated."""
+    return _moved(first, extension.fit, first.unknowns.names, experiments)
 
 
 def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
@@ -98,13 +97,22 @@ def from_mode(
     return _in_base(base, before, final, experiments)
 
 
-def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experiment]) -> Fit:
+def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experiment]) -> Fit | None:
     """Return the base fitted from where a fit with more masses, and perhaps causes, has led."""
     if before is base:
         return found
     names = [n for n in found.unknowns.names if n in base.model.values]
+    return _moved(base, found, names, experiments)
+
+
+def _moved(
+    base: Fit, found: Fit, names: Sequence[str], experiments: Sequence[Experiment]
+) -> Fit | None:
     values = {n: found.model.values[n] for n in names}
-    return refit(replace(base, model=base.model.with_values(values)), experiments, names)
+    try:
+        return refit(replace(base, model=base.model.with_values(values)), experiments, names)
+    except PsaError:
+        return None
 
 
 def _masses(

@@ -45,7 +45,7 @@ SELF_HEATING = Component(
             "heating_gain",
             0.0,
             "1/J",
-            (-1e9, 1e9),
+            (0.0, 1e9),
             "growth of the gain per joule of electric energy still felt",
             scale=_scale,
         ),
