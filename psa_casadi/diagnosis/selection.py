@@ -31,13 +31,13 @@ _QUICK_RTOL = 1e-4
 _POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
 #: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
 MARGIN = 3.0
-#: Share of the excess power that a first and a further effect must remove to be added.
-WORTHWHILE, FURTHER = 0.25, 0.5
+#: Share of the excess power that an effect must remove to be added.
+WORTHWHILE = 0.25
 #: Gain in log-likelihood of the held-out samples that a first and a further effect must bring.
 HELD_OUT, HELD_OUT_FURTHER = 1.0, 4.0
 #: A further effect must remove this share of what the first one did: less may be the first one's
 #: form, which is not the true one.
-OF_FIRST = 0.1
+OF_FIRST = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,18 +257,18 @@ def choose(
 
     Worth having: evidence; the effect in character; a share of the training residual's power above
     the noise `floor` removed; and held-out data predicted better. A further cause, beside the
-    `first`, is asked for more of both. The order is that of the evidence; within the margin the
-    better prediction leads.
+    `first`, must also remove a share of what that one did. The order is that of the evidence;
+    within the margin the better prediction leads.
     """
     excess = before.rms**2 - floor**2
-    share, needed = (WORTHWHILE, HELD_OUT) if first is None else (FURTHER, HELD_OUT_FURTHER)
+    needed = HELD_OUT if first is None else HELD_OUT_FURTHER
     held = sum(int(e.held_out.sum()) for e in experiments) / colour.inflation
     good = [
         e
         for e in extensions
         if e.evidence > 0
         and not out_of_character(e, experiments)
-        and e.removed > share * excess
+        and e.removed > WORTHWHILE * excess
         and (first is None or e.removed > OF_FIRST * first.removed)
         and held * np.log(before_holdout / max(e.holdout_rms, 1e-300)) > needed
     ]

@@ -1,7 +1,8 @@
 """Backlash: the output dwells after every reversal until a gap of fixed width is crossed.
 
 Play is the motion minus a stop: z follows the output mass until |z| = w and then rests. After a
-reversal z moves from one end to the other and the output, at gain 1, stands still over 2 w.
+reversal z moves from one end to the other and the output, at gain 1, stands still over 2 w. A guide
+with dry friction does the same in the displacement: it holds the output back over a fixed width.
 """
 
 from psa_casadi.component import Component, Equations, Symbols
@@ -33,7 +34,7 @@ def _stop_scale(p: Values) -> float:
 
 BACKLASH = Component(
     name="backlash",
-    description="play between the output mass and what is measured",
+    description="play, or a guide that sticks, between the output mass and what is measured",
     source=(
         "play and stop operators (Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989) in"
         " smooth Bouc-Wen form"

@@ -134,8 +134,9 @@ def _residual(axes: Axes, s: Series) -> None:
 
 
 def _evidence(axes: Axes, d: Diagnosis) -> None:
-    rows = d.candidates[::-1]
     causes = {c.effect for c in d.causes}
+    shown = [c for k, c in enumerate(d.candidates) if k < _MOST_BARS or c.effect in causes]
+    rows = shown[::-1]
     values = [c.evidence for c in rows]
     names = [textwrap.fill(plain(c.effect), 17) for c in rows]
     axes.barh(names, values, color=[bar_colour(c, causes) for c in rows])
@@ -148,10 +149,14 @@ def _evidence(axes: Axes, d: Diagnosis) -> None:
     for k, c in enumerate(rows):
         text = f" {share_text(c)}"
         axes.annotate(text, (max(c.evidence, 0.0), k), va="center", fontsize=_FONT - 1.5)
-    _style(axes, "Evidence, and share explained", "evidence over the base [ln units]", "")
+    left = len(d.candidates) - len(shown)
+    title = "Evidence, and share explained" + (f" ({left} lower ones not shown)" if left else "")
+    _style(axes, title, "evidence over the base [ln units]", "")
     axes.grid(visible=False, axis="y")
 
 
+#: Bars for which there is room.
+_MOST_BARS = 9
 #: Every second power of ten: the scale is linear up to 10, logarithmic beyond.
 _TICKS = [0.0] + [sign * 10.0**k for k in (1, 3, 5, 7, 9) for sign in (-1, 1)]
 
