@@ -30,6 +30,9 @@ FIXED = frozenset({"drift_span", "temperature_reference"})
 _QUICK, _FINALISTS, _FIRST = 12, 3, 5
 #: The second best is followed to the end where its cost is at most this much larger.
 _NEAR = 1.5
+#: A fit misses the records where its mean weighted square exceeds this; so many starts are then
+#: followed to the end.
+_MISSED, _FOLLOWED = 2.0, 4
 #: A start whose quick fit comes this close to the best one's cost is followed to the end.
 _CLOSE = 1.02
 
@@ -80,11 +83,12 @@ def search(
 ) -> Search:
     """Fit the core parameters from several starts, then whatever else the data can tell.
 
-    The starts are the shapes of loop with the first of the `linear` candidates (lags and
-    resonances), and the other candidates with the first shape. Each gets a quick fit; the best and
-    the second best are followed to the end, if that one is close or, with `thorough`, not far, to
-    tell whether starts agree. A keyboard interrupt ends the search at the best fit so far. Raises
-    PsaError when no start can be simulated.
+    The starts are the records' loops and ordinary shapes with the first of the `linear` candidates
+    (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
+    best and the second best are followed to the end, if that one is close or, with `thorough`, not
+    far, to tell whether starts agree; with `thorough` more of them while all miss the records. A
+    keyboard interrupt ends the search at the best fit so far. Raises PsaError when no start can be
+    simulated.
     """
     core = free_parameters(model)
     fastest = min(e.record.sample_time for e in experiments)
@@ -94,9 +98,10 @@ def search(
     free = found[0][1].unknowns.names
     sigma = residual_noise(found[0][1], experiments)
     polished: list[Fit] = []
-    for name, quick in found[:2]:
-        limit = (_NEAR if thorough else _CLOSE) * found[0][1].cost
-        if polished and (quick.cost >= limit or polished[0].interrupted):
+    for name, quick in found:
+        near = quick.cost < (_NEAR if thorough else _CLOSE) * found[0][1].cost
+        missed = thorough and len(polished) < _FOLLOWED and all(map(_misses, polished))
+        if polished and (polished[0].interrupted or not (missed or (near and len(polished) < 2))):
             break
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit(quick, experiments, free, sigma=sigma)
@@ -111,6 +116,11 @@ def search(
         not_unique |= set(open_ones)
     names = best.unknowns.names
     return Search(best, outcomes, tuple(n for n in names if n in not_unique))
+
+
+def _misses(found: Fit) -> bool:
+    """Whether a fit leaves much more than the noise, or lost itself on the way there."""
+    return found.cost > _MISSED * len(found.residuals)
 
 
 def _outcomes(
