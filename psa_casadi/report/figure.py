@@ -138,7 +138,7 @@ def _evidence(axes: Axes, d: Diagnosis) -> None:
     shown = [c for k, c in enumerate(d.candidates) if k < _MOST_BARS or c.effect in causes]
     rows = shown[::-1]
     values = [c.evidence for c in rows]
-    names = [textwrap.fill(plain(c.effect), 17) for c in rows]
+    names = [textwrap.fill(plain(c.effect), 22) for c in rows]
     axes.barh(names, values, color=[bar_colour(c, causes) for c in rows])
     axes.set_xscale("symlog", linthresh=10.0)
     largest = max([abs(v) for v in values], default=1.0)
@@ -149,8 +149,9 @@ def _evidence(axes: Axes, d: Diagnosis) -> None:
     for k, c in enumerate(rows):
         text = f" {share_text(c)}"
         axes.annotate(text, (max(c.evidence, 0.0), k), va="center", fontsize=_FONT - 1.5)
-    left = len(d.candidates) - len(shown)
-    title = "Evidence, and share explained" + (f" ({left} lower ones not shown)" if left else "")
+    every = len(shown) == len(d.candidates)
+    count = "" if every else f" ({len(shown)} of {len(d.candidates)} effects)"
+    title = f"Evidence{count}"
     _style(axes, title, "evidence over the base [ln units]", "")
     axes.grid(visible=False, axis="y")
 
