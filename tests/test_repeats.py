@@ -12,6 +12,7 @@ from psa_casadi.diagnosis.noise_floor import noise_floor
 from psa_casadi.experiment import Record, excitation, read_record
 from psa_casadi.experiment.repeats import holds, repeats
 from psa_casadi.experiment.repetitions import held, repetitions
+from psa_casadi.identification.prediction import measured
 
 FloatArray = NDArray[np.float64]
 
@@ -158,7 +159,7 @@ def test_the_noise_floor_takes_the_best_source() -> None:
     once = excitation.multisine(time, 0.0, 100.0, (0.05, 20.0), seed=1)
     rows = [(sine(v.size), 1e-7 * sine(v.size)), (v, creep), (once, 1e-7 * once)]
     records = [record(u, y + LEVEL * rng.standard_normal(u.size)) for u, y in rows]
-    residuals = [r.displacement - y for r, (_, y) in zip(records, rows, strict=True)]  # type: ignore[operator]
+    residuals = [measured(r) - y for r, (_, y) in zip(records, rows, strict=True)]
     floors = noise_floor(records, residuals)
     assert [f.source for f in floors] == ["repeats", "holds", "fast differences"]
     for floor in floors:

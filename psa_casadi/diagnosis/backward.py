@@ -5,8 +5,9 @@ from dataclasses import replace
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.evidence import evidence
+from psa_casadi.diagnosis.extension import extend, polish
 from psa_casadi.diagnosis.rounds import Round, examine
-from psa_casadi.diagnosis.selection import extend, polish, starts_of
+from psa_casadi.diagnosis.selection import starts_of
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
@@ -48,7 +49,7 @@ def _rebuilt(
     first: Round, causes: Sequence[Component], experiments: Sequence[Experiment], progress: Progress
 ) -> list[Round] | None:
     """Return rounds with the causes in their order; None where one of them cannot be fitted."""
-    rounds = [replace(first, extensions=list(first.extensions), chosen=None, rivals=[])]
+    rounds = [replace(first, extensions=list(first.extensions), chosen=None)]
     for cause in causes:
         current = rounds[-1]
         colour = current.screening.colour

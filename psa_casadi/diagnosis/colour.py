@@ -59,10 +59,10 @@ def colour_of(
 ) -> Colour:
     """Return colour and level of what no model and no candidate explains.
 
-    `known` holds the autoregression of records whose noise is known without a model (repeats,
-    holds). The others share one of first order, estimated from the remainder: it can describe the
-    noise of a sensor with a filter, but neither a tone nor a slow misfit on top of white noise, so
-    that those remain visible after whitening.
+    `known` holds the autoregression of records whose noise is known without a model (repeats). The
+    others share one of first order, estimated from the remainder: it can describe the noise of a
+    sensor with a filter, but neither a tone nor a slow misfit on top of white noise, so that those
+    remain visible after whitening.
     """
     given = list(known or [None] * len(lengths))
     top = bottom = 0.0

@@ -53,6 +53,19 @@ def noise_floor(
     return tuple(_floor(r, e) for r, e in zip(records, residuals, strict=True))
 
 
+def pooled_level(noise: Sequence[NoiseFloor], residuals: Sequence[FloatArray]) -> float:
+    """Return the rms of the noise over all records [m].
+
+    Where no voltage was repeated that of the residual's fast differences counts: a hold may ring.
+    """
+    counts = [np.count_nonzero(np.isfinite(e)) for e in residuals]
+    powers = [
+        n.level**2 if n.source == "repeats" else high_frequency_noise(e[np.isfinite(e)]) ** 2
+        for n, e in zip(noise, residuals, strict=True)
+    ]
+    return float(np.sqrt(np.average(powers, weights=counts)))
+
+
 #: Samples from which the colour of the noise is known without a model.
 _COLOUR = 500
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psa_casadi.diagnosis.selection import Extension
+from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit, fit

@@ -9,19 +9,18 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.evidence import estimated, probabilities
+from psa_casadi.diagnosis.extension import (
+    Extension,
+    extend,
+    extend_afresh,
+    extend_like,
+    polish,
+)
 from psa_casadi.diagnosis.noise_floor import known_colour
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.probes import Direction, directions
 from psa_casadi.diagnosis.screening import Screening, copies, screen
-from psa_casadi.diagnosis.selection import (
-    Extension,
-    choose,
-    extend,
-    extend_afresh,
-    extend_like,
-    leading,
-    polish,
-)
+from psa_casadi.diagnosis.selection import choose, leading
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.noise import high_frequency_noise
@@ -55,7 +54,6 @@ class Round:
     test: Omnibus
     extensions: list[Extension] = field(default_factory=list)
     chosen: Extension | None = None
-    rivals: list[Extension] = field(default_factory=list)
     evidence: Mapping[str, float] = field(default_factory=dict)
     probability: Mapping[str, float] = field(default_factory=dict)
 
@@ -131,12 +129,11 @@ def search_cause(
     ranked = choose(current.extensions, experiments, current.fit, before, floor, colour, first)
     fitted = {e.effect.name: e.evidence for e in current.extensions}
     refused = {name for name in fitted if name not in {e.effect.name for e in ranked}}
-    current.evidence = estimated(current.fit, current.screening) | fitted
+    current.evidence = {**current.evidence, **fitted}
     current.probability = probabilities(
         {name: v for name, v in current.evidence.items() if name not in refused}
     )
-    if ranked:
-        current.chosen, current.rivals = ranked[0], ranked[1:]
+    current.chosen = ranked[0] if ranked else None
 
 
 def _sort(current: Round) -> None:

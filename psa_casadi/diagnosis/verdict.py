@@ -8,8 +8,9 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.errors_of import errors_of, gain_of, held_out_rms
 from psa_casadi.diagnosis.evidence import credible_set
+from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
-from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor
+from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
@@ -21,12 +22,10 @@ from psa_casadi.diagnosis.result import (
     Verdict,
 )
 from psa_casadi.diagnosis.rounds import Round
-from psa_casadi.diagnosis.selection import Extension
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
-from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prediction import measured
 
 FloatArray = npt.NDArray[np.float64]
@@ -47,8 +46,9 @@ def conclude(
     first, last = rounds[0], rounds[-1]
     chosen = [r for r in rounds if r.chosen is not None]
     errors = _whole_residuals(experiments, last.predicted)
+    base_errors = _whole_residuals(experiments, first.predicted)
     noise = noise_floor([e.record for e in experiments], errors)
-    floor = _pooled(noise, errors)
+    floor = pooled_level(noise, errors)
     share = _explained_share(experiments, first, last, floor)
     missing = first.test.alarm or first.chosen is not None
     verdict: Verdict
@@ -65,15 +65,18 @@ def conclude(
     named = chosen if verdict in ("cause_named", "partly_explained", "ambiguous") else []
     final = last if named else first
     found = determinacy(final.fit, experiments)
+    missed = _misfits(experiments, base_errors, noise)
     causes = tuple(
         _cause(
             r,
+            r.chosen,
             last.fit,
             found,
             _explained_share(experiments, r, after, floor),
             partly=verdict == "partly_explained",
         )
         for r, after in zip(named, rounds[1:], strict=False)
+        if r.chosen is not None
     )
     return Diagnosis(
         verdict=verdict,
@@ -99,8 +102,8 @@ def conclude(
             stiffness_given,
         ),
         noise=noise,
-        misfit=_misfits(experiments, first.predicted, noise),
-        remainder=_misfits(experiments, final.predicted, noise),
+        misfit=missed,
+        remainder=_misfits(experiments, errors, noise) if named else missed,
     )
 
 
@@ -111,25 +114,11 @@ def _whole_residuals(
     return [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
 
 
-def _pooled(noise: Sequence[NoiseFloor], errors: Sequence[FloatArray]) -> float:
-    """Return the rms of the noise over all records [m].
-
-    Where no voltage was repeated that of the residual's fast differences counts: a hold may ring.
-    """
-    counts = [np.count_nonzero(np.isfinite(e)) for e in errors]
-    powers = [
-        n.level**2 if n.source == "repeats" else high_frequency_noise(e[np.isfinite(e)]) ** 2
-        for n, e in zip(noise, errors, strict=True)
-    ]
-    return float(np.sqrt(np.average(powers, weights=counts)))
-
-
 def _misfits(
     experiments: Sequence[Experiment],
-    predicted: Sequence[FloatArray],
+    errors: Sequence[FloatArray],
     noise: Sequence[NoiseFloor],
 ) -> tuple[Misfit, ...]:
-    errors = _whole_residuals(experiments, predicted)
     return tuple(
         misfit(e.record, error, floor)
         for e, error, floor in zip(experiments, errors, noise, strict=True)
@@ -155,12 +144,13 @@ def _told_from(r: Round) -> tuple[str, ...]:
     return tuple(name for name in within if name != r.chosen.effect.name)
 
 
-def _cause(r: Round, final: Fit, found: Determinacy, own: float, *, partly: bool) -> Cause:
+def _cause(
+    r: Round, chosen: Extension, final: Fit, found: Determinacy, own: float, *, partly: bool
+) -> Cause:
     """State a cause; `own` is the share that it explains of what was left before it.
 
     The confidence is the probability of the effect, times that share where structure remains.
     """
-    chosen: Extension = r.chosen  # type: ignore[assignment]
     estimates = {
         p.name: Estimate(
             final.model.values[p.name],

@@ -6,9 +6,9 @@ with dry friction does the same in the displacement: it holds the output back ov
 """
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.effects.sizes import smooth_magnitude, stroke
+from psa_casadi.effects.sizes import stroke
 from psa_casadi.scales import stroke_scale
-from psa_casadi.smooth import magnitude_power, signed_power
+from psa_casadi.smooth import magnitude_power, signed_power, smooth_magnitude
 from psa_casadi.variables import Parameter, State, Values
 
 #: Exponent of the smooth stop; 2 bends gently, infinity is the ideal one.

@@ -8,7 +8,7 @@ bend of their middle line is what the base lacks.
 """
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.effects.sizes import smooth_magnitude
+from psa_casadi.smooth import smooth_magnitude
 from psa_casadi.variables import Parameter
 
 #: Width of the smooth magnitude, over rated voltage.

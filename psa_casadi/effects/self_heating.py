@@ -5,8 +5,7 @@ the heat capacity and the gain's temperature coefficient act as one number, heat
 """
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.effects.sizes import smooth_magnitude
-from psa_casadi.smooth import rate_magnitude
+from psa_casadi.smooth import rate_magnitude, smooth_magnitude
 from psa_casadi.variables import Parameter, State, Values
 
 #: Width of the smooth magnitude of the voltage, over rated voltage.

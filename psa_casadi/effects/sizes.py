@@ -1,6 +1,4 @@
-"""Typical sizes of a stack as expressions, for both bases, and a smooth magnitude."""
-
-import casadi as ca
+"""Typical sizes of a stack as expressions, for both bases."""
 
 from psa_casadi.component import Expression, Symbols
 
@@ -18,11 +16,3 @@ def static_stiffness(s: Symbols) -> Expression:
 def stroke(s: Symbols) -> Expression:
     """Return the linear free stroke at rated voltage, k_L u_rated / static stiffness [m]."""
     return s.k_L * s.u_rated / static_stiffness(s)
-
-
-def smooth_magnitude(value: Expression, width: Expression) -> Expression:
-    """Return `|value|` as `value^2 / sqrt(value^2 + width^2)`: 0 with slope 0 at 0.
-
-    It is 1 % below `|value|` at 7 widths. A value much smaller than the width counts as none.
-    """
-    return value**2 / ca.sqrt(value**2 + width**2)

@@ -38,3 +38,9 @@ def among_harmonics(frequency: float, record: Record) -> bool:
     """
     drive = drive_frequency(record)
     return drive is not None and frequency < (_ORDERS + 0.5) * drive
+
+
+def turns(voltage: FloatArray, share: float = 0.1) -> bool:
+    """Whether a voltage moves both ways, by this share of its range or more in all."""
+    moves = np.diff(voltage)
+    return bool(min(moves[moves > 0].sum(), -moves[moves < 0].sum()) > share * np.ptp(voltage))

@@ -60,12 +60,6 @@ class Excerpt:
         return float(np.ptp(self.y[self.valid]))
 
     @property
-    def turns(self) -> bool:
-        """Whether the voltage moves both ways, by a tenth of its range or more in all."""
-        moves = np.diff(self.v)
-        return bool(min(moves[moves > 0].sum(), -moves[moves < 0].sum()) > 0.1 * np.ptp(self.v))
-
-    @property
     def crossing(self) -> float:
         """Time in which the voltage crosses its range at its fastest [s]."""
         return self.h * float(np.ptp(self.v) / np.max(np.abs(np.diff(self.v))))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.experiment.drive import turns
 from psa_casadi.identification.excerpts import RADII, Excerpt
 from psa_casadi.identification.levenberg_marquardt import Evaluate, minimise
 from psa_casadi.identification.linear_response import (
@@ -161,7 +162,7 @@ def _eliminated(e: Excerpt, theta: FloatArray) -> _Eliminated:
     force = _force(e, theta)
     count, extra = int(e.valid.sum()), force.shape[1] - 1
     slope = float(np.polyfit(e.v[e.valid], e.y[e.valid], 1)[0])
-    priors = [_LOOP_PRIOR if e.turns else _CURVE_PRIOR] * len(RADII)
+    priors = [_LOOP_PRIOR if turns(e.v) else _CURVE_PRIOR] * len(RADII)
     mean, deviation = np.array([*priors, _SHIFT_PRIOR][:extra]).T
     matrix = np.zeros((count + extra, extra + 2))
     matrix[:count, :-1] = _behind(e, theta, force)[e.valid] / e.sigma

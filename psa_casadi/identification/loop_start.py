@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from psa_casadi.experiment.drive import turns
 from psa_casadi.experiment.record import Record
 from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prediction import measured
@@ -28,8 +29,6 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Loops that take part, samples of each, and how much faster than the slowest they may be.
 _LOOPS, _SAMPLES, _FASTER = 4, 2000, 5.0
-#: The voltage turns where it goes both ways by this share of its range.
-_TURNS = 0.1
 #: Ranges of n, and of k over the slope of displacement on voltage.
 _N, _K = (1.0, 3.0), (0.5, 3.5)
 #: k over the slope, and n, from which the search starts.
@@ -117,15 +116,9 @@ def _integral(steps: FloatArray) -> FloatArray:
 
 def _slowest(records: Sequence[Record]) -> list[Record]:
     """Return the records whose voltage turns, the slowest and those that are not much faster."""
-    turning = [r for r in records if r.mask.sum() > 20 and _turns(r.voltage)]
+    turning = [r for r in records if r.mask.sum() > 20 and turns(r.voltage)]
     turning.sort(key=_rate)
     return [r for r in turning if _rate(r) <= _FASTER * _rate(turning[0])][:_LOOPS]
-
-
-def _turns(voltage: FloatArray) -> bool:
-    moves = np.diff(voltage)
-    both = min(float(moves[moves > 0].sum()), -float(moves[moves < 0].sum()))
-    return both > _TURNS * float(np.ptp(voltage))
 
 
 def _rate(record: Record) -> float:
