@@ -5,7 +5,7 @@
 
 #include "linear.h"
 
-#define GAMMA 0.25
+#define LOOSE 5e-6 /* relative tolerance from which the method of second order costs less */
 #define NEWTON_LIMIT 8
 #define NEWTON_TOLERANCE 0.02 /* share of the step's error tolerance */
 #define SAFETY 0.9
@@ -13,22 +13,44 @@
 #define KINK_RESOLUTION 1e-3 /* of the step in which a kink is located */
 #define KINK_RESTART 0.05    /* first step after a kink over the one that ended there */
 
-static const double C[PSA_STAGES] = {0.0, 1.0 / 2.0, 83.0 / 250.0, 31.0 / 50.0, 17.0 / 20.0, 1.0};
-static const double A[PSA_STAGES][PSA_STAGES] = {
-    {0.0},
-    {1.0 / 4.0, GAMMA},
-    {8611.0 / 62500.0, -1743.0 / 31250.0, GAMMA},
-    {5012029.0 / 34652500.0, -654441.0 / 2922500.0, 174375.0 / 388108.0, GAMMA},
-    {15267082809.0 / 155376265600.0, -71443401.0 / 120774400.0, 730878875.0 / 902184768.0,
-     2285395.0 / 8070912.0, GAMMA},
-    {82889.0 / 524892.0, 0.0, 15625.0 / 83664.0, 69875.0 / 102672.0, -2260.0 / 8211.0, GAMMA}};
-/* b minus the weights of the embedded third-order formula */
-static const double E[PSA_STAGES] = {82889.0 / 524892.0 - 4586570599.0 / 29645900160.0,
-                                     0.0,
-                                     15625.0 / 83664.0 - 178811875.0 / 945068544.0,
-                                     69875.0 / 102672.0 - 814220225.0 / 1159782912.0,
-                                     -2260.0 / 8211.0 + 3700637.0 / 11593932.0,
-                                     1.0 / 4.0 - 61727.0 / 225920.0};
+/* Stiffly accurate: the last stage is the step's result. */
+typedef struct {
+    int stages;
+    double gamma;                           /* diagonal of a */
+    double exponent;                        /* -1 / order of the error estimate */
+    double c[PSA_STAGES];
+    double a[PSA_STAGES][PSA_STAGES];
+    double e[PSA_STAGES];                   /* b minus the weights of the embedded formula */
+} psa_method;
+
+static const psa_method ESDIRK4 = {
+    6,
+    0.25,
+    -0.25,
+    {0.0, 1.0 / 2.0, 83.0 / 250.0, 31.0 / 50.0, 17.0 / 20.0, 1.0},
+    {{0.0},
+     {1.0 / 4.0, 0.25},
+     {8611.0 / 62500.0, -1743.0 / 31250.0, 0.25},
+     {5012029.0 / 34652500.0, -654441.0 / 2922500.0, 174375.0 / 388108.0, 0.25},
+     {15267082809.0 / 155376265600.0, -71443401.0 / 120774400.0, 730878875.0 / 902184768.0,
+      2285395.0 / 8070912.0, 0.25},
+     {82889.0 / 524892.0, 0.0, 15625.0 / 83664.0, 69875.0 / 102672.0, -2260.0 / 8211.0, 0.25}},
+    {82889.0 / 524892.0 - 4586570599.0 / 29645900160.0, 0.0,
+     15625.0 / 83664.0 - 178811875.0 / 945068544.0, 69875.0 / 102672.0 - 814220225.0 / 1159782912.0,
+     -2260.0 / 8211.0 + 3700637.0 / 11593932.0, 1.0 / 4.0 - 61727.0 / 225920.0}};
+
+#define ROOT2 1.4142135623730951
+static const psa_method TR_BDF2 = {
+    3,
+    1.0 - ROOT2 / 2.0,
+    -1.0 / 3.0,
+    {0.0, 2.0 - ROOT2, 1.0},
+    {{0.0}, {1.0 - ROOT2 / 2.0, 1.0 - ROOT2 / 2.0}, {ROOT2 / 4.0, ROOT2 / 4.0, 1.0 - ROOT2 / 2.0}},
+    {(ROOT2 - 1.0) / 3.0, -1.0 / 3.0, (2.0 - ROOT2) / 3.0}};
+
+static const psa_method *method_of(const psa_solver *solver) {
+    return solver->rtol < LOOSE ? &ESDIRK4 : &TR_BDF2;
+}
 
 void psa_input_at(const psa_input *input, double t, double *u) {
     for (int i = 0; i < PSA_NU; ++i) u[i] = input->value[i] + input->rate[i] * (t - input->origin);
@@ -112,7 +134,8 @@ static int solve_stage(psa_solver *solver, int stage, const double *base, double
 
 /* Try one step of size h; returns the scaled error (<= 1 accepts), or a negative number on failure. */
 static double try_step(psa_solver *solver, double h, const psa_input *input, const double *p) {
-    const double h_gamma = h * GAMMA;
+    const psa_method *const method = method_of(solver);
+    const double h_gamma = h * method->gamma;
     double base[PSA_NX], u[PSA_NU + 1], error[PSA_NX];
     if (solver->lu_factor_h != h_gamma) {
         if (factorise(solver, solver->jac, h_gamma)) return -1.0;
@@ -121,12 +144,12 @@ static double try_step(psa_solver *solver, double h, const psa_input *input, con
     memcpy(solver->stage_x[0], solver->x, sizeof solver->x);
     memcpy(solver->stage_k[0], solver->slope, sizeof solver->slope);
     solver->stage_t[0] = solver->t;
-    for (int stage = 1; stage < PSA_STAGES; ++stage) {
-        solver->stage_t[stage] = solver->t + C[stage] * h;
+    for (int stage = 1; stage < method->stages; ++stage) {
+        solver->stage_t[stage] = solver->t + method->c[stage] * h;
         psa_input_at(input, solver->stage_t[stage], u);
         for (int i = 0; i < PSA_NX; ++i) {
             double sum = 0.0;
-            for (int j = 0; j < stage; ++j) sum += A[stage][j] * solver->stage_k[j][i];
+            for (int j = 0; j < stage; ++j) sum += method->a[stage][j] * solver->stage_k[j][i];
             base[i] = solver->x[i] + h * sum;
         }
         memcpy(solver->stage_k[stage], solver->stage_k[stage > 1 ? stage - 1 : 0], sizeof base);
@@ -134,7 +157,7 @@ static double try_step(psa_solver *solver, double h, const psa_input *input, con
     }
     for (int i = 0; i < PSA_NX; ++i) {
         error[i] = 0.0;
-        for (int j = 0; j < PSA_STAGES; ++j) error[i] += h * E[j] * solver->stage_k[j][i];
+        for (int j = 0; j < method->stages; ++j) error[i] += h * method->e[j] * solver->stage_k[j][i];
     }
     psa_lu_solve(PSA_NX, solver->lu, solver->pivot, error);
     return scaled_norm(solver, error, &solver->culprit);
@@ -182,28 +205,29 @@ static void sensitivity_slopes(const psa_sensitivities *sens, const double *jac,
 /* dX_i/dtheta of all stages of the accepted step: differentiates the discrete equations exactly. */
 static int step_sensitivities(psa_solver *solver, double h, const psa_input *input,
                               const double *p, psa_sensitivities *sens) {
-    const int size = PSA_NX * sens->count;
+    const psa_method *const method = method_of(solver);
+    const int size = PSA_NX * sens->count, stages = method->stages;
     const size_t bytes = sizeof(double) * (size_t)size;
     double jac[PSA_NX * PSA_NX], param[PSA_NX * PSA_NP], u[PSA_NU + 1];
     solver->lu_factor_h = 0.0;
-    for (int stage = sens->slope_valid ? 1 : 0; stage < PSA_STAGES; ++stage) {
+    for (int stage = sens->slope_valid ? 1 : 0; stage < stages; ++stage) {
         double *const slopes = stage > 0 ? sens->stage + (long)stage * size : sens->slope;
         psa_input_at(input, solver->stage_t[stage], u);
         if (psa_model_sensitivity(solver->stage_t[stage], solver->stage_x[stage], u, p, jac, param))
             return 1;
         memcpy(sens->base, sens->s, bytes);
         for (int j = 0; j < stage; ++j)
-            if (A[stage][j] != 0.0)
-                psa_axpy(size, h * A[stage][j], j > 0 ? sens->stage + (long)j * size : sens->slope,
+            if (method->a[stage][j] != 0.0)
+                psa_axpy(size, h * method->a[stage][j], j > 0 ? sens->stage + (long)j * size : sens->slope,
                          sens->base);
         sensitivity_slopes(sens, jac, param, sens->base, slopes);
         if (stage == 0) continue;
-        if (factorise(solver, jac, h * GAMMA)) return 1;
+        if (factorise(solver, jac, h * method->gamma)) return 1;
         psa_lu_solve_many(PSA_NX, solver->lu, solver->pivot, sens->count, slopes);
     }
-    memcpy(sens->slope, sens->stage + (long)(PSA_STAGES - 1) * size, bytes);
+    memcpy(sens->slope, sens->stage + (long)(stages - 1) * size, bytes);
     memcpy(sens->s, sens->base, bytes);
-    psa_axpy(size, h * GAMMA, sens->slope, sens->s);
+    psa_axpy(size, h * method->gamma, sens->slope, sens->s);
     sens->slope_valid = 1;
     return 0;
 }
@@ -217,7 +241,8 @@ static int step_sensitivities(psa_solver *solver, double h, const psa_input *inp
 
 /* x at t + theta h of the step just tried: cubic Hermite interpolation. */
 static void interpolate(const psa_solver *solver, double h, double theta, double *x) {
-    const double *x1 = solver->stage_x[PSA_STAGES - 1], *k1 = solver->stage_k[PSA_STAGES - 1];
+    const int last = method_of(solver)->stages - 1;
+    const double *x1 = solver->stage_x[last], *k1 = solver->stage_k[last];
     for (int i = 0; i < PSA_NX; ++i) {
         const double x0 = solver->x[i], change = x1[i] - x0;
         x[i] = x0 + theta * change +
@@ -269,8 +294,9 @@ static double first_kink(const psa_solver *solver, double h, const psa_input *in
 static psa_status accept(psa_solver *solver, double t_new, double h, const psa_input *input,
                          const double *p, psa_sensitivities *sens) {
     if (sens && step_sensitivities(solver, h, input, p, sens)) return PSA_NOT_FINITE;
-    memcpy(solver->x, solver->stage_x[PSA_STAGES - 1], sizeof solver->x);
-    memcpy(solver->slope, solver->stage_k[PSA_STAGES - 1], sizeof solver->slope);
+    const int last = method_of(solver)->stages - 1;
+    memcpy(solver->x, solver->stage_x[last], sizeof solver->x);
+    memcpy(solver->slope, solver->stage_k[last], sizeof solver->slope);
     solver->t = t_new;
     psa_input_at(input, t_new, solver->last_input);
     solver->steps++;
@@ -279,6 +305,7 @@ static psa_status accept(psa_solver *solver, double t_new, double h, const psa_i
 
 psa_status psa_solver_advance(psa_solver *solver, double t_end, const psa_input *input,
                               const double *p, psa_sensitivities *sens) {
+    const double exponent = method_of(solver)->exponent;
     const long limit = solver->steps_limit > 0 ? solver->steps_limit : 10000000L;
     const double smallest = 8.0 * 2.220446049250313e-16 * (fabs(t_end) + fabs(solver->t));
     long taken = 0;
@@ -315,7 +342,7 @@ psa_status psa_solver_advance(psa_solver *solver, double t_end, const psa_input 
                 aimed = kink * h;
                 solver->rejected++;
             } else if (good) {
-                const double factor = fmin(5.0, fmax(0.2, SAFETY * pow(fmax(error, 1e-10), -0.25)));
+                const double factor = fmin(5.0, fmax(0.2, SAFETY * pow(fmax(error, 1e-10), exponent)));
                 const psa_status status = accept(solver, last ? t_end : solver->t + h, h, input, p, sens);
                 if (status != PSA_OK) return status;
                 solver->landed = aimed > 0.0 && h >= aimed;
@@ -325,7 +352,7 @@ psa_status psa_solver_advance(psa_solver *solver, double t_end, const psa_input 
             } else {
                 solver->rejected++;
                 if (!(h > smallest)) return PSA_STEP_TOO_SMALL;
-                solver->step = error > 0.0 ? h * fmax(0.1, SAFETY * pow(error, -0.25)) : 0.25 * h;
+                solver->step = error > 0.0 ? h * fmax(0.1, SAFETY * pow(error, exponent)) : 0.25 * h;
             }
         }
     }

@@ -1,6 +1,8 @@
 /* ESDIRK4(3)6L[2]SA: six stages, order four, L-stable, stiffly accurate, with an embedded third-order
    error estimate. Kennedy and Carpenter, Appl. Numer. Math. 44 (2003) 139-181, table ARK4(3)6L[2]SA-ESDIRK.
    Hairer and Wanner's SDIRK4 was measured beside it on sampled records: three times the steps at 1e-6.
+   From a tolerance of 5e-6 on, where samples or the input's changes bound the step, TR-BDF2 (three stages, order two with a
+   third-order companion; Hosea and Shampine, Appl. Numer. Math. 20 (1996) 21-37) errs less at the same cost.
 
    Between calls the solver keeps its last slope and step size, so that cutting the time axis costs
    accuracy nothing. Everything lives in the struct: no allocation, no static state. */

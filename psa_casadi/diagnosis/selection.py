@@ -15,8 +15,9 @@ from psa_casadi.identification.search import FIXED
 
 FloatArray = npt.NDArray[np.float64]
 
-#: How many effects are fitted fully in each round, and how many starts each gets.
-FULL_FITS = 4
+#: How many effects are fitted fully in each round; how many where the screening's scores are this
+#: close to the best one's; and how many starts each gets.
+FULL_FITS, _MOST_FITS, _AS_NEAR = 4, 7, 0.4
 _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
@@ -38,7 +39,9 @@ def leading(screening: Screening) -> list[tuple[str, list[Score]]]:
         return []
     top = next(iter(best.values())).decrease
     limit = max(screening.threshold, _WORTH * top)
-    chosen = [name for name, score in best.items() if score.decrease >= limit][:FULL_FITS]
+    near = [name for name, score in best.items() if score.decrease >= max(limit, _AS_NEAR * top)]
+    count = max(FULL_FITS, min(len(near), _MOST_FITS))
+    chosen = [name for name, score in best.items() if score.decrease >= limit][:count]
     return [(name, starts_of(screening, name)) for name in chosen]
 
 

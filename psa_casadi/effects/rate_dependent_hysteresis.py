@@ -1,29 +1,22 @@
 """Rate-dependent hysteresis: the loop's width changes with the logarithm of the voltage rate.
 
-At one rate the hysteresis force is c times that of the base, c = exp(rate_gain L) with
-L = lg sqrt(1 + (u'/(rate_onset u_rated))^2), the decades above the onset: with f = c h and
-h' = A u' - (bends at h), the slope A grows by c and the bends by c^(1-n), at every amplitude alike.
-A positive gain widens loops and lowers the stroke as the rate rises. Bends scaled alone would
-leave the width of a full loop as it is. Both factors are positive at any rate and gain, so that the
-bends never turn into a runaway.
+The hysteresis force acts c-fold, c = exp(rate_gain L) with L = lg sqrt(1 + (u'/(rate_onset
+u_rated))^2), the decades above the onset, at every amplitude alike. A positive gain widens loops
+and lowers the stroke as the rate rises. The rate acts at once and leaves the memory as it is: of
+play operators whose thresholds grow with the rate this explains two thirds, coefficients scaled in
+the equation of f_H a third, as those keep what a past rate did.
 """
 
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.smooth import magnitude_power, rate_magnitude, signed_power
 from psa_casadi.variables import Parameter
 
 
 def _equations(s: Symbols) -> Equations:
     relative = s.voltage_rate / (s.rate_onset * s.u_rated)
     decades = 0.5 * ca.log10(1 + relative**2)
-    growth = s.rate_gain * decades
-    ratio = s.f_H / s.h_ref
-    bends = s.beta * rate_magnitude(s) * signed_power(ratio, s.n)
-    bends += s.gamma * s.voltage_rate * magnitude_power(ratio, s.n)
-    slope = (ca.exp(growth) - 1) * s.A * s.voltage_rate
-    return Equations(add={"hysteresis_rate": slope + (1 - ca.exp((1 - s.n) * growth)) * bends})
+    return Equations(add={"free_force": (ca.exp(s.rate_gain * decades) - 1) * s.f_H})
 
 
 RATE_DEPENDENT_HYSTERESIS = Component(
@@ -35,8 +28,7 @@ RATE_DEPENDENT_HYSTERESIS = Component(
     ),
     gain="rate_gain",
     equation_text=(
-        "f_H' gains (c - 1) A u' + (1 - c^(1-n)) (beta |u'| sgn(f_H) r^n + gamma u' r^n),"
-        "  c = (1 + (u'/(rate_onset u_rated))^2)^(rate_gain/(2 ln 10)),  r = |f_H|/h_ref"
+        "force gains (c - 1) f_H,  c = (1 + (u'/(rate_onset u_rated))^2)^(rate_gain/(2 ln 10))"
     ),
     parameters=(
         Parameter(

@@ -1,4 +1,8 @@
-"""Structural mode: a resonance of the mount or the guide that the two-mass model lacks."""
+"""Structural mode: a resonance of the mount or the guide that the two-mass model lacks.
+
+What drives it may run ahead of the output mass or behind it: the lead turns the phase of the
+resonance by its arc tangent, so that a mode driven by the force ahead of its lag is told as well.
+"""
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Symbols
 from psa_casadi.scales import stroke_scale
@@ -14,7 +18,7 @@ def _equations(s: Symbols) -> Equations:
             "q": s.r_q,
             "r_q": omega**2 * (s.tip_displacement - s.q) - 2 * s.mode_damping * omega * s.r_q,
         },
-        add={"displacement": s.mode_gain * s.q},
+        add={"displacement": s.mode_gain * (s.q + s.mode_lead * s.r_q / omega)},
     )
 
 
@@ -29,11 +33,13 @@ STRUCTURAL_MODE = Component(
     gain="mode_gain",
     tone="mode_frequency",
     equation_text=(
-        "q'' + 2 zeta w q' + w^2 q = w^2 x_tip,  x gains mode_gain q,  w = 2 pi mode_frequency"
+        "q'' + 2 zeta w q' + w^2 q = w^2 x_tip,  x gains mode_gain (q + mode_lead q'/w),"
+        "  w = 2 pi mode_frequency"
     ),
     parameters=(
         Parameter("mode_gain", 0.0, "1", (-2.0, 2.0), "static share of the mode", scale=0.01),
         Parameter("mode_frequency", 1e3, "Hz", (0.1, 1e6), "natural frequency", log=True),
+        Parameter("mode_lead", 0.0, "1", (-20.0, 20.0), "tangent of the phase lead", scale=1.0),
         Parameter("mode_damping", 0.02, "1", (1e-4, 0.7), "damping ratio", log=True),
     ),
     states=(
