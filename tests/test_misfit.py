@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.diagnosis.misfit import misfit
-from psa_casadi.diagnosis.misfit_coordinates import drive_of, turning_samples
+from psa_casadi.diagnosis.misfit_coordinates import drive_of
 from psa_casadi.diagnosis.noise_floor import noise_floor
 from psa_casadi.errors import InputError
 from psa_casadi.experiment import Record, excitation, read_record
@@ -185,12 +185,6 @@ def test_a_constant_voltage_is_no_trouble() -> None:
     assert shares(m)["time"] > 0.9
     assert shares(m)["voltage"] == 0.0
     assert m.split is None
-
-
-def test_turning_samples_are_the_reversals() -> None:
-    for voltage in (SINE, MULTISINE, STEPS):
-        found = turning_samples(voltage, 1e-4 * float(np.ptp(voltage)))
-        np.testing.assert_array_equal(found, reversals(voltage))
 
 
 def test_rate_and_turns_of_a_noisy_voltage() -> None:

@@ -37,6 +37,13 @@ def test_reversals_of_plateaus_and_steps() -> None:
     assert len(reversals(np.linspace(0.0, 5.0, 100))) == 0
 
 
+def test_a_threshold_passes_over_smaller_turns() -> None:
+    """A small triangle on top of a large one turns by 0.5 V against it."""
+    both = triangle(1000, 200) + 0.06 * triangle(1000, 10)
+    assert len(reversals(both, 0.1)) > 100
+    np.testing.assert_allclose(reversals(both, 1.0), np.arange(100, 1000, 100), atol=5)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_reversals_see_through_noise_of_a_converter(seed: int) -> None:
     clean = triangle(1000, 200)

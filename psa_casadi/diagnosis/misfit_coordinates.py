@@ -10,6 +10,7 @@ from psa_casadi.diagnosis.misfit_views import COARSE, FINE, Axis
 from psa_casadi.experiment.fast_noise import fast_noise
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.repetitions import held
+from psa_casadi.experiment.split import reversals
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
@@ -109,7 +110,7 @@ def drive_of(record: Record) -> Drive:
     """
     v, n = record.voltage, record.n
     span, noise = float(np.ptp(v)), fast_noise(v)
-    turns = turning_samples(v, max(_TURN * span, _NOISES * noise))
+    turns = reversals(v, max(_TURN * span, _NOISES * noise))
     stops = np.r_[0, turns, n - 1]
     mean_rate = float(np.sum(np.abs(np.diff(v[stops])))) / max(record.duration, 1e-300)
     wanted = _QUIET * mean_rate * record.sample_time
@@ -120,27 +121,6 @@ def drive_of(record: Record) -> Drive:
     k = np.arange(n)
     low, high = np.maximum(k - half, 0), np.minimum(k + half, n - 1)
     return Drive(turns, (smooth[high] - smooth[low]) / (record.time[high] - record.time[low]))
-
-
-def turning_samples(voltage: FloatArray, threshold: float) -> IndexArray:
-    """Return where the voltage turns and comes back by more than `threshold` [V]."""
-    step = np.diff(voltage)
-    moving = np.flatnonzero(step)
-    up = step[moving] > 0
-    places = np.r_[0, moving[np.flatnonzero(up[1:] != up[:-1])] + 1, voltage.size - 1]
-    turns: list[int] = []
-    direction, extreme, level = 0, 0, float(voltage[0])
-    for k, v in zip(places.tolist(), voltage[places].tolist(), strict=True):
-        change = v - level
-        if direction == 0:
-            if abs(change) > threshold:
-                direction, extreme, level = (1 if change > 0 else -1), k, v
-        elif change * direction > 0:
-            extreme, level = k, v
-        elif -change * direction > threshold:
-            turns.append(extreme)
-            direction, extreme, level = -direction, k, v
-    return np.array(turns, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
