@@ -1,28 +1,30 @@
 """Self-heating: losses warm the stack under fast drive, and its gain changes with the warmth.
 
-The loss is a share of the energy that goes through the capacitance, |u| C_p |u'|; the share,
-the heat capacity and the gain's temperature coefficient act as one number, heating_gain.
+The loss is what the hysteresis dissipates: f_H u' less the rate of the energy f_H^2/(2 A) that it
+stores leaves beta |u'| |f_H| r^n / A, which grows with the third power of a small swing and more
+slowly with a large one. Share of heat, heat capacity and the gain's temperature coefficient act as
+one number, heating_gain.
 """
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.smooth import rate_magnitude, smooth_magnitude
+from psa_casadi.smooth import magnitude_power, rate_magnitude
 from psa_casadi.variables import Parameter, State, Values
-
-#: Width of the smooth magnitude of the voltage, over rated voltage.
-_WIDTH = 1e-3
 
 
 def _equations(s: Symbols) -> Equations:
-    throughput = smooth_magnitude(s.u, _WIDTH * s.u_rated) * s.C_p * rate_magnitude(s)
+    loss = rate_magnitude(s) / s.u_rated * magnitude_power(s.f_H / s.h_ref, s.n + 1)
     return Equations(
-        der={"heat": throughput - s.heat / s.heating_time},
-        add={"free_force": s.heating_gain * s.heat * s.k_L * s.u},
+        der={"heat": loss - s.heat / s.heating_time},
+        add={"free_force": s.heating_gain * s.heat * (s.k_L * s.u + s.f_H)},
     )
 
 
 def _heat(p: Values) -> float:
-    """Heat [J] under one cycle 0 .. u_rated .. 0 a second: C_p u_rated^2 each, at equilibrium."""
-    return p["C_p"] * p["u_rated"] ** 2 * p["heating_time"]
+    """Heat [1] under one cycle 0 .. u_rated .. 0 a second, at equilibrium."""
+    straight = abs(p["A"]) * p["u_rated"] / (2.0 * p["h_ref"])
+    bent = (abs(p["A"]) / max(p["beta"] + p["gamma"], 1e-9 * abs(p["A"]), 1e-300)) ** (1.0 / p["n"])
+    largest = max(min(straight, bent), 1e-3)
+    return float(largest ** (p["n"] + 1.0)) * p["heating_time"]
 
 
 def _scale(p: Values) -> float:
@@ -35,22 +37,27 @@ SELF_HEATING = Component(
     description="the gain changes as losses warm the stack, and recovers when it rests",
     source=(
         "Zheng, Takahashi, Yoshikawa, Uchino and de Vries, J. Am. Ceram. Soc. 79 (1996) 3193: heat"
-        " generation in multilayer actuators"
+        " generation in multilayer actuators in proportion to the loss of the hysteresis"
     ),
     gain="heating_gain",
-    equation_text=("f_L gains heating_gain q k_L u,  q' = |u| C_p |u'| - q / heating_time"),
+    equation_text=(
+        "force gains heating_gain q (f_L + f_H),"
+        "  q' = |u'|/u_rated (|f_H|/h_ref)^(n+1) - q / heating_time"
+    ),
     parameters=(
         Parameter(
             "heating_gain",
             0.0,
-            "1/J",
-            (0.0, 1e9),
-            "growth of the gain per joule of electric energy still felt",
+            "1",
+            (0.0, 1e3),
+            "growth of the gain per loss of one rated swing at h_ref still felt",
             scale=_scale,
         ),
         Parameter("heating_time", 3.0, "s", (1e-2, 1e5), "time constant of cooling", log=True),
     ),
-    states=(State("heat", "J", "energy put through and not cooled off", _heat, memory=True),),
+    states=(
+        State("heat", "1", "loss not cooled off, in rated swings at h_ref", _heat, memory=True),
+    ),
     equations=_equations,
     probe={"heating_time": (1.0, 10.0)},
     looks_like="the gain climbs while the drive is fast and recovers when it rests",
