@@ -52,14 +52,16 @@ def write_library(model: Model, directory: Path) -> None:
 def main() -> int:
     """Compile all sources of a model; return 1 if the compiler complained or missed a file.
 
-    The FMU is that of the base model, the library that of the model with every effect.
+    The FMUs, of FMI 2 and FMI 3, are those of the base model, the library that of the model with
+    every effect.
     """
     headers = Path(fmpy.__file__).parent / "c-code"
     with tempfile.TemporaryDirectory() as scratch:
         sources, objects = Path(scratch, "sources"), Path(scratch, "objects")
         objects.mkdir()
         os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str(Path(tempfile.gettempdir()) / "zig"))
-        write_sources(compose(BASE), sources / "fmu")
+        for fmi in (2, 3):
+            write_sources(compose(BASE), sources / f"fmi{fmi}", fmi=fmi)
         write_library(compose((*BASE, *EFFECTS.values())), sources / "library")
         files = sorted(sources.rglob("*.c"))
         missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")} - {f.name for f in files}

@@ -12,19 +12,11 @@ typedef struct {
     char name[]; /* copy of the instance name */
 } component;
 
-static const char *category(psa_result result) {
-    switch (result) {
-    case PSA_FINE: return "logSolver";
-    case PSA_WARNING: return "logStatusWarning";
-    case PSA_DISCARD: return "logStatusDiscard";
-    default: return "logStatusError";
-    }
-}
-
 static void report(void *owner, psa_result severity, int detail, const char *sentence) {
     const component *const self = owner;
     if (self->logger && (self->debug || !detail))
-        self->logger(self->environment, self->name, psa_fmi2_status(severity), category(severity), sentence);
+        self->logger(self->environment, self->name, psa_fmi2_status(severity),
+                     psa_log_category(severity), sentence);
 }
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
@@ -32,30 +24,14 @@ const char *fmi2GetVersion(void) { return fmi2Version; }
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t count,
                                const fmi2String categories[]) {
-    ENTER(PSA_CALL_ANY);
-    int solver = count == 0;
-    if (psa_lacks(core, count, categories, categories)) return fmi2Error;
-    for (size_t i = 0; i < count; ++i) {
-        int known = 0;
-        for (int result = PSA_FINE; result <= PSA_ERROR; ++result)
-            known |= categories[i] && !strcmp(categories[i], category((psa_result)result));
-        if (!known)
-            return psa_fmi2_status(psa_say(core, PSA_ERROR, "There is no log category '%s'.",
-                                  categories[i] ? categories[i] : "(null)"));
-        solver |= !strcmp(categories[i], category(PSA_FINE));
-    }
-    if (solver) ((component *)c)->debug = on != fmi2False;
-    return fmi2OK;
+    ENTER(PSA_CALL_LOG);
+    return psa_fmi2_status(psa_choose_log(core, on != fmi2False, count, categories, &((component *)c)->debug));
 }
 
 /* Why an instance cannot be made, or NULL. */
 static const char *objection(fmi2String name, fmi2Type type, fmi2String guid) {
-    if (!name || !*name) return "The instance name is missing.";
     if (type != fmi2ModelExchange && type != fmi2CoSimulation) return "The FMU type is unknown.";
-    if (!guid || strcmp(guid, psa_token))
-        return "The GUID differs from the one in this binary: modelDescription.xml and binary are not of"
-               " the same export.";
-    return NULL;
+    return psa_objection(name, guid);
 }
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
@@ -69,8 +45,8 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     (void)resources, (void)visible;
     if (problem) {
         if (given->logger)
-            given->logger(given->componentEnvironment, name ? name : "", fmi2Error, category(PSA_ERROR),
-                          problem);
+            given->logger(given->componentEnvironment, name ? name : "", fmi2Error,
+                          psa_log_category(PSA_ERROR), problem);
         return NULL;
     }
     const size_t length = strlen(name) + 1;

@@ -16,11 +16,11 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
     info->valuesOfContinuousStatesChanged = fmi2False;
     info->nextEventTimeDefined = fmi2False;
     info->nextEventTime = 0.0;
-    return fmi2OK;
+    return psa_fmi2_status(psa_update_events(core));
 }
 
 fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) {
-    ENTER(PSA_CALL_EVENT_UPDATE);
+    ENTER(PSA_CALL_ENTER_CONTINUOUS);
     MOVE_TO(PSA_CONTINUOUS);
 }
 
@@ -51,9 +51,7 @@ fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx
 
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real indicators[], size_t ni) {
     ENTER(PSA_CALL_READ_DERIVATIVES);
-    (void)indicators;
-    if (ni == 0) return fmi2OK;
-    return psa_fmi2_status(psa_say(core, PSA_ERROR, "The model has no event indicators."));
+    return psa_fmi2_status(psa_get_indicators(core, indicators, ni));
 }
 
 fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t nx) {
@@ -82,7 +80,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real point, fmi2Real size,
                       fmi2Boolean noSetFMUStatePriorToCurrentPoint) {
     ENTER(PSA_CALL_STEP);
     (void)noSetFMUStatePriorToCurrentPoint;
-    return psa_fmi2_status(psa_do_step(core, point, size));
+    return psa_fmi2_status(psa_do_step(core, point, size, NULL, NULL));
 }
 
 fmi2Status fmi2CancelStep(fmi2Component c) {
@@ -92,7 +90,8 @@ fmi2Status fmi2CancelStep(fmi2Component c) {
 
 /* Steps are never pending: only the last successful time and the wish to terminate are known. */
 static fmi2Status unknown_status(psa_instance *core, const char *name) {
-    return psa_fmi2_status(psa_say(core, PSA_DISCARD, "%s: this status is not known, as steps are never pending.", name));
+    return psa_fmi2_status(psa_say(
+        core, PSA_DISCARD, "%s: this status is not known, as steps are never pending.", name));
 }
 
 fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Status *value) {

@@ -6,10 +6,10 @@
 #include "fmi_config.h"
 #include "model.h"
 
-/* Value references count through the variables: time, then states, their derivatives, inputs, outputs
-   and parameters, each in the order of the model's vectors. */
+/* Value references count through the variables: time, then states, their derivatives, inputs, outputs,
+   parameters and event indicators, each in the order of the model's vectors. */
 #define PSA_FIRST_STATE 1
-#define PSA_VARIABLES (1 + 2 * PSA_NX + PSA_NU + PSA_NY + PSA_NP)
+#define PSA_VARIABLES (1 + 2 * PSA_NX + PSA_NU + PSA_NY + PSA_NP + PSA_NZ)
 
 typedef enum {
     PSA_TIME,
@@ -17,7 +17,8 @@ typedef enum {
     PSA_DERIVATIVE,
     PSA_INPUT,
     PSA_OUTPUT,
-    PSA_PARAMETER
+    PSA_PARAMETER,
+    PSA_INDICATOR
 } psa_kind;
 
 typedef struct {
@@ -34,11 +35,18 @@ extern const double psa_start_states[PSA_NX + 1];
 extern const double psa_start_inputs[PSA_NU + 1];
 extern const double psa_start_parameters[PSA_NP + 1];
 extern const double psa_state_nominals[PSA_NX + 1];
+/* What the states' nominal values move each switch by: the size of its noise at a tolerance of 1. */
+extern const double psa_switch_scales[PSA_NZ + 1];
 
-/* Derivative of (x', y) along a direction (dt, dx, du, dp) at the point (t, x, u, p): exact, by
-   automatic differentiation. */
+/* Derivative of (x', y, z) along a direction (dt, dx, du, dp) at the point (t, x, u, p): exact, by
+   automatic differentiation. A result that is NULL is left out. */
 int psa_model_directional(double t, const double *x, const double *u, const double *p, double dt,
                           const double *dx, const double *du, const double *dp, double *dxdot,
-                          double *dy);
+                          double *dy, double *dz);
+/* Gradient of wxdot . x' + wy . y + wz . z with respect to (t, x, u, p): the transposed of the same
+   matrix, by automatic differentiation backwards. */
+int psa_model_adjoint(double t, const double *x, const double *u, const double *p,
+                      const double *wxdot, const double *wy, const double *wz, double *dt,
+                      double *dx, double *du, double *dp);
 
 #endif

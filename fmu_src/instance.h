@@ -21,12 +21,14 @@ typedef enum {
     PSA_CONTINUOUS = 8,
     PSA_STEP_COMPLETE = 16,
     PSA_STEP_FAILED = 32,
-    PSA_TERMINATED = 64
+    PSA_TERMINATED = 64,
+    PSA_INTERMEDIATE = 128 /* between two solver steps of a communication step */
 } psa_phase;
 
 /* Kinds of calls; the table in instance.c says in which phases each is allowed. */
 typedef enum {
     PSA_CALL_ANY,
+    PSA_CALL_LOG,
     PSA_CALL_SETUP,
     PSA_CALL_INITIALIZE,
     PSA_CALL_INITIALIZED,
@@ -35,11 +37,16 @@ typedef enum {
     PSA_CALL_SET,
     PSA_CALL_DIRECTIONAL,
     PSA_CALL_ENTER_EVENT,
+    PSA_CALL_ENTER_EVENT3, /* FMI 3: from step mode too */
     PSA_CALL_EVENT_UPDATE,
+    PSA_CALL_EVALUATE_DISCRETE,
+    PSA_CALL_ENTER_CONTINUOUS,
+    PSA_CALL_ENTER_STEP,
     PSA_CALL_SET_TIME,
     PSA_CALL_CONTINUOUS,
     PSA_CALL_READ_DERIVATIVES,
     PSA_CALL_READ_NOMINALS,
+    PSA_CALL_COUNT_VECTORS,
     PSA_CALL_SET_RATES,
     PSA_CALL_READ_RATES,
     PSA_CALL_STEP,
@@ -48,65 +55,140 @@ typedef enum {
     PSA_CALL_COUNT
 } psa_call;
 
-/* Everything that a snapshot must hold: a plain struct without pointers. */
+/* What the last communication step started from, enough to repeat it bit by bit. */
+typedef enum {
+    PSA_NO_STEP = 0,
+    PSA_STEP_KNOWN = 1,
+    PSA_STEP_VARIED = 2, /* the importer changed inputs or the end within the step */
+    PSA_STEP_BROKEN = 3  /* it failed */
+} psa_step_kind;
+
+typedef struct {
+    psa_solver solver;
+    psa_input input;
+    double p[PSA_NP + 1];
+    double target; /* end that the importer asked for */
+    int64_t kind;  /* psa_step_kind */
+} psa_last_step;
+
+/* Everything that a snapshot must hold: a plain struct without pointers. Each member has eight bytes or
+   is made of such, so that no platform puts gaps between them. */
 typedef struct {
     psa_solver solver; /* time and continuous states live here, in model exchange too */
     psa_input input;
     double p[PSA_NP + 1];
-    int rate_given[PSA_NU + 1]; /* the importer gave this input's rate for the next step */
+    psa_last_step last;
+    int64_t rate_given[PSA_NU + 1]; /* the importer gave this input's rate for the next step */
+    /* An event indicator is facing * switch + margin. Facing changes its sign at an event, so that the
+       noise of an importer's solver about a held input makes no further ones. */
+    double facing[PSA_NZ + 1];
+    double event_margin; /* share of psa_switch_scales */
     double stop_time;
-    int stop_defined;
-    int phase;     /* psa_phase */
-    int interface; /* psa_interface */
+    int64_t stop_defined;
+    int64_t phase;     /* psa_phase */
+    int64_t interface; /* psa_interface */
 } psa_state;
 
 /* Receives a sentence; `detail` is 1 for what only debug logging shows. */
 typedef void psa_reporter(void *owner, psa_result severity, int detail, const char *sentence);
 
+/* Called between two solver steps of a communication step. `more` is 0 at its end. Returns 1 to end the
+   communication step earlier, at the time written to `end`. */
+typedef int psa_update(void *owner, double time, int more, double *end);
+
 typedef struct {
     psa_state state;
-    double xdot[PSA_NX + 1], y[PSA_NY + 1]; /* valid while `fresh` */
+    psa_work work;
+    double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1]; /* valid while `fresh` */
     int fresh;
+    psa_update *update; /* during a communication step; may be NULL */
     psa_reporter *report; /* may be NULL */
     void *owner;
     void *(*allocate)(size_t count, size_t size);
     void (*release)(void *memory);
 } psa_instance;
 
+/* log.c: what an instance says */
+/* Report a sentence (printf format) and return `result`. */
+psa_result psa_say(psa_instance *instance, psa_result result, const char *format, ...);
+/* The same for what only debug logging shows. */
+void psa_whisper(psa_instance *instance, const char *format, ...);
+/* Report a missing array: 1 if count > 0 and a pointer is NULL. */
+int psa_lacks(psa_instance *instance, size_t count, const void *first, const void *second);
+/* Log category of a severity, and the choice of categories: `debug` follows that of the solver. */
+const char *psa_log_category(psa_result severity);
+psa_result psa_choose_log(psa_instance *instance, int on, size_t count,
+                          const char *const *categories, int *debug);
+
 /* instance.c: life cycle and steps */
 void psa_instance_start(psa_instance *instance, psa_interface interface);
 /* 1 if the call is allowed now, else 0 and a report. `instance` may be NULL. */
 int psa_admit(psa_instance *instance, psa_call call, const char *name);
-/* Report a sentence (printf format) and return `result`. */
-psa_result psa_say(psa_instance *instance, psa_result result, const char *format, ...);
-/* Report a missing array: 1 if count > 0 and a pointer is NULL. */
-int psa_lacks(psa_instance *instance, size_t count, const void *first, const void *second);
 psa_result psa_setup(psa_instance *instance, int tolerance_defined, double tolerance, double start,
                      int stop_defined, double stop);
-psa_result psa_do_step(psa_instance *instance, double point, double size);
+/* One communication step; `early` is set if `update`, which may be NULL, ended it before its time. */
+psa_result psa_do_step(psa_instance *instance, double point, double size, psa_update *update,
+                       int *early);
+/* Why an instance of this name and token cannot be made, or NULL. */
+const char *psa_objection(const char *name, const char *token);
 
-/* values.c: variables by value reference, vectors of model exchange, derivatives */
+/* values.c: variables by value reference, vectors of model exchange, rates */
+/* The variable of a value reference, or NULL and a report. */
+const psa_variable *psa_variable_of(psa_instance *instance, unsigned vr);
+/* Evaluate derivatives, outputs and indicators at the present time, states, inputs and parameters. */
+psa_result psa_refresh(psa_instance *instance);
 psa_result psa_get(psa_instance *instance, const unsigned *vr, size_t count, double *value);
 psa_result psa_set(psa_instance *instance, const unsigned *vr, size_t count, const double *value);
 psa_result psa_set_time(psa_instance *instance, double time);
 psa_result psa_set_states(psa_instance *instance, const double *x, size_t count);
 psa_result psa_get_states(psa_instance *instance, double *x, size_t count);
 psa_result psa_get_derivatives(psa_instance *instance, double *xdot, size_t count);
+psa_result psa_get_indicators(psa_instance *instance, double *z, size_t count);
+/* The event update: switches that have passed their margin face the other way from now on. */
+psa_result psa_update_events(psa_instance *instance);
 psa_result psa_get_nominals(psa_instance *instance, double *nominal, size_t count);
 psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_t count,
                                const int *order, const double *rate);
 psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size_t count,
                                 const int *order, double *rate);
+
+/* derivatives.c: products of a matrix of derivatives with a seed. What is unknown decides which matrix:
+
+   - an output, a derivative or an event indicator: its partial derivatives at the present time, states,
+     inputs and parameters, in both interfaces. That is the meaning FMI gives to these functions;
+   - a state, in co-simulation only (FMI knows no such pair): its sensitivity through the last
+     communication step. Then a known state is the one at the start of the step, a known input the one
+     held over it (its rate stays), a known parameter that of the step, a known time that of its start at
+     the same length. The discrete equations of the solver are differentiated at the steps it took, so
+     the result is exact for the numbers it returned. Before any step, that of a step of no length.
+
+   Chained, the two give the sensitivity of outputs through a step. */
 psa_result psa_directional_derivative(psa_instance *instance, const unsigned *unknown,
                                       size_t unknowns, const unsigned *known, size_t knowns,
                                       const double *seed, double *sensitivity);
+psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknown, size_t unknowns,
+                                  const unsigned *known, size_t knowns, const double *seed,
+                                  double *sensitivity);
+
+/* step_derivatives.c */
+#define PSA_DIRECTIONS 8 /* at most so many at once */
+
+/* One number for each variable that can be known: a direction, or a gradient. */
+typedef struct {
+    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_NP + 1];
+} psa_knowns;
+
+/* Change of the states at the end of the last communication step along each direction: moved is
+   [PSA_NX][count]. */
+psa_result psa_step_sensitivity(psa_instance *instance, int count, const psa_knowns *directions,
+                                double *moved);
 
 /* snapshot.c: the state of an instance, in memory and as bytes */
 psa_result psa_snapshot_take(psa_instance *instance, void **snapshot);
 psa_result psa_snapshot_restore(psa_instance *instance, const void *snapshot);
 void psa_snapshot_release(psa_instance *instance, void **snapshot);
 size_t psa_snapshot_size(void);
-psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, char *bytes, size_t size);
-psa_result psa_snapshot_read(psa_instance *instance, const char *bytes, size_t size, void **snapshot);
+psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, void *bytes, size_t size);
+psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t size, void **snapshot);
 
 #endif

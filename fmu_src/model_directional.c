@@ -1,4 +1,4 @@
-/* Adapter between the plain face in fmi_data.h and the function CasADi generates in directional.c. */
+/* Adapter between the plain face in fmi_data.h and the function CasADi generates in model_derivatives.c. */
 #include "fmi_data.h"
 
 #include <stddef.h>
@@ -9,11 +9,11 @@ casadi_function psa_directional;
 
 int psa_model_directional(double t, const double *x, const double *u, const double *p, double dt,
                           const double *dx, const double *du, const double *dp, double *dxdot,
-                          double *dy) {
-    const double *arg[PSA_DIRECTIONAL_SZ_ARG] = {NULL};
-    double *res[PSA_DIRECTIONAL_SZ_RES] = {NULL};
-    long long int iw[PSA_DIRECTIONAL_SZ_IW];
-    double w[PSA_DIRECTIONAL_SZ_W];
+                          double *dy, double *dz) {
+    const double *arg[PSA_DERIVATIVES_SZ_ARG] = {NULL};
+    double *res[PSA_DERIVATIVES_SZ_RES] = {NULL};
+    long long int iw[PSA_DERIVATIVES_SZ_IW];
+    double w[PSA_DERIVATIVES_SZ_W];
     arg[0] = &t;
     arg[1] = x;
     arg[2] = u;
@@ -24,5 +24,6 @@ int psa_model_directional(double t, const double *x, const double *u, const doub
     arg[7] = dp;
     res[0] = dxdot;
     res[1] = dy;
+    res[2] = dz;
     return psa_directional(arg, res, iw, w, 0);
 }

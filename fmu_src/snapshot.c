@@ -3,8 +3,14 @@
 
 #include "instance.h"
 
+/* psa_state without gaps: otherwise its bytes would depend on the platform. Does not compile if there are. */
+#define WORDS_OF_POINT \
+    ((12 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_NP + 1)) /* solver, input, parameters */
+typedef char psa_state_has_no_gaps
+    [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + 5) ? 1 : -1];
+
 /* Raise it whenever psa_state or psa_solver changes its meaning. */
-#define SNAPSHOT_VERSION 2u
+#define SNAPSHOT_VERSION 3u
 
 /* In front of the bytes of a psa_state: who wrote them, and whether they arrived whole. A machine of
    another byte order or struct layout fails the comparison of version or size. */
@@ -64,25 +70,26 @@ void psa_snapshot_release(psa_instance *instance, void **snapshot) {
 
 size_t psa_snapshot_size(void) { return sizeof(psa_stamp) + sizeof(psa_state); }
 
-psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, char *bytes, size_t size) {
+psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, void *bytes, size_t size) {
     if (psa_lacks(instance, 1, snapshot, bytes)) return PSA_ERROR;
     if (size < psa_snapshot_size())
         return psa_say(instance, PSA_ERROR, "A snapshot needs %lu bytes; there are %lu.",
                        (unsigned long)psa_snapshot_size(), (unsigned long)size);
     const psa_stamp stamp = stamp_of(snapshot);
     memcpy(bytes, &stamp, sizeof stamp);
-    memcpy(bytes + sizeof stamp, snapshot, sizeof(psa_state));
+    memcpy((char *)bytes + sizeof stamp, snapshot, sizeof(psa_state));
     return PSA_FINE;
 }
 
-psa_result psa_snapshot_read(psa_instance *instance, const char *bytes, size_t size, void **snapshot) {
+psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t size, void **snapshot) {
     psa_stamp found;
     if (psa_lacks(instance, 1, bytes, snapshot)) return PSA_ERROR;
     if (size != psa_snapshot_size())
         return psa_say(instance, PSA_ERROR, "These %lu bytes are no snapshot of this model, which has %lu.",
                        (unsigned long)size, (unsigned long)psa_snapshot_size());
     memcpy(&found, bytes, sizeof found);
-    const psa_stamp expected = stamp_of(bytes + sizeof found);
+    const char *const state = (const char *)bytes + sizeof found;
+    const psa_stamp expected = stamp_of(state);
     if (memcmp(found.magic, expected.magic, sizeof found.magic) || found.version != expected.version ||
         found.size != expected.size || found.model != expected.model)
         return psa_say(instance, PSA_ERROR,
@@ -90,6 +97,6 @@ psa_result psa_snapshot_read(psa_instance *instance, const char *bytes, size_t s
     if (found.checksum != expected.checksum)
         return psa_say(instance, PSA_ERROR, "The snapshot is damaged: its checksum does not match.");
     const psa_result result = provide(instance, snapshot);
-    if (result == PSA_FINE) memcpy(*snapshot, bytes + sizeof found, sizeof(psa_state));
+    if (result == PSA_FINE) memcpy(*snapshot, state, sizeof(psa_state));
     return result;
 }

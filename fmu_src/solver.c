@@ -69,13 +69,12 @@ void psa_solver_start(psa_solver *solver, double t, const double *x, const doubl
 void psa_solver_invalidate(psa_solver *solver) {
     solver->slope_valid = 0;
     solver->landed = 0;
-    solver->lu_factor_h = 0.0;
 }
 
-static double scaled_norm(const psa_solver *solver, const double *v, int *worst) {
+static double scaled_norm(const psa_work *work, const double *v, int64_t *worst) {
     double sum = 0.0, largest = -1.0;
     for (int i = 0; i < PSA_NX; ++i) {
-        const double e = v[i] / solver->weight[i];
+        const double e = v[i] / work->weight[i];
         if (!(fabs(e) <= largest)) {
             largest = fabs(e);
             if (worst) *worst = i;
@@ -85,36 +84,36 @@ static double scaled_norm(const psa_solver *solver, const double *v, int *worst)
     return sqrt(sum / PSA_NX);
 }
 
-static void set_weights(psa_solver *solver) {
+static void set_weights(const psa_solver *solver, psa_work *work) {
     for (int i = 0; i < PSA_NX; ++i)
-        solver->weight[i] = solver->rtol * (fabs(solver->x[i]) + solver->nominal[i]);
+        work->weight[i] = solver->rtol * (fabs(solver->x[i]) + solver->nominal[i]);
 }
 
 /* lu = factors of I - h_gamma * df/dx */
-static int factorise(psa_solver *solver, const double *jac, double h_gamma) {
-    for (int i = 0; i < PSA_NX * PSA_NX; ++i) solver->lu[i] = -h_gamma * jac[i];
-    for (int i = 0; i < PSA_NX; ++i) solver->lu[i + i * PSA_NX] += 1.0;
-    return psa_lu_factor(PSA_NX, solver->lu, solver->pivot);
+static int factorise(psa_work *work, const double *jac, double h_gamma) {
+    for (int i = 0; i < PSA_NX * PSA_NX; ++i) work->lu[i] = -h_gamma * jac[i];
+    for (int i = 0; i < PSA_NX; ++i) work->lu[i + i * PSA_NX] += 1.0;
+    return psa_lu_factor(PSA_NX, work->lu, work->pivot);
 }
 
 /* Solve k = f(t, base + h gamma k) by simplified Newton iteration; 0 when converged. */
-static int solve_stage(psa_solver *solver, int stage, const double *base, double h_gamma,
+static int solve_stage(psa_solver *solver, psa_work *work, int stage, const double *base, double h_gamma,
                        const double *u, const double *p) {
-    double *x = solver->stage_x[stage], *k = solver->stage_k[stage];
+    double *x = work->stage_x[stage], *k = work->stage_k[stage];
     double f[PSA_NX], previous = 0.0;
     /* Hairer and Wanner, Solving ODEs II, IV.8: trust the contraction seen last, a little less each time */
     double contraction = pow(fmax(solver->contraction, 1e-10), 0.8);
     for (int iteration = 0; iteration < NEWTON_LIMIT; ++iteration) {
         for (int i = 0; i < PSA_NX; ++i) x[i] = base[i] + h_gamma * k[i];
-        if (psa_model_ode(solver->stage_t[stage], x, u, p, f)) return 1;
+        if (psa_model_ode(work->stage_t[stage], x, u, p, f)) return 1;
         solver->evaluations++;
         for (int i = 0; i < PSA_NX; ++i) f[i] -= k[i];
-        psa_lu_solve(PSA_NX, solver->lu, solver->pivot, f);
+        psa_lu_solve(PSA_NX, work->lu, work->pivot, f);
         for (int i = 0; i < PSA_NX; ++i) {
             k[i] += f[i];
             f[i] *= h_gamma;
         }
-        const double change = scaled_norm(solver, f, &solver->culprit);
+        const double change = scaled_norm(work, f, &solver->culprit);
         if (!(change < 1e12)) return 1;
         if (iteration > 0) {
             const double theta = change / previous;
@@ -133,39 +132,40 @@ static int solve_stage(psa_solver *solver, int stage, const double *base, double
 }
 
 /* Try one step of size h; returns the scaled error (<= 1 accepts), or a negative number on failure. */
-static double try_step(psa_solver *solver, double h, const psa_input *input, const double *p) {
+static double try_step(psa_solver *solver, psa_work *work, double h, const psa_input *input,
+                       const double *p) {
     const psa_method *const method = method_of(solver);
     const double h_gamma = h * method->gamma;
     double base[PSA_NX], u[PSA_NU + 1], error[PSA_NX];
-    if (solver->lu_factor_h != h_gamma) {
-        if (factorise(solver, solver->jac, h_gamma)) return -1.0;
-        solver->lu_factor_h = h_gamma;
+    if (work->lu_factor_h != h_gamma) {
+        if (factorise(work, work->jac, h_gamma)) return -1.0;
+        work->lu_factor_h = h_gamma;
     }
-    memcpy(solver->stage_x[0], solver->x, sizeof solver->x);
-    memcpy(solver->stage_k[0], solver->slope, sizeof solver->slope);
-    solver->stage_t[0] = solver->t;
+    memcpy(work->stage_x[0], solver->x, sizeof solver->x);
+    memcpy(work->stage_k[0], solver->slope, sizeof solver->slope);
+    work->stage_t[0] = solver->t;
     for (int stage = 1; stage < method->stages; ++stage) {
-        solver->stage_t[stage] = solver->t + method->c[stage] * h;
-        psa_input_at(input, solver->stage_t[stage], u);
+        work->stage_t[stage] = solver->t + method->c[stage] * h;
+        psa_input_at(input, work->stage_t[stage], u);
         for (int i = 0; i < PSA_NX; ++i) {
             double sum = 0.0;
-            for (int j = 0; j < stage; ++j) sum += method->a[stage][j] * solver->stage_k[j][i];
+            for (int j = 0; j < stage; ++j) sum += method->a[stage][j] * work->stage_k[j][i];
             base[i] = solver->x[i] + h * sum;
         }
-        memcpy(solver->stage_k[stage], solver->stage_k[stage > 1 ? stage - 1 : 0], sizeof base);
-        if (solve_stage(solver, stage, base, h_gamma, u, p)) return -1.0;
+        memcpy(work->stage_k[stage], work->stage_k[stage > 1 ? stage - 1 : 0], sizeof base);
+        if (solve_stage(solver, work, stage, base, h_gamma, u, p)) return -1.0;
     }
     for (int i = 0; i < PSA_NX; ++i) {
         error[i] = 0.0;
-        for (int j = 0; j < method->stages; ++j) error[i] += h * method->e[j] * solver->stage_k[j][i];
+        for (int j = 0; j < method->stages; ++j) error[i] += h * method->e[j] * work->stage_k[j][i];
     }
-    psa_lu_solve(PSA_NX, solver->lu, solver->pivot, error);
-    return scaled_norm(solver, error, &solver->culprit);
+    psa_lu_solve(PSA_NX, work->lu, work->pivot, error);
+    return scaled_norm(work, error, &solver->culprit);
 }
 
 static int prepare_slope(psa_solver *solver, const psa_input *input, const double *p) {
     double u[PSA_NU + 1];
-    int same = solver->slope_valid;
+    int same = solver->slope_valid != 0;
     psa_input_at(input, solver->t, u);
     for (int i = 0; i < PSA_NU; ++i)
         if (fabs(u[i] - solver->last_input[i]) > 1e-12 * (fabs(u[i]) + fabs(solver->last_input[i])))
@@ -182,48 +182,36 @@ static int prepare_slope(psa_solver *solver, const psa_input *input, const doubl
     return 2;
 }
 
-static double first_step(const psa_solver *solver) {
-    const double slope = scaled_norm(solver, solver->slope, NULL);
+static double first_step(const psa_solver *solver, const psa_work *work) {
+    const double slope = scaled_norm(work, solver->slope, NULL);
     return slope > 0.0 ? 0.5 / slope : INFINITY;
 }
 
-#ifdef PSA_WITH_SENSITIVITIES
-/* slopes = J base + df/dtheta, all [PSA_NX][count] */
-static void sensitivity_slopes(const psa_sensitivities *sens, const double *jac, const double *param,
-                               const double *base, double *slopes) {
-    const int count = sens->count;
-    for (int i = 0; i < PSA_NX; ++i) {
-        double *const row = slopes + i * count;
-        for (int c = 0; c < count; ++c)
-            row[c] = sens->which[c] >= 0 ? param[i + sens->which[c] * PSA_NX] : 0.0;
-        for (int j = 0; j < PSA_NX; ++j)
-            if (jac[i + j * PSA_NX] != 0.0)
-                psa_axpy(count, jac[i + j * PSA_NX], base + j * count, row);
-    }
-}
-
-/* dX_i/dtheta of all stages of the accepted step: differentiates the discrete equations exactly. */
-static int step_sensitivities(psa_solver *solver, double h, const psa_input *input,
-                              const double *p, psa_sensitivities *sens) {
+/* dX_i/dtheta of all stages of the accepted step: differentiates the discrete equations exactly. The
+   slopes are J base + df/dtheta, all [PSA_NX][count]. */
+static int step_sensitivities(const psa_solver *solver, psa_work *work, double h,
+                              const psa_input *input, const double *p, psa_sensitivities *sens) {
     const psa_method *const method = method_of(solver);
-    const int size = PSA_NX * sens->count, stages = method->stages;
+    const int count = sens->count, size = PSA_NX * count, stages = method->stages;
     const size_t bytes = sizeof(double) * (size_t)size;
-    double jac[PSA_NX * PSA_NX], param[PSA_NX * PSA_NP], u[PSA_NU + 1];
-    solver->lu_factor_h = 0.0;
+    double jac[PSA_NX * PSA_NX], u[PSA_NU + 1];
     for (int stage = sens->slope_valid ? 1 : 0; stage < stages; ++stage) {
         double *const slopes = stage > 0 ? sens->stage + (long)stage * size : sens->slope;
-        psa_input_at(input, solver->stage_t[stage], u);
-        if (psa_model_sensitivity(solver->stage_t[stage], solver->stage_x[stage], u, p, jac, param))
+        psa_input_at(input, work->stage_t[stage], u);
+        if (sens->differentiate(sens, work->stage_t[stage], work->stage_x[stage], u, p, jac, slopes))
             return 1;
         memcpy(sens->base, sens->s, bytes);
         for (int j = 0; j < stage; ++j)
             if (method->a[stage][j] != 0.0)
                 psa_axpy(size, h * method->a[stage][j], j > 0 ? sens->stage + (long)j * size : sens->slope,
                          sens->base);
-        sensitivity_slopes(sens, jac, param, sens->base, slopes);
+        for (int i = 0; i < PSA_NX; ++i)
+            for (int j = 0; j < PSA_NX; ++j)
+                if (jac[i + j * PSA_NX] != 0.0)
+                    psa_axpy(count, jac[i + j * PSA_NX], sens->base + j * count, slopes + i * count);
         if (stage == 0) continue;
-        if (factorise(solver, jac, h * method->gamma)) return 1;
-        psa_lu_solve_many(PSA_NX, solver->lu, solver->pivot, sens->count, slopes);
+        if (factorise(work, jac, h * method->gamma)) return 1;
+        psa_lu_solve_many(PSA_NX, work->lu, work->pivot, count, slopes);
     }
     memcpy(sens->slope, sens->stage + (long)(stages - 1) * size, bytes);
     memcpy(sens->s, sens->base, bytes);
@@ -231,18 +219,12 @@ static int step_sensitivities(psa_solver *solver, double h, const psa_input *inp
     sens->slope_valid = 1;
     return 0;
 }
-#else
-static int step_sensitivities(psa_solver *solver, double h, const psa_input *input,
-                              const double *p, psa_sensitivities *sens) {
-    (void)solver, (void)h, (void)input, (void)p, (void)sens;
-    return 1;
-}
-#endif
 
 /* x at t + theta h of the step just tried: cubic Hermite interpolation. */
-static void interpolate(const psa_solver *solver, double h, double theta, double *x) {
+static void interpolate(const psa_solver *solver, const psa_work *work, double h, double theta,
+                        double *x) {
     const int last = method_of(solver)->stages - 1;
-    const double *x1 = solver->stage_x[last], *k1 = solver->stage_k[last];
+    const double *x1 = work->stage_x[last], *k1 = work->stage_k[last];
     for (int i = 0; i < PSA_NX; ++i) {
         const double x0 = solver->x[i], change = x1[i] - x0;
         x[i] = x0 + theta * change +
@@ -252,22 +234,22 @@ static void interpolate(const psa_solver *solver, double h, double theta, double
     }
 }
 
-static int switches_at(const psa_solver *solver, double h, double theta, const psa_input *input,
-                       const double *p, double *z) {
+static int switches_at(const psa_solver *solver, const psa_work *work, double h, double theta,
+                       const psa_input *input, const double *p, double *z) {
     double x[PSA_NX], u[PSA_NU + 1];
     const double t = solver->t + theta * h;
-    interpolate(solver, h, theta, x);
+    interpolate(solver, work, h, theta, x);
     psa_input_at(input, t, u);
     return psa_model_switches(t, x, u, p, z);
 }
 
 /* Share of the step just tried after which the first switch has changed its sign; 1 if none does.
    Illinois's variant of the secant method on the interpolated states. */
-static double first_kink(const psa_solver *solver, double h, const psa_input *input,
-                         const double *p) {
+static double first_kink(const psa_solver *solver, const psa_work *work, double h,
+                         const psa_input *input, const double *p) {
     double first = 1.0, low[PSA_NZ + 1], high[PSA_NZ + 1], z[PSA_NZ + 1];
-    if (PSA_NZ == 0 || switches_at(solver, h, 0.0, input, p, low) ||
-        switches_at(solver, h, 1.0, input, p, high))
+    if (PSA_NZ == 0 || switches_at(solver, work, h, 0.0, input, p, low) ||
+        switches_at(solver, work, h, 1.0, input, p, high))
         return 1.0;
     for (int s = 0; s < PSA_NZ; ++s) {
         double a = 0.0, b = 1.0, za = low[s], zb = high[s];
@@ -275,7 +257,7 @@ static double first_kink(const psa_solver *solver, double h, const psa_input *in
         for (int i = 0; i < KINK_ITERATIONS && b - a > KINK_RESOLUTION; ++i) {
             const double margin = 0.01 * (b - a), secant = b - zb * (b - a) / (zb - za);
             const double theta = fmin(fmax(secant, a + margin), b - margin);
-            if (switches_at(solver, h, theta, input, p, z)) return 1.0;
+            if (switches_at(solver, work, h, theta, input, p, z)) return 1.0;
             if (z[s] * zb > 0.0) {
                 b = theta;
                 zb = z[s];
@@ -291,70 +273,88 @@ static double first_kink(const psa_solver *solver, double h, const psa_input *in
     return first;
 }
 
-static psa_status accept(psa_solver *solver, double t_new, double h, const psa_input *input,
-                         const double *p, psa_sensitivities *sens) {
-    if (sens && step_sensitivities(solver, h, input, p, sens)) return PSA_NOT_FINITE;
+static psa_status accept(psa_solver *solver, psa_work *work, double t_new, double h,
+                         const psa_input *input, const double *p, psa_sensitivities *sens) {
+    if (sens && step_sensitivities(solver, work, h, input, p, sens)) return PSA_NOT_FINITE;
     const int last = method_of(solver)->stages - 1;
-    memcpy(solver->x, solver->stage_x[last], sizeof solver->x);
-    memcpy(solver->slope, solver->stage_k[last], sizeof solver->slope);
+    memcpy(solver->x, work->stage_x[last], sizeof solver->x);
+    memcpy(solver->slope, work->stage_k[last], sizeof solver->slope);
     solver->t = t_new;
     psa_input_at(input, t_new, solver->last_input);
     solver->steps++;
     return PSA_OK;
 }
 
-psa_status psa_solver_advance(psa_solver *solver, double t_end, const psa_input *input,
-                              const double *p, psa_sensitivities *sens) {
-    const double exponent = method_of(solver)->exponent;
-    const long limit = solver->steps_limit > 0 ? solver->steps_limit : 10000000L;
-    const double smallest = 8.0 * 2.220446049250313e-16 * (fabs(t_end) + fabs(solver->t));
-    long taken = 0;
-    set_weights(solver);
-    switch (prepare_slope(solver, input, p)) {
-    case 1: return PSA_NOT_FINITE;
-    case 2:
-        if (sens) sens->slope_valid = 0;
-        break;
-    default: break;
-    }
-    if (!(solver->step > 0.0)) solver->step = first_step(solver);
-    while (solver->t < t_end) {
-        double u[PSA_NU + 1];
-        psa_input_at(input, solver->t, u);
-        set_weights(solver);
-        if (psa_model_jacobian(solver->t, solver->x, u, p, solver->jac)) return PSA_NOT_FINITE;
-        solver->lu_factor_h = 0.0;
-        double aimed = 0.0; /* length of the step that ends at a kink; 0: no kink is in sight */
-        for (int accepted = 0; !accepted;) {
-            double h = solver->max_step > 0.0 ? fmin(solver->step, solver->max_step) : solver->step;
-            const double left = t_end - solver->t;
-            const int last = h * 1.01 >= left && aimed == 0.0;
-            if (aimed > 0.0) h = fmin(h, aimed);
-            else if (last) h = left;
-            else if (2.0 * h > left) h = 0.5 * left;
-            if (!(h > smallest) && !last) return PSA_STEP_TOO_SMALL;
-            if (++taken > limit) return PSA_TOO_MANY_STEPS;
-            const double error = try_step(solver, h, input, p);
-            const int good = error >= 0.0 && error <= 1.0;
-            const double kink =
-                good && !solver->landed && aimed == 0.0 ? first_kink(solver, h, input, p) : 1.0;
-            if (kink < 1.0 && kink * h > smallest) {
-                aimed = kink * h;
-                solver->rejected++;
-            } else if (good) {
-                const double factor = fmin(5.0, fmax(0.2, SAFETY * pow(fmax(error, 1e-10), exponent)));
-                const psa_status status = accept(solver, last ? t_end : solver->t + h, h, input, p, sens);
-                if (status != PSA_OK) return status;
-                solver->landed = aimed > 0.0 && h >= aimed;
-                if (solver->landed) solver->step = KINK_RESTART * h;
-                else solver->step = h < solver->step ? fmax(solver->step, h * factor) : h * factor;
-                accepted = 1;
-            } else {
-                solver->rejected++;
-                if (!(h > smallest)) return PSA_STEP_TOO_SMALL;
-                solver->step = error > 0.0 ? h * fmax(0.1, SAFETY * pow(error, exponent)) : 0.25 * h;
-            }
+/* What one call of psa_solver_advance may still spend and reach. */
+typedef struct {
+    double t_end, smallest; /* the end and the smallest step [s] */
+    int64_t attempts;       /* left */
+} psa_bounds;
+
+/* One accepted step towards the end, after as many attempts as it takes. */
+static psa_status one_step(psa_solver *solver, psa_work *work, psa_bounds *bounds,
+                           const psa_input *input, const double *p, psa_sensitivities *sens) {
+    const double exponent = method_of(solver)->exponent, smallest = bounds->smallest;
+    const double left = bounds->t_end - solver->t;
+    double u[PSA_NU + 1];
+    double aimed = 0.0; /* length of the step that ends at a kink; 0: no kink is in sight */
+    psa_input_at(input, solver->t, u);
+    set_weights(solver, work);
+    if (psa_model_jacobian(solver->t, solver->x, u, p, work->jac)) return PSA_NOT_FINITE;
+    work->lu_factor_h = 0.0;
+    for (;;) {
+        double h = solver->max_step > 0.0 ? fmin(solver->step, solver->max_step) : solver->step;
+        const int last = h * 1.01 >= left && aimed == 0.0;
+        if (aimed > 0.0) h = fmin(h, aimed);
+        else if (last) h = left;
+        else if (2.0 * h > left) h = 0.5 * left;
+        if (!(h > smallest) && !last) return PSA_STEP_TOO_SMALL;
+        if (--bounds->attempts < 0) return PSA_TOO_MANY_STEPS;
+        const double error = try_step(solver, work, h, input, p);
+        const int good = error >= 0.0 && error <= 1.0;
+        const double kink =
+            good && !solver->landed && aimed == 0.0 ? first_kink(solver, work, h, input, p) : 1.0;
+        if (kink < 1.0 && kink * h > smallest) {
+            aimed = kink * h;
+            solver->rejected++;
+        } else if (good) {
+            const double factor = fmin(5.0, fmax(0.2, SAFETY * pow(fmax(error, 1e-10), exponent)));
+            const psa_status status =
+                accept(solver, work, last ? bounds->t_end : solver->t + h, h, input, p, sens);
+            if (status != PSA_OK) return status;
+            solver->landed = aimed > 0.0 && h >= aimed;
+            if (solver->landed) solver->step = KINK_RESTART * h;
+            else solver->step = h < solver->step ? fmax(solver->step, h * factor) : h * factor;
+            return PSA_OK;
+        } else {
+            solver->rejected++;
+            if (!(h > smallest)) return PSA_STEP_TOO_SMALL;
+            solver->step = error > 0.0 ? h * fmax(0.1, SAFETY * pow(error, exponent)) : 0.25 * h;
         }
+    }
+}
+
+psa_status psa_solver_advance(psa_solver *solver, psa_work *work, double t_end,
+                              const psa_input *input, const double *p, psa_sensitivities *sens,
+                              const psa_watch *watch) {
+    psa_bounds bounds = {t_end, 8.0 * 2.220446049250313e-16 * (fabs(t_end) + fabs(solver->t)),
+                         solver->steps_limit > 0 ? solver->steps_limit : 10000000};
+    while (solver->t < bounds.t_end) {
+        /* afresh for each step, because who watches may have changed the input */
+        switch (prepare_slope(solver, input, p)) {
+        case 1: return PSA_NOT_FINITE;
+        case 2:
+            if (sens) sens->slope_valid = 0;
+            break;
+        default: break;
+        }
+        if (!(solver->step > 0.0)) {
+            set_weights(solver, work);
+            solver->step = first_step(solver, work);
+        }
+        const psa_status status = one_step(solver, work, &bounds, input, p, sens);
+        if (status != PSA_OK) return status;
+        if (watch) watch->accepted(watch->owner, &bounds.t_end);
     }
     return PSA_OK;
 }

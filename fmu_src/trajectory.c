@@ -26,6 +26,27 @@ static int write_sample(psa_trajectory *run, const psa_solver *solver, const psa
     return 0;
 }
 
+#ifdef PSA_WITH_SENSITIVITIES
+/* df/dx, and df/dtheta of the parameters in `which`; zero for initial values. */
+static int differentiate(const psa_sensitivities *sens, double t, const double *x, const double *u,
+                         const double *p, double *jac, double *forcing) {
+    const int *const which = sens->directions;
+    const int count = sens->count;
+    double param[PSA_NX * PSA_NP];
+    if (psa_model_sensitivity(t, x, u, p, jac, param)) return 1;
+    for (int i = 0; i < PSA_NX; ++i)
+        for (int c = 0; c < count; ++c)
+            forcing[i * count + c] = which[c] >= 0 ? param[i + which[c] * PSA_NX] : 0.0;
+    return 0;
+}
+#else
+static int differentiate(const psa_sensitivities *sens, double t, const double *x, const double *u,
+                         const double *p, double *jac, double *forcing) {
+    (void)sens, (void)t, (void)x, (void)u, (void)p, (void)jac, (void)forcing;
+    return 1;
+}
+#endif
+
 static void set_input(const psa_trajectory *run, long sample, psa_input *input) {
     const double span = run->t[sample + 1] - run->t[sample];
     input->origin = run->t[sample];
@@ -38,6 +59,7 @@ static void set_input(const psa_trajectory *run, long sample, psa_input *input) 
 
 int psa_run(psa_trajectory *run) {
     psa_solver solver;
+    psa_work work;
     psa_input input;
     psa_sensitivities sens = {0}, *carried = NULL;
     int status = PSA_OK;
@@ -47,7 +69,8 @@ int psa_run(psa_trajectory *run) {
     if (run->count > 0) {
         const long size = (long)PSA_NX * run->count;
         sens.count = run->count;
-        sens.which = run->which;
+        sens.differentiate = differentiate;
+        sens.directions = run->which;
         sens.s = run->work;
         sens.slope = run->work + size;
         sens.base = run->work + 2 * size;
@@ -58,14 +81,14 @@ int psa_run(psa_trajectory *run) {
     if (write_sample(run, &solver, carried, 0)) status = PSA_NOT_FINITE;
     for (long sample = 0; sample + 1 < run->samples && status == PSA_OK; ++sample) {
         set_input(run, sample, &input);
-        status = (int)psa_solver_advance(&solver, run->t[sample + 1], &input, run->p, carried);
+        status = (int)psa_solver_advance(&solver, &work, run->t[sample + 1], &input, run->p, carried, NULL);
         if (status == PSA_OK && write_sample(run, &solver, carried, sample + 1))
             status = PSA_NOT_FINITE;
     }
-    run->steps = solver.steps;
-    run->rejected = solver.rejected;
-    run->evaluations = solver.evaluations;
+    run->steps = (long)solver.steps;
+    run->rejected = (long)solver.rejected;
+    run->evaluations = (long)solver.evaluations;
     run->t_failed = solver.t;
-    run->culprit = solver.culprit;
+    run->culprit = (int)solver.culprit;
     return status;
 }

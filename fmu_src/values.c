@@ -3,21 +3,24 @@
 
 #include "instance.h"
 
-/* Evaluate derivatives and outputs at the present time, states, inputs and parameters. */
-static psa_result refresh(psa_instance *instance) {
+psa_result psa_refresh(psa_instance *instance) {
     const psa_state *const state = &instance->state;
     double u[PSA_NU + 1];
     if (instance->fresh) return PSA_FINE;
     psa_input_at(&state->input, state->solver.t, u);
     if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
-        psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y))
+        psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y) ||
+        psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z))
         return psa_say(instance, PSA_DISCARD, "The model cannot be evaluated at t = %.9g s.",
                        state->solver.t);
+    for (int i = 0; i < PSA_NZ; ++i)
+        instance->z[i] =
+            state->facing[i] * instance->z[i] + state->event_margin * psa_switch_scales[i];
     instance->fresh = 1;
     return PSA_FINE;
 }
 
-static const psa_variable *variable(psa_instance *instance, unsigned vr) {
+const psa_variable *psa_variable_of(psa_instance *instance, unsigned vr) {
     if (vr < PSA_VARIABLES) return &psa_variables[vr];
     psa_say(instance, PSA_ERROR, "There is no variable of value reference %u; the last is %u.", vr,
             (unsigned)(PSA_VARIABLES - 1));
@@ -31,6 +34,7 @@ static double value_of(const psa_instance *instance, const psa_variable *v) {
     case PSA_DERIVATIVE: return instance->xdot[v->index];
     case PSA_INPUT: return instance->state.input.value[v->index];
     case PSA_OUTPUT: return instance->y[v->index];
+    case PSA_INDICATOR: return instance->z[v->index];
     default: return instance->state.p[v->index];
     }
 }
@@ -39,10 +43,10 @@ psa_result psa_get(psa_instance *instance, const unsigned *vr, size_t count, dou
     psa_result result = PSA_FINE;
     if (psa_lacks(instance, count, vr, value)) return PSA_ERROR;
     for (size_t i = 0; i < count; ++i) {
-        const psa_variable *const v = variable(instance, vr[i]);
+        const psa_variable *const v = psa_variable_of(instance, vr[i]);
         if (!v) return PSA_ERROR;
-        if (v->kind == PSA_DERIVATIVE || v->kind == PSA_OUTPUT) {
-            result = refresh(instance);
+        if (v->kind == PSA_DERIVATIVE || v->kind == PSA_OUTPUT || v->kind == PSA_INDICATOR) {
+            result = psa_refresh(instance);
             if (result != PSA_FINE) return result;
         }
         value[i] = value_of(instance, v);
@@ -56,11 +60,15 @@ psa_result psa_get(psa_instance *instance, const unsigned *vr, size_t count, dou
 /* A variable may be set if it is an input, a parameter, or a state that no solver in here is using: in
    model exchange always (CasADi's importer does so), in co-simulation before the first step. */
 static psa_result settable(psa_instance *instance, unsigned vr, double value) {
-    const psa_variable *const v = variable(instance, vr);
+    const psa_variable *const v = psa_variable_of(instance, vr);
     if (!v) return PSA_ERROR;
     if (!isfinite(value))
         return psa_say(instance, PSA_ERROR, "'%s' cannot be set to a value that is not finite.", v->name);
-    if (v->kind == PSA_STATE && instance->state.phase == PSA_STEP_COMPLETE)
+    if (instance->state.phase == PSA_INTERMEDIATE && v->kind != PSA_INPUT)
+        return psa_say(instance, PSA_ERROR,
+                       "'%s' cannot be set in an intermediate update, only inputs can.", v->name);
+    if (v->kind == PSA_STATE && instance->state.interface == PSA_CO_SIMULATION &&
+        !(instance->state.phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)))
         return psa_say(instance, PSA_ERROR,
                        "State '%s' can be set only before the first step.", v->name);
     if (v->kind != PSA_STATE && v->kind != PSA_INPUT && v->kind != PSA_PARAMETER)
@@ -130,7 +138,7 @@ psa_result psa_get_states(psa_instance *instance, double *x, size_t count) {
 
 psa_result psa_get_derivatives(psa_instance *instance, double *xdot, size_t count) {
     if (mismatch(instance, xdot, count)) return PSA_ERROR;
-    const psa_result result = refresh(instance);
+    const psa_result result = psa_refresh(instance);
     if (result != PSA_FINE) return result;
     for (int i = 0; i < PSA_NX; ++i) {
         xdot[i] = instance->xdot[i];
@@ -138,6 +146,28 @@ psa_result psa_get_derivatives(psa_instance *instance, double *xdot, size_t coun
             return psa_say(instance, PSA_DISCARD, "The derivative of '%s' is not finite at t = %.9g s.",
                            psa_variables[PSA_FIRST_STATE + i].name, instance->state.solver.t);
     }
+    return PSA_FINE;
+}
+
+psa_result psa_get_indicators(psa_instance *instance, double *z, size_t count) {
+    if (count != PSA_NZ)
+        return psa_say(instance, PSA_ERROR, "The model has %d event indicators; a vector of %lu was passed.",
+                       PSA_NZ, (unsigned long)count);
+    if (psa_lacks(instance, count, z, z)) return PSA_ERROR;
+    const psa_result result = psa_refresh(instance);
+    if (result == PSA_FINE) memcpy(z, instance->z, sizeof(double) * PSA_NZ);
+    return result;
+}
+
+psa_result psa_update_events(psa_instance *instance) {
+    psa_state *const state = &instance->state;
+    const psa_result result = psa_refresh(instance);
+    if (result != PSA_FINE) return result;
+    for (int i = 0; i < PSA_NZ; ++i)
+        if (instance->z[i] < 0.5 * state->event_margin * psa_switch_scales[i]) {
+            state->facing[i] = -state->facing[i];
+            instance->fresh = 0;
+        }
     return PSA_FINE;
 }
 
@@ -154,7 +184,7 @@ psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_
     if (psa_lacks(instance, count, vr, rate) || psa_lacks(instance, count, order, order))
         return PSA_ERROR;
     for (size_t i = 0; i < count; ++i) {
-        const psa_variable *const v = variable(instance, vr[i]);
+        const psa_variable *const v = psa_variable_of(instance, vr[i]);
         if (!v) return PSA_ERROR;
         if (v->kind != PSA_INPUT || order[i] != 1 || !isfinite(rate[i]))
             return psa_say(instance, PSA_ERROR,
@@ -175,17 +205,17 @@ psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size
                                 const int *order, double *rate) {
     const psa_state *const state = &instance->state;
     const double none[PSA_NP + 1] = {0.0};
-    double dxdot[PSA_NX + 1], dy[PSA_NY + 1], u[PSA_NU + 1];
+    double dy[PSA_NY + 1], u[PSA_NU + 1];
     if (psa_lacks(instance, count, vr, rate) || psa_lacks(instance, count, order, order))
         return PSA_ERROR;
-    const psa_result result = refresh(instance);
+    const psa_result result = psa_refresh(instance);
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.t, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, 1.0, instance->xdot,
-                              state->input.rate, none, dxdot, dy))
+                              state->input.rate, none, NULL, dy, NULL))
         return psa_say(instance, PSA_DISCARD, "The outputs cannot be differentiated here.");
     for (size_t i = 0; i < count; ++i) {
-        const psa_variable *const v = variable(instance, vr[i]);
+        const psa_variable *const v = psa_variable_of(instance, vr[i]);
         if (!v) return PSA_ERROR;
         if (v->kind != PSA_OUTPUT || order[i] != 1)
             return psa_say(instance, PSA_ERROR,
@@ -193,44 +223,6 @@ psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size
                            " order 1.",
                            order[i], v->name);
         rate[i] = dy[v->index];
-    }
-    return PSA_FINE;
-}
-
-/* Seed of a known: time, state, input or parameter. */
-static int seed_one(const psa_variable *v, double seed, double *dt, double *dx, double *du, double *dp) {
-    switch (v->kind) {
-    case PSA_TIME: *dt += seed; return 1;
-    case PSA_STATE: dx[v->index] += seed; return 1;
-    case PSA_INPUT: du[v->index] += seed; return 1;
-    case PSA_PARAMETER: dp[v->index] += seed; return 1;
-    default: return 0;
-    }
-}
-
-psa_result psa_directional_derivative(psa_instance *instance, const unsigned *unknown,
-                                      size_t unknowns, const unsigned *known, size_t knowns,
-                                      const double *seed, double *sensitivity) {
-    const psa_state *const state = &instance->state;
-    double dt = 0.0, dx[PSA_NX + 1] = {0.0}, du[PSA_NU + 1] = {0.0}, dp[PSA_NP + 1] = {0.0};
-    double dxdot[PSA_NX + 1], dy[PSA_NY + 1], u[PSA_NU + 1];
-    if (psa_lacks(instance, unknowns, unknown, sensitivity) || psa_lacks(instance, knowns, known, seed))
-        return PSA_ERROR;
-    for (size_t i = 0; i < knowns; ++i) {
-        const psa_variable *const v = variable(instance, known[i]);
-        if (!v) return PSA_ERROR;
-        if (!seed_one(v, seed[i], &dt, dx, du, dp))
-            return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be varied.", v->name);
-    }
-    psa_input_at(&state->input, state->solver.t, u);
-    if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, dt, dx, du, dp, dxdot, dy))
-        return psa_say(instance, PSA_DISCARD, "The model cannot be differentiated here.");
-    for (size_t i = 0; i < unknowns; ++i) {
-        const psa_variable *const v = variable(instance, unknown[i]);
-        if (!v) return PSA_ERROR;
-        if (v->kind != PSA_DERIVATIVE && v->kind != PSA_OUTPUT)
-            return psa_say(instance, PSA_ERROR, "'%s' is not calculated and has no derivative.", v->name);
-        sensitivity[i] = v->kind == PSA_OUTPUT ? dy[v->index] : dxdot[v->index];
     }
     return PSA_FINE;
 }

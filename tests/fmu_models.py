@@ -4,7 +4,10 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
+
+from lxml import etree  # type: ignore[import-untyped]
 
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
@@ -24,7 +27,10 @@ _MANIPULATOR = {
 
 @cache
 def model_named(name: str) -> Model:
-    """Return a stack by its name, or one of: manipulator, single_mass, flexure, slow_creep."""
+    """Return a stack by its name, or one of: manipulator, single_mass, flexure, slow_creep.
+
+    Or "every_effect": the base with all effects, each with a small gain.
+    """
     if name in STACKS:
         return compose(BASE, {k: figure.value for k, figure in STACKS[name].values.items()})
     if name == "manipulator":
@@ -33,13 +39,29 @@ def model_named(name: str) -> Model:
         return compose(SIMPLIFIED)
     if name == "flexure":
         return compose([COMPONENTS["flexure"]], name="flexure")
+    if name == "every_effect":
+        gains = {c.gain: 1e-3 for c in EFFECTS.values() if c.gain}
+        return compose((*BASE, *EFFECTS.values()), gains, name=name)
     return compose((*BASE, EFFECTS["slow_creep"]), {"creep_gain": 0.05})
 
 
 @cache
-def exported(name: str) -> Path:
-    """Return the FMU of a named model."""
-    return export_fmu(model_named(name), Path(_FOLDER.name) / f"{name}.fmu")
+def exported(name: str, fmi: int = 2) -> Path:
+    """Return the FMU of a named model, FMI 2.0 or 3.0."""
+    return export_fmu(model_named(name), Path(_FOLDER.name) / f"{name}_{fmi}.fmu", fmi=fmi)
+
+
+@cache
+def entries(name: str, fmi: int) -> dict[str, bytes]:
+    """Return the files inside the FMU of a named model."""
+    with zipfile.ZipFile(exported(name, fmi)) as archive:
+        return {n: archive.read(n) for n in archive.namelist()}
+
+
+def assert_valid(text: str, *schema: str) -> None:
+    """Validate an XML text with a schema that comes with fmpy, named by its place in there."""
+    rules = etree.XMLSchema(file=str(files("fmpy").joinpath(*schema)))
+    assert rules.validate(etree.fromstring(text.encode("utf-8"))), rules.error_log
 
 
 def rewritten(source: Path, target: Path, changes: dict[str, Callable[[bytes], bytes]]) -> Path:

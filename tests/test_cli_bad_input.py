@@ -204,10 +204,9 @@ def test_the_papers_method_takes_no_model(tmp_path: Path) -> None:
     assert "--method paper starts from no model" in said
 
 
-def test_what_is_not_available_yet_says_so(tmp_path: Path) -> None:
+def test_impossible_exports_say_so(tmp_path: Path) -> None:
     model = write(tmp_path / "model.json", MODEL)
     fmu = ("export", "fmu", "--model", model, "-o", tmp_path / "x.fmu")
-    assert "not available yet" in refused(*fmu, "--fmi", "3", outputs=tmp_path)
     assert "'vax' is not known" in refused(*fmu, "--platforms", "vax", outputs=tmp_path)
     assert "cannot name an FMU" in refused(*fmu, "--name", "1st", outputs=tmp_path)
     assert "--fmi" in refused(*fmu, "--fmi", "7", outputs=tmp_path)

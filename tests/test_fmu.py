@@ -15,12 +15,16 @@ from psa_casadi.reference import from_samples, simulate
 from tests.fmu_models import exported, model_named
 
 STACK = "P-885.51"
-MODELS = ("PTBS200", "WYDS0808020", STACK, "manipulator", "single_mass", "slow_creep", "flexure")
+MODELS = (
+    "PTBS200", "WYDS0808020", STACK, "manipulator", "single_mass", "slow_creep", "flexure",
+    "every_effect",
+)  # fmt: skip
 
 
+@pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("name", MODELS)
-def test_check_passes(name: str) -> None:
-    report = check_fmu(exported(name), model_named(name))
+def test_check_passes(name: str, fmi: int) -> None:
+    report = check_fmu(exported(name, fmi), model_named(name))
     assert report.compared
     assert not report.failures, "\n".join(
         f"{r.name}: {r.figure} {r.remark}" for r in report.failures

@@ -2,8 +2,6 @@
 
 import re
 import shutil
-import subprocess
-import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,6 @@ from psa_casadi.component import Component, Equations
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.fmi2_functions import FUNCTIONS
 from psa_casadi.export.fmu import MODEL_ENTRY, export_fmu
 from psa_casadi.export.model_description import model_description, time_scale
 from psa_casadi.export.platforms import PLATFORMS, chosen_platforms
@@ -40,12 +37,6 @@ def _binary(path: Path) -> bytes:
 def _xml(path: Path) -> ET.Element:
     with zipfile.ZipFile(path) as archive:
         return ET.fromstring(archive.read("modelDescription.xml"))
-
-
-def test_same_model_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    again = export_fmu(model_named(STACK), Path("again.fmu"))
-    assert again.read_bytes() == exported(STACK).read_bytes()
 
 
 def test_token_follows_the_model() -> None:
@@ -84,26 +75,6 @@ def test_source_list_is_complete() -> None:
     for interface in ("ModelExchange", "CoSimulation"):
         assert {f.attrib["name"] for f in root.findall(f"{interface}/SourceFiles/File")} == compiled
     assert {f.attrib["name"] for f in listed.iter("SourceFile")} == compiled
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads the versions of GNU libc")
-def test_binary_needs_an_old_c_library_only() -> None:
-    found = {
-        tuple(map(int, v.split(b".")))
-        for v in re.findall(rb"GLIBC_([\d.]+)", _binary(exported(STACK)))
-    }
-    assert found
-    assert max(found) <= (2, 17)
-
-
-@pytest.mark.skipif(not shutil.which("nm"), reason="needs nm")
-def test_binary_exports_fmi_functions_only(tmp_path: Path) -> None:
-    library = tmp_path / "library.so"
-    library.write_bytes(_binary(exported(STACK)))
-    listing = subprocess.run(
-        ["nm", "-D", "--defined-only", str(library)], capture_output=True, text=True, check=True
-    ).stdout
-    assert {line.split()[-1] for line in listing.splitlines()} == {f"fmi2{n}" for n in FUNCTIONS}
 
 
 def test_model_is_inside() -> None:

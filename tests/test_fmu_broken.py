@@ -1,18 +1,22 @@
 """FMUs broken in one way each: the check must find every one, and name it."""
 
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.check import CheckReport, check_fmu
+from psa_casadi.export.fmu import MODEL_ENTRY, write_archive
 from psa_casadi.export.platforms import compile_library, host_platform
-from tests.fmu_models import exported, model_named, rewritten
+from tests.broken_descriptions import DESCRIPTIONS, STACK
+from tests.fmu_models import entries, exported, model_named, rewritten
 
-STACK = "P-885.51"
 XML = "modelDescription.xml"
+VERSIONS = (2, 3)
+#: Any change of description or sources is found by this row too.
+ALWAYS = "reproducible"
 
 
 def _failures(report: CheckReport) -> dict[str, str]:
@@ -23,56 +27,37 @@ def _edit(old: str, new: str) -> Callable[[bytes], bytes]:
     return lambda content: content.replace(old.encode(), new.encode(), 1)
 
 
-def _recompiled(source: Path, target: Path, file: str, old: str, new: str) -> Path:
-    """Change one source file, compile all, and put the binary in place."""
-    with zipfile.ZipFile(source) as archive:
-        texts = {
-            n.removeprefix("sources/"): archive.read(n).decode()
-            for n in archive.namelist()
-            if n.startswith("sources/")
-        }
-        binary = next(n for n in archive.namelist() if n.startswith("binaries/"))
-    if old not in texts[file]:
-        raise ValueError(f"{file} has no '{old}'")
-    texts[file] = texts[file].replace(old, new, 1)
-    library = compile_library(texts, "psa", host_platform())
-    return rewritten(source, target, {binary: lambda _: library})
+def _binary(fmi: int) -> str:
+    return next(n for n in entries(STACK, fmi) if n.startswith("binaries/"))
 
 
-def test_token_mismatch(tmp_path: Path) -> None:
-    broken = rewritten(exported(STACK), tmp_path / "b.fmu", {XML: _edit('guid="{', 'guid="{0')})
-    found = _failures(check_fmu(broken))
-    assert set(found) == {"co-simulation instantiates", "model exchange instantiates"}
-    assert "not of the same export" in found["co-simulation instantiates"]
-
-
-def test_missing_unit_definition(tmp_path: Path) -> None:
-    change = _edit('<Unit name="N/V">', '<Unit name="N.V">')
-    found = _failures(check_fmu(rewritten(exported(STACK), tmp_path / "b.fmu", {XML: change})))
-    assert set(found) == {"description valid", "units defined"}
-    assert "'k_L' has the unit 'N/V', which is not defined" in found["units defined"]
-
-
-def test_missing_dependency(tmp_path: Path) -> None:
-    """charge = C_p u: the entry of C_p is taken out."""
-    model = model_named(STACK).plant()
-    place = 2 + 2 * len(model.state_names) + len(model.input_names) + len(model.output_names)
-    place += model.parameter_names.index("C_p")
-    old = f'dependencies="2 {place}" dependenciesKind="tunable dependent"'
-    change = _edit(old, 'dependencies="2" dependenciesKind="tunable"')
-    found = _failures(check_fmu(rewritten(exported(STACK), tmp_path / "b.fmu", {XML: change})))
-    assert found == {
-        "dependencies complete": "'charge' depends on 'C_p', which its dependencies do not list"
+def _recompiled(target: Path, fmi: int, edits: Mapping[str, tuple[tuple[str, str], ...]]) -> Path:
+    """Change source files, compile all, and put the binary in place."""
+    texts = {
+        n.removeprefix("sources/"): content.decode()
+        for n, content in entries(STACK, fmi).items()
+        if n.startswith("sources/")
     }
+    for file, changes in edits.items():
+        for old, new in changes:
+            if old not in texts[file]:
+                raise ValueError(f"{file} has no '{old}'")
+            texts[file] = texts[file].replace(old, new, 1)
+    library = compile_library(texts, "psa", host_platform())
+    return rewritten(exported(STACK, fmi), target, {_binary(fmi): lambda _: library})
 
 
-def test_wrong_start_value(tmp_path: Path) -> None:
-    change = _edit('start="0.0001"', 'start="0.0002"')
-    found = _failures(check_fmu(rewritten(exported(STACK), tmp_path / "b.fmu", {XML: change})))
-    assert found == {"start values": "'tau' starts at 0.0002, the model has 0.0001"}
+@pytest.mark.parametrize("fmi", VERSIONS)
+@pytest.mark.parametrize("fault", DESCRIPTIONS)
+def test_wrong_description(fault: str, fmi: int, tmp_path: Path) -> None:
+    edit, rows, remark = DESCRIPTIONS[fault]
+    changes = {XML: _edit(*edit(fmi))}
+    found = _failures(check_fmu(rewritten(exported(STACK, fmi), tmp_path / "b.fmu", changes)))
+    assert set(found) == rows | {ALWAYS}, found
+    assert any(remark in found[row] for row in rows), found
 
 
-SOURCES = {
+CORE = {
     "wrong sign of a derivative": (
         "model_casadi.c",
         "return call(psa_ode, t, x, u, p, xdot, NULL);",
@@ -125,17 +110,112 @@ SOURCES = {
 }
 
 
-@pytest.mark.parametrize("fault", SOURCES)
+@pytest.mark.parametrize("fault", CORE)
 def test_wrong_sources(fault: str, tmp_path: Path) -> None:
-    file, old, new, rows = SOURCES[fault]
-    broken = _recompiled(exported(STACK), tmp_path / "b.fmu", file, old, new)
-    report = check_fmu(broken)
+    file, old, new, rows = CORE[fault]
+    report = check_fmu(_recompiled(tmp_path / "b.fmu", 2, {file: ((old, new),)}))
     assert report.compared
     assert rows <= set(_failures(report)), _failures(report)
+
+
+#: Faults of the FMI 3.0 face that share a binary, as each has a row of its own.
+FACE = {
+    "fmi3_values.c": (
+        (
+            "    return psa_fmi3_status(psa_adjoint_derivative(core, unknowns, nunknowns, knowns,"
+            " nknowns, seed,\n                                                  sensitivity));",
+            "    const psa_result r = psa_adjoint_derivative(core, unknowns, nunknowns, knowns,"
+            " nknowns, seed, sensitivity);\n    if (nknowns) sensitivity[0] *= 1.0 + 1e-6;\n"
+            "    return psa_fmi3_status(r);",
+        ),
+    ),
+    "fmi3_interfaces.c": (
+        ("*terminate = fmi3False;", "*terminate = fmi3True;"),
+        ("*earlyReturn = early != 0;", "*earlyReturn = fmi3False;"),
+    ),
+    "fmi3_clocks.c": (
+        (
+            "fmi3Status fmi3ActivateModelPartition(",
+            "FMI3_Export fmi3Status fmi3ActivateModelPartitions(fmi3Instance, fmi3ValueReference,"
+            " fmi3Float64);\nfmi3Status fmi3ActivateModelPartitions(",
+        ),
+    ),
+}
+
+
+def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
+    found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, FACE)))
+    assert {
+        "adjoint derivatives", "event mode", "life cycle", "intermediate update",
+        "functions present", "no other symbols", "illegal calls",
+    } == set(found), found  # fmt: skip
+    assert "fmi3ActivateModelPartition is missing" in found["functions present"]
+    assert "fmi3ActivateModelPartitions is exported" in found["no other symbols"]
+    assert "does not return early" in found["intermediate update"]
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_binaries_that_cannot_be_used(fmi: int, tmp_path: Path) -> None:
+    """Missing, cut off, of something else, or of a new library: found, and nothing is loaded."""
+    name, content = _binary(fmi), entries(STACK, fmi)[_binary(fmi)]
+    left = {n: c for n, c in entries(STACK, fmi).items() if n != name}
+    cut, other = content[: len(content) // 2], b"no library at all"
+    for wrong, said in ((None, "no binary for this machine"), (cut, "cut off"), (other, "known")):
+        path = tmp_path / "b.fmu"
+        write_archive(path, left if wrong is None else {**left, name: wrong})
+        report = check_fmu(path)
+        assert not report.compared
+        assert said in _failures(report)["binary loads"]
+        assert {row.name for row in report.rows if row.passed} >= {"units defined", ALWAYS}
+
+
+@pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_names_in_the_binary(fmi: int, tmp_path: Path) -> None:
+    """A function under another name, and a need of a newer libc, seen without a compiler."""
+    path, name = tmp_path / "b.fmu", _binary(fmi)
+    change = _edit(f"fmi{fmi}DoStep\0", f"fmi{fmi}DoStop\0")
+    found = _failures(check_fmu(rewritten(exported(STACK, fmi), path, {name: change})))
+    assert f"fmi{fmi}DoStep is missing" in found["functions present"]
+    assert f"fmi{fmi}DoStop is exported" in found["no other symbols"]
+    change = _edit("GLIBC_2.2.5\0", "GLIBC_2.38\0\0")
+    found = _failures(check_fmu(rewritten(exported(STACK, fmi), path, {name: change})))
+    assert "needs GLIBC_2.38" in found["GNU libc 2.17"]
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_sources_and_model_that_are_not_those_of_the_binary(fmi: int, tmp_path: Path) -> None:
+    path = tmp_path / "b.fmu"
+    change = _edit("\n", "\n\n")
+    found = _failures(
+        check_fmu(rewritten(exported(STACK, fmi), path, {"sources/solver.c": change}))
+    )
+    assert found == {ALWAYS: "sources/solver.c differs"}
+    lost = {n: c for n, c in entries(STACK, fmi).items() if n != "sources/linear.c"}
+    write_archive(path, lost)
+    assert "sources/linear.c is missing" in _failures(check_fmu(path))[ALWAYS]
+    changed = {MODEL_ENTRY: lambda _: b"{"}
+    report = check_fmu(rewritten(exported(STACK, fmi), path, changed))
+    assert set(_failures(report)) == {"model inside"}
+    assert not report.compared
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_another_model(fmi: int) -> None:
+    report = check_fmu(exported(STACK, fmi), model_named("manipulator"))
+    assert {"start values", ALWAYS, "co-simulation, step 0.01 s", "model exchange"} <= set(
+        _failures(report)
+    )
 
 
 def test_no_fmu(tmp_path: Path) -> None:
     path = tmp_path / "text.fmu"
     path.write_text("no archive")
     with pytest.raises(InputError, match="cannot be read as an FMU"):
+        check_fmu(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(
+            XML, entries(STACK, 2)[XML].replace(b'fmiVersion="2.0"', b'fmiVersion="1.0"')
+        )
+    with pytest.raises(InputError, match="export it again"):
         check_fmu(path)

@@ -46,5 +46,10 @@ BENCHES: dict[str, Bench] = {
             "verification",
             "the paper's figures 6 to 10 (loops, steps, other voltages), and three mechanics",
         ),
+        _later(
+            "work_precision",
+            "fmu",
+            "error against work: the FMU's own solver beside CVode, Radau and LSODA",
+        ),
     )
 }

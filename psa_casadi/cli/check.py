@@ -16,7 +16,7 @@ def check(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Check an FMU: description, calling sequences, trajectories; exit code 1 if a check fails."""
+    """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.check import check_fmu
     from psa_casadi.model.model_file import load_model

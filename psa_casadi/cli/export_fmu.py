@@ -32,14 +32,12 @@ def fmu(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a model as an FMU: FMI 2.0, co-simulation and model exchange in one archive."""
+    """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu import export_fmu
     from psa_casadi.export.platforms import chosen_platforms
 
     given = Given()
-    if fmi is FmiVersion.THREE:
-        given.add("--fmi 3: FMI 3.0 is not available yet; leave --fmi out, or give 2.")
     given.outputs({"--output": output}, [model])
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
@@ -49,7 +47,14 @@ def fmu(
         return
     with working("compiling", quiet) as progress:
         progress(", ".join(t.name for t in targets))
-        export_fmu(chosen, output, name=name, include_sensor=include_sensor, platforms=wanted)
+        export_fmu(
+            chosen,
+            output,
+            name=name,
+            include_sensor=include_sensor,
+            platforms=wanted,
+            fmi=int(fmi),
+        )
     kept = chosen if include_sensor else chosen.plant()
     inside = ", ".join(c.name for c in kept.components)
     left_out = [c.name for c in chosen.components if c not in kept.components]

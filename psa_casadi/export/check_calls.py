@@ -1,4 +1,4 @@
-"""Calling sequences of an FMI 2.0 FMU that must succeed, and what must come of them."""
+"""Calling sequences of an FMU that must succeed, and what must come of them."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -7,16 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.export.check_illegal import illegal_calls
-from psa_casadi.export.fmu_instance import (
-    CO_SIMULATION,
-    ERROR,
-    MODEL_EXCHANGE,
-    OK,
-    Callbacks,
-    Fmu,
-    FmuError,
-    Instance,
-)
+from psa_casadi.export.fmu_calls import CO_SIMULATION, ERROR, MODEL_EXCHANGE, FmuError, Instance
+from psa_casadi.export.fmu_instance import Fmu
 
 FloatArray = npt.NDArray[np.float64]
 Problems = Iterator[str]
@@ -52,11 +44,9 @@ def life_cycle(fmu: Fmu) -> Problems:
             results.append(_run(slave, size, (0.5, 1.0)))
             slave.require("Terminate")
             slave.require("Reset")
-            slave.require("SetupExperiment", 0, 0.0, 0.0, 0, 0.0)
-            slave.require("EnterInitializationMode")
-            slave.require("ExitInitializationMode")
+            slave.setup()
     if _differ(*results):
-        yield "after fmi2Reset a co-simulation instance gives other results"
+        yield "after a reset a co-simulation instance gives other results"
     with fmu.start(MODEL_EXCHANGE) as model:
         names = fmu.states()
         x = np.array([0.1 * fmu.nominals[n] for n in names])
@@ -64,36 +54,48 @@ def life_cycle(fmu: Fmu) -> Problems:
         if not np.all(np.isfinite(slope)):
             yield "the derivatives are not finite"
         if _differ(model.get([f"der({n})" for n in names]), slope):
-            yield "fmi2GetReal of der(x) differs from fmi2GetDerivatives"
+            yield "the values of the variables der(x) differ from the derivatives"
+        if any(model.completed_integrator_step()):
+            yield "the end of an integrator step asks for an event or for the end"
         model.require("EnterEventMode")
+        if any(model.update_discrete_states()):
+            yield "an event asks for more than going on"
         model.require("EnterContinuousTimeMode")
         model.require("Terminate")
 
 
 def refused_instances(fmu: Fmu) -> Problems:
-    """A wrong GUID and an empty name give no instance."""
-    wrong = (({"guid": "{no such token}"}, "a wrong GUID"), ({"name": ""}, "an empty name"))
-    for changes, what in wrong:
-        instance = fmu.instantiate(CO_SIMULATION, **changes)
-        if instance is not None:
-            instance.free()
-            yield f"fmi2Instantiate accepts {what}"
+    """A wrong token and an empty name give no instance."""
+    wrong = (({"token": "{no such token}"}, "a wrong token"), ({"name": ""}, "an empty name"))
+    for interface in (CO_SIMULATION, MODEL_EXCHANGE):
+        for changes, what in wrong:
+            instance = fmu.instantiate(interface, **changes)
+            if instance is not None:
+                instance.free()
+                yield f"an instance is made in spite of {what}"
 
 
 def null_callbacks(fmu: Fmu) -> Problems:
     """No callbacks, and callbacks that are all NULL, are tolerated, errors included."""
-    for callbacks in (None, Callbacks()):
-        instance = fmu.instantiate(CO_SIMULATION, callbacks=callbacks)
+    for logger in ("none", "empty"):
+        instance = fmu.instantiate(CO_SIMULATION, logger=logger)
         if instance is None:
-            yield "fmi2Instantiate refuses NULL callbacks"
+            yield "NULL callbacks are refused"
             continue
         with instance:
-            if instance.call("DoStep", 0.0, 1.0, 1) != ERROR:
-                yield "fmi2DoStep before initialization is not refused"
-            instance.require("SetupExperiment", 0, 0.0, 0.0, 0, 0.0)
-            instance.require("EnterInitializationMode")
-            instance.require("ExitInitializationMode")
+            if _status(instance, 0.0, 1.0) != ERROR:
+                yield "a step before initialization is not refused"
+            instance.setup()
             instance.step(0.0, fmu.step_size)
+
+
+def _status(instance: Instance, point: float, size: float) -> int:
+    """Return the status of a communication step."""
+    try:
+        instance.step(point, size)
+    except FmuError as error:
+        return error.status
+    return 0
 
 
 def communication_points(fmu: Fmu) -> Problems:
@@ -106,7 +108,7 @@ def communication_points(fmu: Fmu) -> Problems:
         if _differ(before[-1], slave.get([*fmu.names("output"), *fmu.states()])):
             yield "a step of zero size changes the result"
         for point in (math.nextafter(now, 1.0), math.nextafter(now + size, 0.0)):
-            if slave.call("DoStep", float(point), size, 1) != OK:
+            if _status(slave, point, size):
                 yield "a communication point that differs by rounding is refused"
 
 
@@ -173,14 +175,21 @@ def snapshots(fmu: Fmu) -> Problems:
             other.drop(copy)
             if _differ(first, _run(other, size, shares, 2 * size)):
                 yield "a state moved to another instance does not replay the same bits"
-        middle = len(data) // 2
-        damaged = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
-        for wrong, what in ((damaged, "damaged"), (data[:-1], "truncated")):
+        for wrong, what in _damaged(data):
             try:
-                slave.deserialize(wrong)
+                slave.drop(slave.deserialize(wrong))
             except FmuError:
                 continue
             yield f"a {what} serialised state is accepted"
+
+
+def _damaged(data: bytes) -> Iterator[tuple[bytes, str]]:
+    """Yield serialised states with something wrong, and what."""
+    for place, what in ((0, "foreign"), (len(data) // 2, "damaged")):
+        yield data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :], what
+    yield data[:-1], "truncated"
+    yield data[:8], "truncated"
+    yield data + b"\0", "lengthened"
 
 
 #: The checks by the name of their row.

@@ -1,39 +1,20 @@
 """What modelDescription.xml claims about an FMU, measured on its binary."""
 
 from collections.abc import Iterator
-from ctypes import c_double, c_size_t
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.export.fmi2_functions import FUNCTIONS
-from psa_casadi.export.fmu_instance import MODEL_EXCHANGE, Fmu, Instance
+from psa_casadi.export.fmu_calls import CO_SIMULATION, MODEL_EXCHANGE, Instance
+from psa_casadi.export.fmu_instance import Fmu
+from psa_casadi.export.fmu_instance3 import Instance3
 from psa_casadi.model.compose import Model
 
 FloatArray = npt.NDArray[np.float64]
 _POINTS = 3
 
 
-def missing_functions(fmu: Fmu) -> Iterator[str]:
-    """Every function of both interfaces is in the binary, as importers look them all up."""
-    for name in FUNCTIONS:
-        if not hasattr(fmu.library, "fmi2" + name):
-            yield f"fmi2{name} is missing"
-
-
-def undefined_units(fmu: Fmu) -> Iterator[str]:
-    """Every Real variable has a unit, with a definition; so has its display unit."""
-    defined = {u.name: {d.name for d in u.displayUnits} for u in fmu.description.unitDefinitions}
-    for variable in fmu.description.modelVariables:
-        if variable.type != "Real":
-            continue
-        if variable.unit not in defined:
-            yield f"'{variable.name}' has the unit '{variable.unit}', which is not defined"
-        elif variable.displayUnit and variable.displayUnit not in defined[variable.unit]:
-            yield f"'{variable.name}' has the undefined display unit '{variable.displayUnit}'"
-
-
-def _random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
+def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
     """Return values of time, states, inputs and parameters; no gain is 0, all keep their bounds."""
     point = {"time": float(generator.uniform(0.1, 1.0))}
     for v in fmu.description.modelVariables:
@@ -46,7 +27,7 @@ def _random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
     return point
 
 
-def _evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) -> FloatArray:
+def evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) -> FloatArray:
     """Return unknowns at a point."""
     fmu = instance.fmu
     states = np.array([point[n] for n in fmu.states()])
@@ -56,27 +37,29 @@ def _evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) 
 
 
 def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
-    """Whatever moves an output or a derivative is among its dependencies, parameters included."""
+    """Whatever moves an output, derivative or indicator is listed, parameters included."""
     generator = np.random.default_rng(1)
-    entries = [*fmu.description.outputs, *fmu.description.derivatives]
-    claimed: dict[str, set[str]] = {}
+    described = fmu.description
+    entries = [*described.outputs, *described.derivatives, *described.initialUnknowns]
+    entries += described.eventIndicators if fmu.version == 3 else []
     for entry in entries:
         if entry.dependencies is None:
             yield f"'{entry.variable.name}' lists no dependencies"
-        claimed[entry.variable.name] = {d.name for d in entry.dependencies or []}
-    unknowns = list(claimed)
-    found: set[tuple[str, str]] = set()
+    unknowns = list(dict.fromkeys(e.variable.name for e in entries))
+    found: dict[str, set[str]] = {name: set() for name in unknowns}
     with fmu.start(MODEL_EXCHANGE) as instance:
         for _ in range(_POINTS):
-            point = _random_point(fmu, generator)
-            here = _evaluate(instance, point, unknowns)
+            point = random_point(fmu, generator)
+            here = evaluate(instance, point, unknowns)
             for known in point:
                 moved = {**point, known: point[known] * 1.01}
-                changed = _evaluate(instance, moved, unknowns) != here
-                found |= {(u, known) for u, c in zip(unknowns, changed, strict=True) if c}
-    for unknown, known in sorted(found):
-        if known not in claimed[unknown]:
-            yield f"'{unknown}' depends on '{known}', which its dependencies do not list"
+                changed = evaluate(instance, moved, unknowns) != here
+                for name in np.array(unknowns)[changed]:
+                    found[name].add(known)
+    claims = [(e.variable.name, {d.name for d in e.dependencies or []}) for e in entries]
+    missing = {(name, known) for name, claimed in claims for known in found[name] - claimed}
+    for name, known in sorted(missing):
+        yield f"'{name}' depends on '{known}', which its dependencies do not list"
 
 
 def directional_error(fmu: Fmu) -> float:
@@ -86,35 +69,55 @@ def directional_error(fmu: Fmu) -> float:
     """
     generator = np.random.default_rng(2)
     unknowns = [u.variable.name for u in (*fmu.description.outputs, *fmu.description.derivatives)]
+    unknowns += fmu.indicators()
     worst = 0.0
     with fmu.start(MODEL_EXCHANGE) as instance:
         for _ in range(_POINTS):
-            point = _random_point(fmu, generator)
+            point = random_point(fmu, generator)
             knowns = [k for k in point if k != "time"]
             seeds = np.array([fmu.nominals[k] * generator.uniform(-1.0, 1.0) for k in knowns])
             step = 1e-6
             ends = []
             for sign in (1.0, -1.0):
                 moved = {k: point[k] + sign * step * d for k, d in zip(knowns, seeds, strict=True)}
-                ends.append(_evaluate(instance, {**point, **moved}, unknowns))
-            here = _evaluate(instance, point, unknowns)
-            exact = _directional(instance, unknowns, knowns, seeds)
+                ends.append(evaluate(instance, {**point, **moved}, unknowns))
+            here = evaluate(instance, point, unknowns)
+            exact = instance.directional(unknowns, knowns, seeds)
             difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
             worst = max(worst, float(np.max(difference / (np.abs(exact) + np.abs(here) + 1e-300))))
     return worst
 
 
-def _directional(
-    instance: Instance, unknowns: list[str], knowns: list[str], seeds: FloatArray
-) -> FloatArray:
-    result = (c_double * len(unknowns))()
-    instance.require(
-        "GetDirectionalDerivative",
-        instance.references(unknowns), c_size_t(len(unknowns)),
-        instance.references(knowns), c_size_t(len(knowns)),
-        (c_double * len(knowns))(*seeds), result,
-    )  # fmt: skip
-    return np.array(result)
+def adjoint_error(fmu: Fmu) -> float:
+    """Return the largest difference of adjoint from directional derivatives, FMI 3.0 only.
+
+    Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step;
+    each row in nominal units of the knowns, relative to its largest entry.
+    """
+    generator = np.random.default_rng(4)
+    unknowns = [*fmu.names("output"), *(u.variable.name for u in fmu.description.derivatives)]
+    unknowns += fmu.indicators()
+    point = random_point(fmu, generator)
+    knowns = [k for k in point if k != "time"]
+    size = np.array([fmu.nominals[k] for k in knowns])
+    with fmu.start3(MODEL_EXCHANGE) as instance:
+        evaluate(instance, point, unknowns)
+        worst = _transposed(instance, unknowns, knowns, size)
+    with fmu.start3(CO_SIMULATION) as instance:
+        instance.set({n: point[n] for n in fmu.names("input")})
+        instance.step(0.0, fmu.step_size)
+        return max(worst, _transposed(instance, [*unknowns, *fmu.states()], knowns, size))
+
+
+def _transposed(
+    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray
+) -> float:
+    """Return the largest difference of the matrix by rows from the one by columns."""
+    columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))]
+    rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))]
+    forward, backward = np.array(columns).T * size, np.array(rows) * size
+    largest = np.max(np.abs(forward), axis=1, initial=1e-300)
+    return float(np.max(np.abs(forward - backward) / largest[:, None]))
 
 
 def equation_error(fmu: Fmu, model: Model) -> float:
@@ -124,8 +127,8 @@ def equation_error(fmu: Fmu, model: Model) -> float:
     worst = 0.0
     with fmu.start(MODEL_EXCHANGE) as instance:
         for _ in range(_POINTS):
-            point = _random_point(fmu, generator)
-            found = _evaluate(instance, point, unknowns)
+            point = random_point(fmu, generator)
+            found = evaluate(instance, point, unknowns)
             vectors = [
                 np.array([point[n] for n in names])
                 for names in (model.state_names, model.input_names, model.parameter_names)
@@ -135,13 +138,3 @@ def equation_error(fmu: Fmu, model: Model) -> float:
             size = np.abs(expected) + np.abs(found) + 1e-300
             worst = max(worst, float(np.max(np.abs(found - expected) / size)))
     return worst
-
-
-def wrong_start_values(fmu: Fmu, model: Model) -> Iterator[str]:
-    """The parameters' start values are the model's values."""
-    starts = {v.name: v.start for v in fmu.description.modelVariables if v.causality == "parameter"}
-    for name, value in model.values.items():
-        if name not in starts:
-            yield f"the parameter '{name}' of the model is not in the FMU"
-        elif float(starts[name]) != value:
-            yield f"'{name}' starts at {starts[name]}, the model has {value!r}"

@@ -1,4 +1,4 @@
-"""What each output and derivative depends on, read off the symbolic Jacobian."""
+"""What each output, derivative and event indicator depends on, read off the symbolic Jacobian."""
 
 from functools import cache
 
@@ -12,7 +12,7 @@ Key = tuple[str, int]
 
 @cache
 def dependencies(structure: Structure) -> dict[Key, dict[Key, str]]:
-    """Return for each output and derivative what it depends on, and how.
+    """Return for each output, derivative and event indicator what it depends on, and how.
 
     Keys are (kind, index). The dependence is "constant" where the partial derivative is a number,
     "tunable" where it holds parameters only, else "dependent". Taken from the sparsity of the
@@ -24,7 +24,9 @@ def dependencies(structure: Structure) -> dict[Key, dict[Key, str]]:
     knowns: list[Key] = [(kind, i) for kind, size in groups for i in range(size)]
     unknowns: list[Key] = [("derivative", i) for i in range(len(s.states))]
     unknowns += [("output", i) for i in range(len(s.outputs))]
-    jacobian = ca.jacobian(ca.vertcat(s.xdot, s.y), ca.vertcat(s.time, s.x, s.u, s.p))
+    unknowns += [("indicator", i) for i in range(len(s.switches))]
+    values = ca.vertcat(s.xdot, s.y, *s.switches.values())
+    jacobian = ca.jacobian(values, ca.vertcat(s.time, s.x, s.u, s.p))
     tunable = {p.name for p in s.parameters}
     result: dict[Key, dict[Key, str]] = {u: {} for u in unknowns}
     rows, columns = jacobian.sparsity().get_triplet()

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,21 +22,29 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Signals:
-    """Inputs that are linear between knots: `times` (k,), `values` (k, nu), columns as `names`."""
+    """Inputs that are linear between knots: `times` (k,), `values` (k, nu), columns as `names`.
+
+    With `held` they keep the value of a knot up to the next one, where they jump.
+    """
 
     names: tuple[str, ...]
     times: FloatArray
     values: FloatArray
+    held: bool = False
 
-    def at(self, times: FloatArray | float) -> FloatArray:
-        """Return the inputs at times (n,), shape (n, nu)."""
+    def at(self, times: FloatArray | float, *, before: bool = False) -> FloatArray:
+        """Return the inputs at times (n,), shape (n, nu); at a jump those after it, or `before`."""
         wanted = np.atleast_1d(np.asarray(times, dtype=float))
+        if self.held:
+            side: Literal["left", "right"] = "left" if before else "right"
+            rows = np.searchsorted(self.times, wanted, side) - 1
+            return self.values[np.maximum(rows, 0)]
         columns = [np.interp(wanted, self.times, column) for column in self.values.T]
         return np.array(columns).reshape(len(self.names), len(wanted)).T
 
     def on(self, times: FloatArray) -> "Signals":
         """Return the signals sampled at times: what an importer that samples them passes on."""
-        return Signals(self.names, times, self.at(times))
+        return Signals(self.names, times, self.at(times), self.held)
 
 
 def communicate(
@@ -48,8 +57,9 @@ def communicate(
 ) -> FloatArray:
     """Step an initialised instance over communication points (n,); return outputs (n, ny).
 
-    Inputs are set at the start of each step; with `rates` their slope over the step is set too,
-    else they are held. Outputs are read at the end of each step, and at the start.
+    Inputs are set at the start of each step; with `rates` their slope over the step is set too
+    unless they are held, or FMI 3.0 has no way to. Outputs are read at the end of each step, and at
+    the start.
     """
     samples = inputs.at(times)
     names = inputs.names
@@ -59,7 +69,7 @@ def communicate(
     for k, (begin, end) in enumerate(pairwise(times)):
         size = float(end - begin)
         instance.set(dict(zip(names, samples[k], strict=True)))
-        if rates:
+        if rates and instance.has_input_rates and not inputs.held:
             slope = (samples[k + 1] - samples[k]) / size
             instance.set_rates(dict(zip(names, slope, strict=True)))
         instance.step(float(begin), size)

@@ -15,7 +15,9 @@ from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compi
 class Platform:
     """A platform: target of the `ziglang` compiler, FMI folder, suffix and flags of the library.
 
-    An old C library is asked for on Linux (2.17, of 2012) so that the binary loads everywhere.
+    `name` is FMI 3's platform tuple and its folder; `folder` is the one of FMI 2.
+    Old systems are asked for, so that the binary loads everywhere: GNU libc 2.17 (of 2012) on
+    Linux, and macOS 11 (of 2020), the first for both processors.
     """
 
     name: str
@@ -23,6 +25,10 @@ class Platform:
     folder: str
     suffix: str
     flags: tuple[str, ...] = ()
+
+    def binaries(self, fmi: int = 2) -> str:
+        """Return the name of the folder below binaries/ in an archive of FMI 2 or FMI 3."""
+        return self.folder if fmi == 2 else self.name
 
 
 _PIC = ("-fPIC", "-Wl,-s")
@@ -34,8 +40,8 @@ PLATFORMS: dict[str, Platform] = {
         Platform("aarch64-linux", "aarch64-linux-gnu.2.17", "aarch64-linux", ".so", _PIC),
         Platform("x86_64-windows", "x86_64-windows-gnu", "win64", ".dll", ("-Wl,-s",)),
         Platform("x86-windows", "x86-windows-gnu", "win32", ".dll", ("-Wl,-s",)),
-        Platform("x86_64-darwin", "x86_64-macos", "darwin64", ".dylib", ("-fPIC",)),
-        Platform("aarch64-darwin", "aarch64-macos", "aarch64-darwin", ".dylib", ("-fPIC",)),
+        Platform("x86_64-darwin", "x86_64-macos.11.0", "darwin64", ".dylib", ("-fPIC",)),
+        Platform("aarch64-darwin", "aarch64-macos.11.0", "aarch64-darwin", ".dylib", ("-fPIC",)),
     )
 }
 

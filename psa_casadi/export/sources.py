@@ -1,6 +1,7 @@
 """The C sources of an exported model: hand-written logic, generated functions and data."""
 
 import hashlib
+import itertools
 import math
 import uuid
 from collections.abc import Sequence
@@ -9,26 +10,38 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import casadi as ca
+import numpy as np
 
+from psa_casadi.component import Expression
 from psa_casadi.export.model_description import model_description
+from psa_casadi.export.model_description3 import model_description3
 from psa_casadi.export.variable_table import Variable, variable_table
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import generate_c
 from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
 
-#: The hand-written files of `fmu_src` that an FMU consists of, C files first.
+#: The hand-written files of `fmu_src` that every FMU consists of, C files first.
 LOGIC = (
-    "fmi2.c", "fmi2_interfaces.c", "instance.c", "linear.c", "model_casadi.c",
-    "model_directional.c", "snapshot.c", "solver.c", "values.c",
-    "fmi2_face.h", "fmi_data.h", "instance.h", "linear.h", "model.h", "solver.h",
+    "derivatives.c", "instance.c", "linear.c", "log.c", "model_adjoint.c", "model_casadi.c",
+    "model_directional.c", "snapshot.c", "solver.c", "step_derivatives.c", "values.c",
+    "fmi_data.h", "instance.h", "linear.h", "model.h", "solver.h",
 )  # fmt: skip
-FMI_HEADERS = ("fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h")
+#: The files of `fmu_src` that speak one version of FMI.
+FACES = {
+    2: ("fmi2.c", "fmi2_interfaces.c", "fmi2_face.h"),
+    3: ("fmi3.c", "fmi3_clocks.c", "fmi3_interfaces.c", "fmi3_values.c", "fmi3_face.h"),
+}
+#: The headers of the FMI standard, from fmpy.
+FMI_HEADERS = {
+    2: ("fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h"),
+}
 
 #: Warnings under which all sources compile cleanly.
 STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
 
-_DIRECTIONAL_HEAD = """\
+_GENERATED_HEAD = """\
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #pragma GCC diagnostic ignored "-Wunused-function"
@@ -47,7 +60,9 @@ Make each model a library of its own: two of them have functions of the same nam
 """
 
 
-def write_sources(model: Model, directory: Path, *, name: str | None = None) -> list[Path]:
+def write_sources(
+    model: Model, directory: Path, *, name: str | None = None, fmi: int = 2
+) -> list[Path]:
     """Write all sources of a model's FMU to a folder and return the paths, sorted.
 
     The folder is made if it does not exist. The sources compile alone; its README.txt has the line.
@@ -55,24 +70,25 @@ def write_sources(model: Model, directory: Path, *, name: str | None = None) -> 
     directory.mkdir(parents=True, exist_ok=True)
     identifier = name or model.name
     written = []
-    texts = source_files(model, identifier, export_token(model, identifier))
+    texts = source_files(model, identifier, export_token(model, identifier, fmi), fmi)
     for file_name, text in sorted(texts.items()):
         atomic_write(directory / file_name, text)
         written.append(directory / file_name)
     return written
 
 
-def source_files(model: Model, identifier: str, token: str) -> dict[str, str]:
-    """Return the text of every file in the folder sources, by its name."""
+def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dict[str, str]:
+    """Return the text of every file in the folder sources, by its name; `fmi` is 2 or 3."""
     structure = model.structure
-    directional = _directional(structure)
-    texts = {n: (sources_directory() / n).read_text(encoding="utf-8") for n in LOGIC}
+    derivatives = _derivatives(structure)
+    logic = (*LOGIC, *FACES[fmi])
+    texts = {n: (sources_directory() / n).read_text(encoding="utf-8") for n in logic}
     headers = files("fmpy") / "c-code"
-    texts |= {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS}
+    texts |= {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[fmi]}
     texts |= generate_c(structure, sensitivities=False)
-    texts["directional.c"] = _c_code(directional)
-    texts["fmi_config.h"] = _config(directional)
-    texts["fmi_data.c"] = _data(variable_table(model), identifier, token)
+    texts["model_derivatives.c"] = _c_code(derivatives)
+    texts["fmi_config.h"] = _config(derivatives)
+    texts["fmi_data.c"] = _data(model, variable_table(model), identifier, token)
     names = compiled_files(texts)
     flags = " ".join(OPTIMISE)
     texts["README.txt"] = _README.format(name=identifier, flags=flags, files=" ".join(names))
@@ -85,41 +101,58 @@ def compiled_files(texts: Sequence[str] | dict[str, str]) -> list[str]:
     return sorted(n for n in texts if n.endswith(".c"))
 
 
-def export_token(model: Model, identifier: str) -> str:
-    """Return the GUID of an export: a hash of its description and its sources."""
-    texts = source_files(model, identifier, "")
-    digest = hashlib.sha256(
-        model_description(model, identifier, "", compiled_files(texts)).encode("utf-8")
-    )
+def export_token(model: Model, identifier: str, fmi: int = 2) -> str:
+    """Return the token (GUID) of an export: a hash of its description and its sources."""
+    texts = source_files(model, identifier, "", fmi)
+    describe = model_description if fmi == 2 else model_description3
+    digest = hashlib.sha256(describe(model, identifier, "", compiled_files(texts)).encode("utf-8"))
     for name, text in sorted(texts.items()):
         digest.update(name.encode("utf-8") + b"\0" + text.encode("utf-8") + b"\0")
     return "{" + str(uuid.UUID(bytes=digest.digest()[:16])) + "}"
 
 
-def _directional(structure: Structure) -> ca.Function:
-    """Return the derivative of (x', y) along (dt, dx, du, dp), exact."""
+def _derivatives(structure: Structure) -> tuple[ca.Function, ca.Function]:
+    """Return the products of d(x', y, z)/d(t, x, u, p) with a vector, exact, in both directions.
+
+    psa_directional: (t, x, u, p, dt, dx, du, dp) to the derivatives of x', y and z along the seeds.
+    psa_adjoint: (t, x, u, p, wx, wy, wz) to the gradient of wx.x' + wy.y + wz.z by t, x, u, p.
+    """
     s = structure
-    point = [s.time, s.x, s.u, s.p]
+    point: list[Expression] = [s.time, s.x, s.u, s.p]
+    results: list[Expression] = [s.xdot, s.y, ca.vertcat(ca.SX(0, 1), *s.switches.values())]
+    both = ca.vertcat(*results), ca.vertcat(*point)
     seeds = [ca.SX.sym("d" + n, v.numel()) for n, v in zip("txup", point, strict=True)]
-    along = ca.jtimes(ca.vertcat(s.xdot, s.y), ca.vertcat(*point), ca.vertcat(*seeds))
-    parts = ca.vertsplit(ca.densify(along), [0, len(s.states), along.numel()])
-    return ca.Function("psa_directional", [*point, *seeds], ca.cse(parts), {"cse": True})
+    weights = [ca.SX.sym("w" + n, v.numel()) for n, v in zip("xyz", results, strict=True)]
+    along = _split(ca.jtimes(*both, ca.vertcat(*seeds)), results)
+    back = _split(ca.jtimes(*both, ca.vertcat(*weights), True), point)
+    return (
+        ca.Function("psa_directional", [*point, *seeds], ca.cse(along), {"cse": True}),
+        ca.Function("psa_adjoint", [*point, *weights], ca.cse(back), {"cse": True}),
+    )
 
 
-def _c_code(function: ca.Function) -> str:
-    generator = ca.CodeGenerator("directional.c", {"with_header": False})
-    generator.add(function)
-    return _DIRECTIONAL_HEAD + str(generator.dump())
+def _split(stacked: ca.SX, like: Sequence[Expression]) -> list[ca.SX]:
+    """Cut a stacked column into dense parts of the lengths of others."""
+    ends = itertools.accumulate((part.numel() for part in like), initial=0)
+    parts: list[ca.SX] = ca.vertsplit(ca.densify(stacked), list(ends))
+    return parts
 
 
-def _config(function: ca.Function) -> str:
+def _c_code(functions: Sequence[ca.Function]) -> str:
+    generator = ca.CodeGenerator("model_derivatives.c", {"with_header": False})
+    for function in functions:
+        generator.add(function)
+    return _GENERATED_HEAD + str(generator.dump())
+
+
+def _config(functions: Sequence[ca.Function]) -> str:
     sizes = {
-        "ARG": max(8, function.sz_arg()),
-        "RES": max(2, function.sz_res()),
-        "IW": max(1, function.sz_iw()),
-        "W": max(1, function.sz_w()),
+        "ARG": max(8, *(f.sz_arg() for f in functions)),
+        "RES": max(4, *(f.sz_res() for f in functions)),
+        "IW": max(1, *(f.sz_iw() for f in functions)),
+        "W": max(1, *(f.sz_w() for f in functions)),
     }
-    lines = [f"#define PSA_DIRECTIONAL_SZ_{name} {size}" for name, size in sizes.items()]
+    lines = [f"#define PSA_DERIVATIVES_SZ_{name} {size}" for name, size in sizes.items()]
     return "\n".join(["#ifndef PSA_FMI_CONFIG_H", "#define PSA_FMI_CONFIG_H", *lines, "#endif", ""])
 
 
@@ -140,13 +173,24 @@ def _vector(name: str, size: str, values: Sequence[float]) -> str:
     return f"const double {name}[{size} + 1] = {{{body}}};"
 
 
-def _data(table: Sequence[Variable], identifier: str, token: str) -> str:
+def _switch_scales(model: Model, nominals: Sequence[float]) -> list[float]:
+    """Return sum_j |dz/dx_j| nominal_j of every switch z at rest: its noise at a tolerance of 1."""
+    s = model.structure
+    slopes = ca.jacobian(ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.x)
+    at_rest = ca.Function("slopes", [s.time, s.x, s.u, s.p], [ca.densify(slopes)])
+    states, inputs = [0.0] * len(s.states), [0.0] * len(s.inputs)
+    found = np.array(at_rest(0.0, states, inputs, model.parameter_vector()), dtype=np.float64)
+    return [float(row @ np.array(nominals)) for row in np.abs(found.reshape(-1, len(s.states)))]
+
+
+def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) -> str:
     """Return fmi_data.c; vectors have one element more than the model, as C has no empty ones."""
 
     def starts(kind: str) -> list[float]:
         return [v.start or 0.0 for v in table if v.kind == kind]
 
     nominals = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
+    scales = _switch_scales(model, nominals)
     lines = [
         '#include "fmi_data.h"',
         "",
@@ -161,6 +205,7 @@ def _data(table: Sequence[Variable], identifier: str, token: str) -> str:
         _vector("psa_start_inputs", "PSA_NU", starts("input")),
         _vector("psa_start_parameters", "PSA_NP", starts("parameter")),
         _vector("psa_state_nominals", "PSA_NX", nominals),
+        _vector("psa_switch_scales", "PSA_NZ", scales),
         "",
     ]
     return "\n".join(lines)

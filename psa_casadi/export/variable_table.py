@@ -12,9 +12,10 @@ from psa_casadi.variables import nominal_value
 class Variable:
     """One variable as FMI describes it, in SI units.
 
-    `kind` is time, state, derivative, input, output or parameter; `index` its place in the vector
-    of its kind; the value reference is the place in the table. Only a state, an input and a
-    parameter have a `start`; a derivative has no nominal.
+    `kind` is time, state, derivative, input, output, parameter or indicator (zero where a
+    derivative has a kink); `index` is its place in the vector of its kind; the value reference is
+    the place in the table. Only a state, an input and a parameter have a `start`; a derivative has
+    no nominal; an indicator, of which only the sign counts, has neither unit nor nominal.
     """
 
     name: str
@@ -29,7 +30,10 @@ class Variable:
 
 
 def variable_table(model: Model) -> tuple[Variable, ...]:
-    """Return time, states, derivatives, inputs, outputs, parameters: the layout of `fmi_data.h`.
+    """Return time, states, derivatives, inputs, outputs, parameters, event indicators.
+
+    This is the layout of `fmi_data.h`. The indicator of a switch is named `switch.<name>`, as FMI's
+    structured names have parentheses for der() only.
 
     Raises InputError if two variables share a name or the model has no state.
     """
@@ -60,6 +64,11 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
             Variable(q.name, "parameter", i, q.unit, q.description, q.display_unit, values[q.name],
                      q.typical(values), q.bounds)
             for i, q in enumerate(s.parameters)
+        ),
+        *(
+            Variable(f"switch.{name}", "indicator", i, "",
+                     f"zero where derivatives have a kink: {name.replace('_', ' ')}")
+            for i, name in enumerate(s.switches)
         ),
     ]  # fmt: skip
     _refuse(model, table)

@@ -1,0 +1,58 @@
+/* Sensitivity of the last communication step: it is taken once more from where it started, with the
+   discrete equations of each of its solver steps differentiated along some directions. */
+#include <string.h>
+
+#include "instance.h"
+
+/* df/dx, and the change of f along the directions at constant x. */
+static int differentiate(const psa_sensitivities *sens, double t, const double *x, const double *u,
+                         const double *p, double *jac, double *forcing) {
+    const psa_knowns *const along = sens->directions;
+    const double none[PSA_NX + 1] = {0.0};
+    double f[PSA_NX + 1];
+    if (psa_model_jacobian(t, x, u, p, jac)) return 1;
+    for (int c = 0; c < sens->count; ++c) {
+        if (psa_model_directional(t, x, u, p, along[c].t, none, along[c].u, along[c].p, f, NULL, NULL))
+            return 1;
+        for (int i = 0; i < PSA_NX; ++i) forcing[i * sens->count + c] = f[i];
+    }
+    return 0;
+}
+
+/* A step that the importer ended early stops where it did the first time. */
+typedef struct {
+    const psa_solver *solver;
+    double stop;
+} psa_repetition;
+
+static void stop_there(void *owner, double *t_end) {
+    const psa_repetition *const repetition = owner;
+    if (repetition->solver->t >= repetition->stop) *t_end = repetition->solver->t;
+}
+
+static psa_result refuse(psa_instance *instance) {
+    const int failed = instance->state.last.kind == PSA_STEP_BROKEN;
+    return psa_say(instance, PSA_DISCARD,
+                   "The sensitivity of the last step is not known, because %s; take a step from the start"
+                   " of it %s.",
+                   failed ? "that step failed" : "inputs or its end changed within it",
+                   failed ? "that succeeds" : "without a change");
+}
+
+psa_result psa_step_sensitivity(psa_instance *instance, int count, const psa_knowns *directions,
+                                double *moved) {
+    const psa_last_step *const last = &instance->state.last;
+    double slope[PSA_NX * PSA_DIRECTIONS], base[PSA_NX * PSA_DIRECTIONS];
+    double stage[PSA_STAGES * PSA_NX * PSA_DIRECTIONS];
+    psa_solver solver = last->solver;
+    psa_sensitivities sens = {count, differentiate, directions, moved, slope, stage, base, 0};
+    psa_repetition repetition = {&solver, instance->state.solver.t};
+    const psa_watch watch = {stop_there, &repetition};
+    for (int i = 0; i < PSA_NX; ++i)
+        for (int c = 0; c < count; ++c) moved[i * count + c] = directions[c].x[i];
+    if (last->kind == PSA_NO_STEP) return PSA_FINE;
+    if (last->kind != PSA_STEP_KNOWN) return refuse(instance);
+    if (psa_solver_advance(&solver, &instance->work, last->target, &last->input, last->p, &sens, &watch))
+        return psa_say(instance, PSA_DISCARD, "The last step cannot be differentiated.");
+    return PSA_FINE;
+}

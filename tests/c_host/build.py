@@ -1,0 +1,168 @@
+"""Compiles and runs the small C importer, and finds the tools that run it on other platforms.
+
+What a test needs from the system's packages may be missing: then the test is skipped, but it fails
+if the tool is one of those that PSA_CASADI_REQUIRE_TOOLS names.
+"""
+
+import os
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NoReturn
+
+import fmpy
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from psa_casadi.export.fmu import export_fmu
+from psa_casadi.export.platforms import PLATFORMS, Platform
+from psa_casadi.export.sources import STRICT
+from psa_casadi.simulation.compiler import OPTIMISE, run_compiler, zig_command
+from tests.fmu_models import model_named
+
+FloatArray = npt.NDArray[np.float64]
+
+HERE = Path(__file__).parent
+HEADERS = Path(fmpy.__file__).parent / "c-code"
+VERSIONS = (2, 3)
+STACK = "P-885.51"
+IDENTIFIER = "psa"
+#: Outputs that are compared: not the current, a small difference of large voltages.
+OUTPUTS = ("displacement", "velocity", "charge")
+STEP, STEPS = 1e-4, 120
+
+_FOLDER = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+
+#: Where the packages of the system put what is not in PATH.
+_ELSEWHERE = {"wine64": "/usr/lib/wine/wine64"}
+#: GNU libc for aarch64, as Debian's libc6-arm64-cross has it.
+_ARM_LIBRARIES = "/usr/aarch64-linux-gnu"
+
+
+def tool(*names: str) -> str:
+    """Return the path of the first program found; skips the test, or fails it if required."""
+    for name in names:
+        found = shutil.which(name) or shutil.which(_ELSEWHERE.get(name, name))
+        if found:
+            return found
+    return _missing(f"{' or '.join(names)} is not installed", names)
+
+
+def _missing(what: str, names: Sequence[str]) -> NoReturn:
+    required = os.environ.get("PSA_CASADI_REQUIRE_TOOLS", "").split()
+    if any(name in required for name in names):
+        pytest.fail(f"{what}, and PSA_CASADI_REQUIRE_TOOLS requires it")
+    pytest.skip(what)
+
+
+@cache
+def everywhere(fmi: int) -> Path:
+    """Return the folder of an unpacked FMU of a stack with binaries for all platforms."""
+    path = Path(_FOLDER.name) / f"fmi{fmi}.fmu"
+    export_fmu(model_named(STACK), path, platforms=["all"], fmi=fmi)
+    folder = path.with_suffix("")
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def binary(fmi: int, platform: Platform) -> Path:
+    """Return the library of one platform in the unpacked FMU."""
+    return everywhere(fmi) / "binaries" / platform.binaries(fmi) / (IDENTIFIER + platform.suffix)
+
+
+@cache
+def host(platform: Platform) -> Path:
+    """Compile the importer for a platform and return the program."""
+    windows = platform.suffix == ".dll"
+    program = Path(_FOLDER.name) / f"host-{platform.name}{'.exe' if windows else ''}"
+    sources = [str(HERE / n) for n in ("host.c", "host_fmi2.c", "host_fmi3.c")]
+    target = ["-target", platform.target or ""]
+    options = [*OPTIMISE, *STRICT, "-isystem", str(HEADERS), "-g0"]
+    libraries = [] if windows else ["-ldl"]
+    command = [*zig_command(), *target, *options, *sources, *libraries, "-o", str(program)]
+    run_compiler(command, Path(_FOLDER.name))
+    return program
+
+
+@dataclass(frozen=True)
+class Runner:
+    """A way to run a platform's programs here: a command in front of them, and its environment."""
+
+    platform: Platform
+    command: tuple[str, ...] = ()
+    environment: tuple[tuple[str, str], ...] = ()
+
+    def run(
+        self,
+        fmi: int,
+        library: Path | None = None,
+        *,
+        steps: tuple[int, int] = (0, STEPS),
+        state: Path | None = None,
+        keep: Path | None = None,
+        program: Path | None = None,
+    ) -> FloatArray:
+        """Return OUTPUTS after each of the steps, (n, 3); `state` is read and `keep` written."""
+        arguments = importer_arguments(fmi, library or binary(fmi, self.platform), steps)
+        arguments[6:6] = [str(state or "-"), str(keep or "-")]
+        done = subprocess.run(
+            [*self.command, str(program or host(self.platform)), *arguments],
+            env={**os.environ, **dict(self.environment)},
+            capture_output=True, text=True, check=False, timeout=300,
+        )  # fmt: skip
+        assert done.returncode == 0, f"status {done.returncode}: {done.stderr[-2000:]}"
+        rows = [[float(v) for v in line.split()] for line in done.stdout.splitlines()]
+        assert len(rows) == steps[1] - steps[0]
+        return np.array(rows)
+
+
+def importer_arguments(fmi: int, library: Path, steps: tuple[int, int]) -> list[str]:
+    """Return the arguments of host.c without the two files of states."""
+    description = fmpy.read_model_description(str(everywhere(fmi)))
+    token = description.guid if fmi == 2 else description.instantiationToken
+    references = {v.name: str(v.valueReference) for v in description.modelVariables}
+    numbers = [references[name] for name in ("voltage", *OUTPUTS)]
+    return [str(fmi), str(library), token, repr(STEP), str(steps[0]), str(steps[1]), *numbers]
+
+
+def native() -> Runner:
+    """Return the way to run this machine's own programs; skips where it is not x86-64 Linux."""
+    if os.uname().sysname != "Linux" or os.uname().machine != "x86_64":
+        pytest.skip("the emulators are used on Linux, x86-64")
+    return Runner(PLATFORMS["x86_64-linux"])
+
+
+def emulated(name: str) -> Runner:
+    """Return the way to run the programs of another platform; skips where there is none."""
+    if name == "aarch64-linux":
+        qemu = tool("qemu-aarch64")
+        if not (Path(_ARM_LIBRARIES) / "lib" / "libc.so.6").exists():
+            _missing(f"{_ARM_LIBRARIES} has no C library for qemu-aarch64", ["qemu-aarch64"])
+        return Runner(PLATFORMS[name], (qemu, "-L", _ARM_LIBRARIES))
+    prefix = str(Path(_FOLDER.name) / "wine")
+    quiet = {"WINEPREFIX": prefix, "WINEDEBUG": "-all", "WINEDLLOVERRIDES": "mscoree,mshtml="}
+    return Runner(PLATFORMS[name], (tool("wine64", "wine"),), tuple(quiet.items()))
+
+
+def linked(
+    fmi: int, command: Sequence[str], files: Sequence[str], name: str, inside: Path | None = None
+) -> Path:
+    """Compile C files of this folder together with the sources of the FMU; return the program.
+
+    `command` is a compiler with its flags; the warnings of `STRICT` are errors. `inside` is a
+    folder of other sources of the FMU than its own.
+    """
+    inside = inside or everywhere(fmi) / "sources"
+    sources = [*(str(HERE / n) for n in files), *(str(p) for p in sorted(inside.glob("*.c")))]
+    program = Path(_FOLDER.name) / f"{name}-{fmi}"
+    places = [f"-DHOST_LINKED={fmi}", "-isystem", str(HEADERS), "-isystem", str(inside)]
+    options = ["-std=c99", *STRICT, *places, *sources, "-o", str(program), "-lm", "-pthread"]
+    run_compiler([*command, *options], Path(_FOLDER.name))
+    return program

@@ -1,0 +1,401 @@
+"""The FMI 3.0 face: its states, what it refuses and why, intermediate updates, snapshots."""
+
+import ctypes
+import re
+import struct
+from collections.abc import Iterator
+from ctypes import c_bool, c_double, c_size_t, c_void_p
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+
+from psa_casadi.export.fmu_instance import CO_SIMULATION as CO_SIMULATION2
+from psa_casadi.export.fmu_instance import Fmu
+from tests.fmi3_instances import (
+    CO_SIMULATION,
+    DISCARD,
+    ERROR,
+    MODEL_EXCHANGE,
+    OK,
+    WARNING,
+    Instance3,
+    Update,
+    loaded,
+)
+from tests.fmu_models import exported
+
+STACK = "P-885.51"
+OUTPUTS = ["displacement", "velocity", "current", "charge"]
+
+
+@pytest.fixture
+def slave() -> Iterator[Instance3]:
+    with Instance3(loaded(STACK)) as instance:
+        yield instance.start()
+
+
+def test_all_functions_of_the_header_are_there() -> None:
+    header = (Path(fmpy.__file__).parent / "c-code" / "fmi3Functions.h").read_text()
+    names = re.findall(r"^FMI3_Export fmi3\w+TYPE\s+(fmi3\w+);", header, re.MULTILINE)
+    assert len(names) > 70
+    library = loaded(STACK).library
+    assert [n for n in names if not hasattr(library, n)] == []
+    assert library.fmi3GetVersion() == b"3.0"
+
+
+@pytest.mark.parametrize("interface", [CO_SIMULATION, MODEL_EXCHANGE])
+def test_wrong_token_and_missing_name_give_no_instance(interface: str) -> None:
+    for changes in ({"token": "{0}"}, {"name": None}, {"name": b""}):
+        for logger in (True, False):
+            with Instance3(loaded(STACK), interface, logger=logger, **changes) as instance:
+                assert instance.component is None
+                expected = "token" if "token" in changes else "name is missing"
+                assert not logger or expected in instance.messages[-1]
+
+
+def test_scheduled_execution_is_refused() -> None:
+    with Instance3(loaded(STACK)) as other:
+        made = other.fmu.library.fmi3InstantiateScheduledExecution(
+            b"x", b"y", None, c_bool(False), c_bool(False), None, other._logger, None, None, None
+        )
+        assert not made
+        assert "no scheduled execution" in other.messages[-1]
+
+
+def test_unknown_intermediate_variable_gives_no_instance() -> None:
+    fmu = loaded(STACK)
+    token = fmu.description.instantiationToken.encode()
+    no, wrong = c_bool(False), (ctypes.c_uint32 * 1)(10**6)
+    for references in (wrong, None):
+        made = fmu.library.fmi3InstantiateCoSimulation(
+            b"x", token, None, no, no, no, no, references, c_size_t(1), None, None, None
+        )
+        assert not made
+
+
+def test_co_simulation_equals_that_of_fmi_2_bit_for_bit(slave: Instance3) -> None:
+    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION2) as older:
+        for k in range(200):
+            voltage = 50.0 * np.sin(0.1 * k) if k < 150 else -20.0
+            slave.set({"voltage": voltage})
+            older.set({"voltage": voltage})
+            done = slave.step(k * 1e-5, 1e-5)
+            assert done[:4] == (OK, False, False, False)
+            assert done.time == pytest.approx((k + 1) * 1e-5)
+            older.step(k * 1e-5, 1e-5)
+            assert slave.get(OUTPUTS).tobytes() == older.get(OUTPUTS).tobytes()
+
+
+STEP_TIME = (
+    "GetContinuousStates",
+    "GetContinuousStateDerivatives",
+    "GetNominalsOfContinuousStates",
+)
+
+
+def test_calls_out_of_order_are_refused_with_function_and_state(slave: Instance3) -> None:
+    vector = (c_double * 20)()
+    illegal: list[tuple[str, tuple[object, ...]]] = [
+        ("EnterInitializationMode", (False, 0.0, 0.0, False, 0.0)),
+        ("ExitInitializationMode", ()),
+        ("EnterContinuousTimeMode", ()),
+        ("EnterStepMode", ()),
+        ("SetTime", (0.0,)),
+        ("EvaluateDiscreteStates", ()),
+        *((name, (vector, c_size_t(20))) for name in STEP_TIME),
+    ]
+    for name, arguments in illegal:
+        slave.messages.clear()
+        assert slave.call(name, *arguments) == ERROR, name
+        assert f"fmi3{name}" in slave.messages[-1]
+        assert "'step complete' of this co-simulation" in slave.messages[-1]
+    assert slave.call("EnterEventMode") == ERROR
+    assert "without event mode" in slave.messages[-1]
+    assert slave.step(0.0, 1e-4).status == OK
+    assert slave.call("Terminate") == OK
+    assert slave.step(1e-4, 1e-4).status == ERROR
+    assert slave.call("Reset") == OK
+    slave.start()
+    assert slave.step(0.0, 1e-4).status == OK
+
+
+def test_step_is_refused_in_model_exchange() -> None:
+    with Instance3(loaded(STACK), MODEL_EXCHANGE) as instance:
+        instance.start()
+        assert instance.step(0.0, 1e-4).status == ERROR
+        assert instance.call("EnterStepMode") == ERROR
+        assert "model exchange instance" in instance.messages[-1]
+
+
+def test_configuration_clocks_and_dependencies_say_why_not(slave: Instance3) -> None:
+    one, count = slave.references(["voltage"]), ctypes.c_size_t(1)
+    number, flag = (ctypes.c_uint64 * 1)(), (c_bool * 1)()
+    refused = {
+        "EnterConfigurationMode": ((), "structural parameters"),
+        "ExitConfigurationMode": ((), "structural parameters"),
+        "GetClock": ((one, count, flag), "no clocks"),
+        "SetClock": ((one, count, flag), "no clocks"),
+        "GetIntervalDecimal": ((one, count, number, number), "no clocks"),
+        "GetShiftDecimal": ((one, count, number), "no clocks"),
+        "SetIntervalFraction": ((one, count, number, number), "no clocks"),
+        "ActivateModelPartition": ((ctypes.c_uint32(0), 0.0), "no clocks"),
+        "GetNumberOfVariableDependencies": ((ctypes.c_uint32(1), number), "modelDescription.xml"),
+        "GetInt32": ((one, count, number, count), "type Float64"),
+        "SetBoolean": ((one, count, flag, count), "type Float64"),
+        "GetBinary": ((one, count, number, number, count), "type Float64"),
+        "GetString": ((one, count, number, count), "type Float64"),
+    }
+    for name, (arguments, reason) in refused.items():
+        assert slave.call(name, *arguments) == ERROR, name
+        assert reason in slave.messages[-1], name
+    none = c_size_t(0)
+    for name in ("GetFloat32", "SetUInt8", "GetString"):
+        assert slave.call(name, None, none, None, none) == OK
+    assert slave.step(0.0, 1e-4).status == OK
+
+
+def test_wrong_counts_and_null_pointers_are_refused(slave: Instance3) -> None:
+    one, two, values = c_size_t(1), c_size_t(2), (c_double * 2)()
+    names = slave.references(["voltage", "load_force"])
+    assert slave.call("GetFloat64", names, two, values, one) == ERROR
+    assert "scalars" in slave.messages[-1]
+    assert slave.call("SetFloat64", names, two, None, two) == ERROR
+    assert slave.call("GetFloat64", None, two, values, two) == ERROR
+    wrong = (ctypes.c_uint32 * 1)(10**6)
+    assert slave.call("GetFloat64", wrong, one, values, one) == ERROR
+    assert slave.call("DoStep", 0.0, 1e-4, True, None, None, None, None) == ERROR
+    assert slave.call("GetFMUState", None) == ERROR
+    assert slave.call("SetFMUState", None) == ERROR
+    assert slave.fmu.library.fmi3Terminate(None) == ERROR
+    slave.fmu.library.fmi3FreeInstance(None)
+    assert slave.step(0.0, 1e-4).status == OK
+
+
+def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instance3) -> None:
+    seen: list[tuple[Update, float]] = []
+
+    def watcher(instance: Instance3, update: Update) -> None:
+        seen.append((update, float(instance.get(["displacement"])[0])))
+        assert instance.get(["time"])[0] == update.time
+        assert np.isfinite(instance.output_rates(["displacement"])).all()
+        assert instance.call("Reset") == ERROR
+
+    with Instance3(loaded(STACK), watcher=watcher) as watched:
+        watched.start()
+        for instance in (slave, watched):
+            instance.set({"voltage": 50.0})
+            assert instance.step(0.0, 1e-3).status == OK
+        times = [u.time for u, _ in seen]
+        assert len(times) > 5
+        assert np.all(np.diff(times) > 0.0)
+        assert times[-1] == pytest.approx(1e-3)
+        assert all(u.get_allowed and u.step_finished for u, _ in seen)
+        assert [u.can_return_early for u, _ in seen] == [True] * (len(seen) - 1) + [False]
+        assert [u.set_requested for u, _ in seen] == [True] * (len(seen) - 1) + [False]
+        path = [d for _, d in seen]
+        assert 0.0 < path[0] < path[-1]
+        assert slave.get(OUTPUTS).tobytes() == watched.get(OUTPUTS).tobytes()
+        assert slave.serialized() == watched.serialized()
+
+
+@pytest.mark.parametrize("late", [0.0, 1e-4])
+def test_early_return_is_honoured(late: float) -> None:
+    asked: list[float] = []
+
+    def watcher(_: Instance3, update: Update) -> float | None:
+        if update.time > 3e-4 and not asked:
+            asked.append(update.time + late)
+            return asked[0]
+        return None
+
+    with Instance3(loaded(STACK), watcher=watcher) as slave, Instance3(loaded(STACK)) as plain:
+        slave.start({"voltage": 50.0})
+        done = slave.step(0.0, 1e-3)
+        assert done.status == OK
+        assert done.early
+        assert done.time == asked[0]
+        rest = slave.step(done.time, 1e-3 - done.time)
+        assert rest[:4] == (OK, False, False, False)
+        plain.start({"voltage": 50.0})
+        plain.step(0.0, 1e-3)
+        assert slave.get(["time"])[0] == pytest.approx(1e-3, rel=1e-15)
+        both = [instance.get(["displacement", "charge"]) for instance in (slave, plain)]
+        assert both[0] == pytest.approx(both[1], rel=1e-5)
+
+
+def test_early_return_that_was_not_allowed_is_ignored() -> None:
+    with Instance3(loaded(STACK), early=False, watcher=lambda _, u: u.time) as slave:
+        slave.start({"voltage": 50.0})
+        done = slave.step(0.0, 1e-3)
+        assert (done.status, done.early) == (OK, False)
+        assert done.time == pytest.approx(1e-3)
+
+
+def test_input_set_in_an_intermediate_update_holds_from_there_on() -> None:
+    """The same as a communication step that ends there and a second one with the new input."""
+    jump: list[float] = []
+
+    def watcher(instance: Instance3, update: Update) -> None:
+        if update.time > 4e-4 and not jump:
+            jump.append(update.time)
+            assert instance.try_set({"C_p": 1e-6}) == ERROR
+            assert "only inputs can" in instance.messages[-1]
+            instance.set({"voltage": 80.0})
+
+    with Instance3(loaded(STACK), watcher=watcher) as slave, Instance3(loaded(STACK)) as plain:
+        slave.start({"voltage": 50.0}, tolerance=1e-7)
+        assert slave.step(0.0, 1e-3).status == OK
+        plain.start({"voltage": 50.0}, tolerance=1e-7)
+        plain.step(0.0, jump[0])
+        plain.set({"voltage": 80.0})
+        plain.step(jump[0], 1e-3 - jump[0])
+        assert slave.get(OUTPUTS) == pytest.approx(plain.get(OUTPUTS), rel=1e-6, abs=1e-12)
+        assert slave.get(["charge"])[0] > 1.5e-6 * 70.0
+
+
+def test_event_mode_in_co_simulation() -> None:
+    with Instance3(loaded(STACK), events=True) as slave, Instance3(loaded(STACK)) as plain:
+        slave.set({"voltage": 50.0})
+        slave.start()
+        assert slave.step(0.0, 1e-4).status == ERROR
+        assert "'event mode'" in slave.messages[-1]
+        assert slave.call("EnterContinuousTimeMode") == ERROR
+        assert slave.call("EvaluateDiscreteStates") == OK
+        assert slave.update_discrete_states() == [False] * 5
+        slave.must("EnterStepMode")
+        slave.step(0.0, 1e-3)
+        slave.must("EnterEventMode")
+        slave.set({"voltage": -10.0})
+        slave.update_discrete_states()
+        slave.must("EnterStepMode")
+        slave.step(1e-3, 1e-3)
+        plain.start({"voltage": 50.0})
+        plain.step(0.0, 1e-3)
+        plain.set({"voltage": -10.0})
+        plain.step(1e-3, 1e-3)
+        assert slave.get(OUTPUTS).tobytes() == plain.get(OUTPUTS).tobytes()
+
+
+def test_failed_step_names_state_and_time_and_can_be_undone(slave: Instance3) -> None:
+    slave.set({"voltage": 50.0})
+    slave.step(0.0, 1e-3)
+    snapshot = slave.save()
+    slave.set({"voltage": 1e300})
+    done = slave.step(1e-3, 1e-3)
+    assert done.status == DISCARD
+    said = re.fullmatch(r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1])
+    assert said is not None
+    assert said[2] in slave.fmu.states()
+    assert 1e-3 <= done.time < 2e-3
+    slave.must("SetFMUState", snapshot)
+    slave.must("FreeFMUState", ctypes.byref(snapshot))
+    assert snapshot.value is None
+    slave.set({"voltage": 60.0})
+    assert slave.step(1e-3, 1e-3).status == OK
+    assert 0.0 < slave.get(["displacement"])[0] < 20e-6
+
+
+def _play(slave: Instance3, first: int, last: int) -> bytes:
+    rows = []
+    for k in range(first, last):
+        slave.set({"voltage": 40.0 + 40.0 * np.sin(0.7 * k)})
+        assert slave.step(k * 2e-5, 2e-5).status == OK
+        rows.append(slave.get(OUTPUTS))
+    return np.array(rows).tobytes()
+
+
+def test_rollback_and_replay_are_bit_equal(slave: Instance3) -> None:
+    _play(slave, 0, 40)
+    snapshot, data = slave.save(), slave.serialized()
+    first, after = _play(slave, 40, 90), slave.serialized()
+    slave.must("SetFMUState", snapshot)
+    assert slave.serialized() == data
+    assert _play(slave, 40, 90) == first
+    assert slave.serialized() == after
+    slave.must("FreeFMUState", ctypes.byref(snapshot))
+    with Instance3(slave.fmu) as other:
+        assert other.try_restore(data) == OK
+        assert _play(other, 40, 90) == first
+
+
+def test_foreign_truncated_and_corrupted_states_are_refused(slave: Instance3) -> None:
+    _play(slave, 0, 5)
+    data = slave.serialized()
+    assert slave.try_restore(data[:-1]) == ERROR
+    assert "no snapshot of this model" in slave.messages[-1]
+    assert slave.try_restore(data + b"\0") == ERROR
+    for place in (40, len(data) // 2, len(data) - 1):
+        broken = bytearray(data)
+        broken[place] ^= 1
+        assert slave.try_restore(bytes(broken)) == ERROR
+        assert "damaged" in slave.messages[-1]
+    for place in (0, 8, 16):
+        broken = bytearray(data)
+        broken[place] ^= 1
+        assert slave.try_restore(bytes(broken)) == ERROR
+        assert "another model, version or kind of machine" in slave.messages[-1]
+    with Instance3(slave.fmu, MODEL_EXCHANGE) as other:
+        assert other.try_restore(data) == ERROR
+        assert "other interface" in other.messages[-1]
+    assert slave.serialized() == data
+
+
+def test_state_bytes_are_numbers_of_eight_bytes_and_hold_no_pointer(slave: Instance3) -> None:
+    """Two instances at different addresses write the same bytes; time stands where it should."""
+    _play(slave, 0, 7)
+    data = slave.serialized()
+    with Instance3(slave.fmu) as other:
+        other.start()
+        _play(other, 0, 7)
+        assert other.serialized() == data
+    assert data[:8] == b"psasnap\0"
+    assert (len(data) - 32) % 8 == 0
+    assert struct.unpack("<I", data[12:16])[0] == len(data) - 32
+    assert struct.unpack("<d", data[32:40])[0] == slave.get(["time"])[0]
+
+
+def test_logging_categories(slave: Instance3) -> None:
+    slave.step(0.0, 1e-4)
+    assert not slave.messages
+    assert slave.call("SetDebugLogging", True, c_size_t(0), None) == OK
+    slave.step(1e-4, 1e-4)
+    assert "solver steps" in slave.messages[-1]
+    assert slave.call("SetDebugLogging", True, c_size_t(1), (ctypes.c_char_p * 1)(b"x")) == ERROR
+    assert slave.call("SetDebugLogging", False, c_size_t(1), None) == ERROR
+
+
+def test_parameter_out_of_bounds_is_taken_with_a_warning(slave: Instance3) -> None:
+    assert slave.try_set({"tau": 5.0}) == WARNING
+    assert "outside its interval" in slave.messages[-1]
+    assert slave.try_set({"voltage": np.nan}) == ERROR
+    assert slave.try_set({"u": 1.0}) == ERROR
+
+
+def test_model_exchange_sizes_and_vectors() -> None:
+    fmu = loaded(STACK)
+    with Instance3(fmu, MODEL_EXCHANGE) as instance:
+        counts = []
+        for name in ("GetNumberOfContinuousStates", "GetNumberOfEventIndicators"):
+            count = c_size_t(99)
+            instance.must(name, ctypes.byref(count))
+            counts.append(count.value)
+        assert counts == [len(fmu.states()), 1]
+        instance.start({"u": 80.0})
+        nx = counts[0]
+        x = instance.vector("GetContinuousStates", nx)
+        assert x == pytest.approx(instance.get(fmu.states()))
+        slopes = instance.vector("GetContinuousStateDerivatives", nx)
+        assert slopes == pytest.approx(instance.get([f"der({n})" for n in fmu.states()]))
+        assert instance.call("GetContinuousStates", (c_double * 1)(), c_size_t(1)) == ERROR
+        assert np.all(instance.vector("GetNominalsOfContinuousStates", nx) > 0.0)
+        flags = [c_bool(True), c_bool(True)]
+        instance.must("CompletedIntegratorStep", True, *(ctypes.byref(f) for f in flags))
+        assert not flags[0].value
+        assert not flags[1].value
+        instance.must("SetContinuousStates", (c_double * nx)(*(2.0 * x)), c_size_t(nx))
+        instance.must("SetTime", 1.0)
+        assert instance.get(["time"])[0] == 1.0
+        assert not np.allclose(instance.vector("GetContinuousStateDerivatives", nx), slopes)
+        assert instance.call("SetFMUState", c_void_p()) == ERROR

@@ -1,0 +1,179 @@
+"""The voltage's reversal as an event: located by an importer, harmless where nobody looks."""
+
+import ctypes
+import itertools
+from ctypes import c_bool, c_double, c_size_t
+from typing import Literal
+
+import fmpy
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.integrate import solve_ivp
+
+from psa_casadi.export.fmu_instance import CO_SIMULATION, ERROR, MODEL_EXCHANGE, OK, Fmu
+from psa_casadi.export.variable_table import variable_table
+from tests import fmi3_instances as fmi3
+from tests.fmu_models import exported, model_named
+
+FloatArray = npt.NDArray[np.float64]
+
+STACK = "P-885.51"
+(SWITCH,) = [v.name for v in variable_table(model_named(STACK)) if v.kind == "indicator"]
+#: Corners of a triangle of 100 Hz, 0 V to 50 V [s], [V]
+CORNERS = np.array([0.0, 5e-3, 10e-3, 15e-3, 20e-3])
+VOLTS = np.array([0.0, 50.0, 0.0, 50.0, 0.0])
+
+
+def _rate(u: float, voltage: float) -> float:
+    """Return u' of the drive stage (V - u) / (R_s C_p)."""
+    values = model_named(STACK).values
+    return (voltage - u) / (values["R_s"] * values["C_p"])
+
+
+def _margin(tolerance: float = 1e-6) -> float:
+    """Return 3 tolerances of what the voltage's nominal value moves its rate by [V/s]."""
+    values = model_named(STACK).values
+    nominal = next(v.nominal for v in variable_table(model_named(STACK)) if v.name == "u")
+    return 3.0 * tolerance * float(nominal or 0.0) / (values["R_s"] * values["C_p"])
+
+
+def test_indicator_is_the_rate_of_the_voltage_in_fmi_2() -> None:
+    with Fmu(exported(STACK)) as fmu, fmu.start(MODEL_EXCHANGE) as instance:
+        assert fmu.description.numberOfEventIndicators == 1
+        z = (c_double * 2)()
+        for u, voltage in ((30.0, 50.0), (50.0, 30.0)):
+            instance.set({"u": u, "voltage": voltage})
+            instance.require("GetEventIndicators", z, c_size_t(1))
+            assert z[0] == pytest.approx(_rate(u, voltage) + _margin(), rel=1e-12)
+            assert instance.get([SWITCH])[0] == z[0]
+        assert instance.call("GetEventIndicators", z, c_size_t(2)) == ERROR
+        assert "1 event indicators" in instance.messages[-1]
+        assert instance.call("GetEventIndicators", None, c_size_t(1)) == ERROR
+        assert instance.call("EnterEventMode") == OK
+
+
+def test_indicator_is_the_rate_of_the_voltage_in_fmi_3() -> None:
+    with fmi3.Instance3(fmi3.loaded(STACK), fmi3.MODEL_EXCHANGE) as instance:
+        instance.start({"u": 30.0, "voltage": 50.0})
+        z = instance.vector("GetEventIndicators", 1)
+        assert z[0] == pytest.approx(_rate(30.0, 50.0) + _margin(), rel=1e-12)
+        assert instance.get([SWITCH])[0] == z[0]
+        assert instance.try_set({SWITCH: 0.0}) == fmi3.ERROR
+        instance.must("EnterEventMode")
+        assert instance.update_discrete_states() == [False] * 5
+        instance.must("EnterContinuousTimeMode")
+        nothing = (c_double * 1)()
+        assert instance.call("GetEventIndicators", nothing, c_size_t(0)) == fmi3.ERROR
+        flags = [c_bool(True), c_bool(True)]
+        instance.must("CompletedIntegratorStep", True, *(ctypes.byref(f) for f in flags))
+
+
+def test_indicator_faces_the_other_way_after_an_event_and_noise_makes_none() -> None:
+    """Beyond the margin an event update turns it round; within the margin it does not."""
+    values = model_named(STACK).values
+    step = 2.0 * _margin() * values["R_s"] * values["C_p"]  # [V], two margins of the rate
+    with fmi3.Instance3(fmi3.loaded(STACK), fmi3.MODEL_EXCHANGE) as instance:
+        instance.start({"u": 50.0, "voltage": 50.0})
+        for share, facing in ((0.2, 1.0), (1.0, -1.0), (-0.2, -1.0), (-1.0, 1.0)):
+            instance.must("EnterEventMode")
+            instance.set({"voltage": 50.0 - share * step})
+            assert instance.update_discrete_states() == [False] * 5
+            instance.must("EnterContinuousTimeMode")
+            expected = facing * _rate(50.0, 50.0 - share * step) + _margin()
+            assert instance.vector("GetEventIndicators", 1)[0] == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_held_voltage_makes_no_events(fmi: int) -> None:
+    signal = np.array(
+        [(0.0, 0.0, 0.0), (1e-3, 50.0, 0.0), (5e-2, 50.0, 0.0)],
+        dtype=[("time", "f8"), ("voltage", "f8"), ("load_force", "f8")],
+    )
+    path = fmpy.simulate_fmu(
+        str(exported(STACK, fmi)), fmi_type="ModelExchange", input=signal, output=["displacement"],
+        stop_time=5e-2, output_interval=1e-4, relative_tolerance=1e-5,
+    )  # fmt: skip
+    assert np.count_nonzero(np.diff(path["time"]) == 0.0) <= 4
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_importer_locates_reversals_where_they_are(fmi: int) -> None:
+    """After a corner of a triangle, u turns R_s C_p ln 2 later: the drive is of first order."""
+    signal = np.zeros(len(CORNERS), dtype=[("time", "f8"), ("voltage", "f8"), ("load_force", "f8")])
+    signal["time"], signal["voltage"] = CORNERS, VOLTS
+    path = fmpy.simulate_fmu(
+        str(exported(STACK, fmi)), fmi_type="ModelExchange", input=signal,
+        output=["displacement", SWITCH], stop_time=CORNERS[-1], output_interval=1e-5,
+        relative_tolerance=1e-6,
+    )  # fmt: skip
+    events = path["time"][:-1][np.diff(path["time"]) == 0.0]
+    values = model_named(STACK).values
+    turns = CORNERS[1:-1] + values["R_s"] * values["C_p"] * np.log(2.0)
+    assert len(turns) == 3
+    for turn in turns:
+        assert np.abs(events - turn).min() < 0.1 * values["R_s"] * values["C_p"]
+    assert len(events) < 3 * len(turns)
+    # fmpy holds the input over its interval: a delay of up to 10 us, 0.1 V of 50 V
+    truth = _path(np.asarray(path["time"]))
+    assert np.abs(np.asarray(path["displacement"]) - truth).max() < 2e-3 * np.ptp(truth)
+
+
+def _path(times: FloatArray) -> FloatArray:
+    """Return the displacement at times, by tight co-simulation with the input's slope."""
+    grid = np.union1d(times, CORNERS)
+    found = [0.0]
+    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION, tolerance=1e-9) as slave:
+        for begin, end in itertools.pairwise(grid):
+            low, high = np.interp([begin, end], CORNERS, VOLTS)
+            slave.set({"voltage": float(low)})
+            slave.set_rates({"voltage": float((high - low) / (end - begin))})
+            slave.step(float(begin), float(end - begin))
+            found.append(float(slave.get(["displacement"])[0]))
+    return np.interp(times, grid, found)
+
+
+@pytest.mark.parametrize("method", ["Radau", "LSODA", "RK23"])
+def test_loose_solver_without_events_is_right_too(
+    method: Literal["Radau", "LSODA", "RK23"],
+) -> None:
+    tolerance, end = 1e-3, float(CORNERS[-1])
+    times = np.linspace(0.0, end, 201)
+    with Fmu(exported(STACK)) as fmu, fmu.start(MODEL_EXCHANGE) as instance:
+        states = fmu.states()
+
+        def slope(time: float, x: FloatArray) -> FloatArray:
+            return instance.derivatives(
+                time, x, {"voltage": float(np.interp(time, CORNERS, VOLTS))}
+            )
+
+        nominal = np.array([fmu.nominals[n] for n in states])
+        solved = solve_ivp(
+            slope, (0.0, end), np.zeros(len(states)), method=method, t_eval=times,
+            rtol=tolerance, atol=tolerance * nominal, max_step=1e-3,
+        )  # fmt: skip
+        found = []
+        for time, x in zip(times, solved.y.T, strict=True):
+            slope(float(time), x)
+            found.append(float(instance.get(["displacement"])[0]))
+    truth = _path(times)
+    assert np.abs(np.array(found) - truth).max() < 10.0 * tolerance * np.ptp(truth)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_fmpy_integrates_a_moving_voltage_at_the_default_tolerance(fmi: int) -> None:
+    """fmpy 0.3.32 moves the input in the root function only; the events bear that."""
+    time = np.linspace(0.0, 0.05, 2001)
+    signal = np.zeros(len(time), dtype=[("time", "f8"), ("voltage", "f8"), ("load_force", "f8")])
+    signal["time"], signal["voltage"] = time, 30.0 * (1.0 - np.cos(2.0 * np.pi * 50.0 * time))
+    found = {
+        kind: fmpy.simulate_fmu(
+            str(exported(STACK, fmi)), fmi_type=kind, input=signal, output=["displacement"],
+            stop_time=0.05, output_interval=5e-5,
+        )
+        for kind in ("CoSimulation", "ModelExchange")
+    }  # fmt: skip
+    path, other = found["ModelExchange"], found["CoSimulation"]
+    assert np.count_nonzero(np.diff(path["time"]) == 0.0) == 4
+    expected = np.interp(path["time"], other["time"], other["displacement"])
+    assert np.abs(path["displacement"] - expected).max() < 0.02 * np.ptp(expected)

@@ -1,0 +1,204 @@
+"""The reference run and the parameter set inside an FMU."""
+
+import hashlib
+import io
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import fmpy
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from psa_casadi.components import BASE, COMPONENTS
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.check_agreement import expected_outputs
+from psa_casadi.export.fmu import export_fmu
+from psa_casadi.export.fmu_instance import Fmu
+from psa_casadi.export.fmu_masters import Signals, co_simulate, integrate
+from psa_casadi.export.parameter_sets import parameter_set
+from psa_casadi.export.reference_results import (
+    EXPERIMENTS,
+    FOLDER,
+    INPUTS,
+    NOTES,
+    OUTPUTS,
+    PARAMETERS,
+    reference_entries,
+)
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.variables import Interval
+from tests.fmu_models import assert_valid, entries, exported, model_named
+
+STACK = "P-885.51"
+Table = Mapping[str, npt.NDArray[np.float64]]
+
+flexure = compose([COMPONENTS["flexure"]], name="flexure")
+every_effect = compose((*BASE, *EFFECTS.values()), name="every_effect")
+
+
+def table(content: bytes) -> Table:
+    names, *rows = content.decode().splitlines()
+    columns = np.array([[float(v) for v in row.split(",")] for row in rows]).T
+    return dict(zip(names.split(","), columns, strict=True))
+
+
+# Parameter sets
+
+
+@pytest.mark.parametrize("model", [stack_model(STACK), flexure, every_effect])
+def test_parameter_sets_hold_every_value_exactly(model: Model) -> None:
+    text = parameter_set(model)
+    assert_valid(text, "ssp", "schema", "SystemStructureParameterValues.xsd")
+    root = ET.fromstring(text)
+    spaces = {"v": root.tag[1:].partition("}")[0]}
+    spaces["c"] = spaces["v"].replace("ParameterValues", "Common")
+    found = {p.attrib["name"]: p for p in root.iterfind("v:Parameters/v:Parameter", spaces)}
+    units = {u.attrib["name"] for u in root.iterfind("v:Units/c:Unit", spaces)}
+    assert list(found) == list(model.parameter_names)
+    for p in model.structure.parameters:
+        real = found[p.name].find("v:Real", spaces)
+        assert real is not None
+        assert float(real.attrib["value"]) == model.values[p.name]
+        assert real.attrib["unit"] == p.unit
+        assert p.unit in units
+
+
+def test_parameter_sets_tell_intervals() -> None:
+    model = stack_model(STACK)
+    known = {"tau": Interval(9.5e-5, 1.05e-4)}
+    identified = replace(model, provenance=replace(model.provenance, intervals=known))
+    assert "; 95 % interval 9.5e-05 to 0.000105 s" in parameter_set(identified)
+    assert "interval" not in parameter_set(model)
+
+
+# The reference run
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_manifest_lists_every_file_with_its_checksum(fmi: int) -> None:
+    """Names and attributes as FMI-LS-REF 1.0.0-alpha.1 and the Experiments Format have them."""
+    inside = entries(STACK, fmi)
+    root = ET.fromstring(inside[f"{FOLDER}/fmi-ls-manifest.xml"])
+    space = "{http://fmi-standard.org/fmi-ls-manifest}"
+    assert root.tag == "fmiReferences"
+    assert root.attrib[f"{space}fmi-ls-name"] == "org.fmi-standard.fmi-ls-ref"
+    assert root.attrib[f"{space}fmi-ls-version"] == "1.0.0-alpha.1"
+    roles = {}
+    for related in root:
+        path = f"{FOLDER}/{related.attrib['source']}".replace(f"{FOLDER}/../../", "")
+        assert hashlib.sha3_256(inside[path]).hexdigest() == related.attrib["checksum"]
+        roles[path] = related.attrib["role"]
+    own = {n for n in inside if n.startswith(FOLDER)} - {f"{FOLDER}/fmi-ls-manifest.xml"}
+    assert set(roles) == {*own, NOTES}
+    assert roles[f"{FOLDER}/{EXPERIMENTS}"] == "experiment/smoke-test"
+    assert roles[f"{FOLDER}/{PARAMETERS}"] == "parameter"
+    assert roles[f"{FOLDER}/{OUTPUTS}"] == "result"
+    (experiment,) = ET.fromstring(inside[f"{FOLDER}/{EXPERIMENTS}"])
+    assert {e.tag: e.attrib["source"] for e in experiment} == {
+        "Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS,
+    }  # fmt: skip
+    times = table(inside[f"{FOLDER}/{OUTPUTS}"])["time"]
+    assert float(experiment.attrib["startTime"]) == times[0] == 0.0
+    assert float(experiment.attrib["stopTime"]) == times[-1]
+    assert float(experiment.attrib["stepSize"]) == pytest.approx(np.diff(times), rel=1e-6)
+    assert set(table(inside[f"{FOLDER}/{INPUTS}"])["time"]) == set(times)
+
+
+def _signals(inputs: Table) -> Signals:
+    names = tuple(n for n in inputs if n != "time")
+    return Signals(names, inputs["time"], np.array([inputs[n] for n in names]).T)
+
+
+def _kinks(signals: Signals) -> Signals:
+    """Return the signals between their kinks only, every hundredth row."""
+    return Signals(signals.names, signals.times[::100], signals.values[::100])
+
+
+def _errors(found: npt.NDArray[np.float64], expected: Table) -> dict[str, float]:
+    """Return the largest difference of each output as a share of its range."""
+    names = [n for n in expected if n != "time"]
+    return {
+        n: float(np.max(np.abs(column - expected[n])) / np.ptp(expected[n]))
+        for n, column in zip(names, found.T, strict=True)
+    }
+
+
+@pytest.mark.parametrize("name", ["PTBS200", STACK, "manipulator", "single_mass"])
+def test_reference_outputs_agree_with_the_independent_reference(name: str) -> None:
+    model = model_named(name).plant()
+    inside = reference_entries(model)
+    inputs, outputs = (table(inside[f"{FOLDER}/{n}"]) for n in (INPUTS, OUTPUTS))
+    truth = expected_outputs(model, outputs["time"], _kinks(_signals(inputs)))
+    assert max(_errors(truth, outputs).values()) < 1e-6
+
+
+def test_importers_meet_the_reference_outputs() -> None:
+    """Co-simulation with the slopes of the inputs, and model exchange: to a millionth."""
+    inside = entries(STACK, 2)
+    inputs, outputs = (table(inside[f"{FOLDER}/{n}"]) for n in (INPUTS, OUTPUTS))
+    times, names = outputs["time"], [n for n in outputs if n != "time"]
+    with Fmu(exported(STACK, 2)) as fmu:
+        stepped = co_simulate(fmu, times, _signals(inputs), names, tolerance=1e-9)
+        assert max(_errors(stepped, outputs).values()) < 2e-6
+        left = integrate(fmu, times, _kinks(_signals(inputs)), names, tolerance=1e-9)
+        assert max(_errors(left, outputs).values()) < 2e-6
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_fmpy_meets_the_reference_outputs_as_the_notes_say(fmi: int) -> None:
+    """It holds the inputs over a communication step in FMI 2 and 3: late by half a step."""
+    inside = entries(STACK, fmi)
+    names = ("charge", "displacement", "blocked_force")
+    inputs, outputs = (
+        np.genfromtxt(io.BytesIO(inside[f"{FOLDER}/{n}"]), delimiter=",", names=True)
+        for n in (INPUTS, OUTPUTS)
+    )
+    step, end = float(inputs["time"][1]), float(inputs["time"][-1])
+    found: Any = fmpy.simulate_fmu(
+        str(exported(STACK, fmi)), fmi_type="CoSimulation", input=inputs, stop_time=end,
+        output_interval=step, relative_tolerance=1e-6, output=list(names),
+    )  # fmt: skip
+    assert found["time"] == pytest.approx(outputs["time"], abs=1e-3 * step)
+    for name in names:
+        error = np.max(np.abs(found[name] - outputs[name])) / np.ptp(outputs[name])
+        assert 1e-3 < error < 1e-2, name
+
+
+def test_values_are_rounded_to_their_range() -> None:
+    """Seven digits of the largest value: what differs between machines is below."""
+    for name in (INPUTS, OUTPUTS):
+        for column, values in table(reference_entries(flexure)[f"{FOLDER}/{name}"]).items():
+            if column != "time" and np.any(values):
+                quantum = 10.0 ** (np.floor(np.log10(np.max(np.abs(values)))) - 6)
+                assert np.abs(values / quantum - np.round(values / quantum)).max() < 1e-3
+
+
+def test_every_input_moves() -> None:
+    model = compose((*BASE, EFFECTS["temperature"]))
+    inputs = table(reference_entries(model)[f"{FOLDER}/{INPUTS}"])
+    assert {n for n in inputs if np.ptp(inputs[n]) > 0.0} == {"time", *model.input_names}
+    assert inputs["temperature"].min() > 250.0
+
+
+def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise SimulationError("no")
+
+    monkeypatch.setattr("psa_casadi.export.reference_results.run", fails)
+    monkeypatch.setattr("psa_casadi.export.fmu.compile_library", lambda *_: b"no binary")
+    with zipfile.ZipFile(export_fmu(flexure, tmp_path / "m.fmu", fmi=3)) as archive:
+        names = set(archive.namelist())
+        page = archive.read("documentation/index.html").decode()
+    assert not any(n.startswith("extra/") for n in names)
+    assert NOTES not in names
+    assert all(link.removeprefix("../") in names for link in re.findall(r'href="([^"]*)"', page))
