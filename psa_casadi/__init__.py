@@ -11,6 +11,7 @@ The public names, in the order of the workflow:
     psa.save_model(result.model, "extended.json")
     psa.export_fmu(result.model, "extended.fmu")
     psa.check_fmu("extended.fmu", result.model).passed
+    psa.export_modelica(result.model, "PiezoStack.mo")
 
 Each name is loaded when it is first used, so that importing the package is quick.
 """
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from psa_casadi.experiment import Record, read_record, read_records, write_record
     from psa_casadi.export.check import CheckReport, check_fmu
     from psa_casadi.export.fmu import export_fmu
+    from psa_casadi.export.modelica import export_modelica
     from psa_casadi.identification.identify import Identification, identify
     from psa_casadi.model.compose import Model, compose
     from psa_casadi.model.model_file import load_model, save_model
@@ -82,6 +84,7 @@ _HOMES = {
     "psa_casadi.report.page": ("write_report",),
     "psa_casadi.report.fit_page": ("write_fit_report",),
     "psa_casadi.export.fmu": ("export_fmu",),
+    "psa_casadi.export.modelica": ("export_modelica",),
     "psa_casadi.export.check": (
         "CheckReport",
         "check_fmu",
@@ -120,6 +123,7 @@ __all__ = [
     "write_report",
     "write_fit_report",
     "export_fmu",
+    "export_modelica",
     "CheckReport",
     "check_fmu",
     "InputError",

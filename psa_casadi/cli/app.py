@@ -11,6 +11,7 @@ from psa_casadi.cli.demo import demo
 from psa_casadi.cli.diagnose import diagnose
 from psa_casadi.cli.effects import effects
 from psa_casadi.cli.export_fmu import fmu
+from psa_casadi.cli.export_modelica import modelica
 from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.simulate import simulate
@@ -60,6 +61,9 @@ app.command(epilog="Example: psa effects slow_creep")(guarded(effects))
 app.command(epilog="Example: psa stacks P-885.51")(guarded(stacks))
 app.add_typer(export, name="export")
 export.command(epilog="Example: psa export fmu --model extended.json -o stack.fmu")(guarded(fmu))
+export.command(epilog="Example: psa export modelica --model extended.json -o PiezoStack.mo")(
+    guarded(modelica)
+)
 app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))
 app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(datasets))
 app.command(epilog="Example: psa bench identify --quick")(guarded(bench))

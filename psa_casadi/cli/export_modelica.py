@@ -1,0 +1,38 @@
+"""`psa export modelica`: a model as a Modelica package."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written
+
+
+def modelica(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Modelica file to write.")],
+    model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
+    stack: StackOption = None,
+    name: Annotated[str, typer.Option(help="Name of the package.")] = "PiezoStack",
+    include_sensor: Annotated[
+        bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a model as a Modelica package: signals, connectors, examples in one file."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.export.modelica import class_names, export_modelica
+
+    given = Given()
+    given.outputs({"--output": output}, [model])
+    chosen = given.model_or_stack(model, stack, any_model=True)
+    given.check()
+    if chosen is None:
+        return
+    export_modelica(chosen, output, name=name, include_sensor=include_sensor)
+    kept = chosen if include_sensor else chosen.plant()
+    left_out = [c.name for c in chosen.components if c not in kept.components]
+    show(f"inside: {', '.join(c.name for c in kept.components)}", quiet)
+    if left_out:
+        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", quiet)
+    tell_written(output, quiet=quiet)

@@ -1,0 +1,180 @@
+"""Exported packages in rumoca, an independent Modelica compiler, and what they should give."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import rumoca
+from numpy.typing import NDArray
+
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.modelica import modelica_text
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import Output, State
+
+FloatArray = NDArray[np.float64]
+
+#: Time to drive each stack once up and down [s]: slow beside its lags.
+SPANS = {"PTBS200": 0.02, "WYDS0808020": 0.02, "P-885.51": 0.02, "demo": 0.5, "micromanipulator": 2}
+_SAMPLES = 200
+
+
+@cache
+def model_named(name: str) -> Model:
+    """Return a stack by name, P-885.51 with an effect of its ordinary size, or "every_effect"."""
+    if name in STACKS:
+        return stack_model(name)
+    chosen = EFFECTS.values() if name == "every_effect" else (EFFECTS[name],)
+    base = {k: figure.value for k, figure in STACKS["P-885.51"].values.items()}
+    model = compose((*BASE, *chosen), base)
+    gains = {str(e.gain): model.parameter(str(e.gain)) for e in chosen}
+    sizes = {g: p.typical({**model.values, g: 0.0}) for g, p in gains.items()}
+    return model.with_values(sizes)
+
+
+@cache
+def text_of(name: str) -> str:
+    """Return the package of a named model, sensor and environment included."""
+    return modelica_text(model_named(name), include_sensor=True)
+
+
+def load(text: str, name: str) -> rumoca.Model:
+    """Compile one class of a text."""
+    return rumoca.Session().loads(text, model=name)
+
+
+def simulated(text: str, name: str, span: float, rtol: float = 1e-11) -> Mapping[str, FloatArray]:
+    """Return every variable of a run of a class from 0 to span [s], and its times as "time"."""
+    config = rumoca.SimConfig(solver="bdf", rtol=rtol, atol=1e-16, dt=span / _SAMPLES)
+    result = load(text, name).simulate(t=(0.0, span), config=config)
+    found = {n: np.asarray(result[n]) for n in result.names}
+    return {**found, "time": np.asarray(result.time)}
+
+
+def triangle_error(model: Model, text: str, span: float) -> dict[str, float]:
+    """Return the largest difference from `run`, over the range, of every state and output.
+
+    The voltage rises to half its rating and falls. A velocity, which is small beside what the stack
+    can reach as it rings, is compared to its usual size.
+    """
+    peak = 0.5 * model.values["u_rated"]
+    slope = 2.0 * peak / span
+    held = {i.name: i.start for i in model.structure.inputs if i.name != "voltage"}
+    kept = "".join(f", {n}={v!r}" for n, v in held.items())
+    voltage = f"if time < {span / 2!r} then {slope!r}*time else {slope!r}*({span!r} - time)"
+    harness = f"model Harness PiezoStack.Signal psa(voltage={voltage}{kept}); end Harness;"
+    got = simulated(text + harness, "Harness", span)
+    t = np.linspace(0.0, span, _SAMPLES + 1)
+    u = np.column_stack([peak * (1.0 - np.abs(2.0 * t / span - 1.0))] + [
+        np.full_like(t, v) for v in held.values()
+    ])  # fmt: skip
+    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-11)
+    variables: list[State | Output] = [*model.structure.states, *model.structure.outputs]
+    nominals = np.concatenate([model.state_nominals(), model.output_nominals()])
+    errors = {}
+    for it, expected, nominal in zip(
+        variables, np.hstack([steps.x, steps.y]).T, nominals, strict=True
+    ):
+        at = np.interp(t, got["time"], got[f"psa.{it.name}"])
+        size = nominal if it.unit == "m/s" else np.ptp(expected) or nominal
+        errors[it.name] = float(np.abs(at - expected).max() / size)
+    return errors
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The equations of a class `Signal`: right-hand side by left-hand side, as texts."""
+
+    sides: Mapping[str, str]
+
+    def resolved(self, side: str) -> str:
+        """Return a text with every variable that has an equation replaced by its right side."""
+
+        def replaced(match: re.Match[str]) -> str:
+            name = match[0].replace(" ", "")
+            return f"({self.resolved(self.sides[name])})" if name in self.sides else match[0]
+
+        return re.sub(r"der\(\w+\)|\b[A-Za-z_]\w*\b", replaced, side)
+
+
+def signal_class(text: str) -> str:
+    """Return the lines of the class `Signal` without its annotation."""
+    return text.partition("  model Signal ")[2].partition("annotation(")[0]
+
+
+def equations(text: str) -> Equations:
+    """Read the equations of `Signal`."""
+    body = re.sub(r"//[^\n]*", "", signal_class(text).split("\n  equation\n")[1])
+    pairs = (" ".join(e.split()).split(" = ", 1) for e in body.split(";") if e.strip())
+    return Equations({e[0]: e[1] for e in pairs})
+
+
+def pure_ode(model: Model, text: str) -> str:
+    """Return a class with the states' equations, and each output as the rate of one more state.
+
+    rumoca hands its reading of a class to CasADi only if all equations are of the form
+    der(x) = f(x); every other variable is replaced by its right-hand side.
+    """
+    given = equations(text)
+    lines = [
+        re.sub(r"^\s*output (.*)$", "", line)
+        for line in signal_class(text)
+        .split("\n  equation\n")[0]
+        .partition("\n  protected\n")[0]
+        .split("\n")[2:]
+    ]
+    lines += [f"Real integral_{n}(start=0.0, fixed=true);" for n in model.output_names]
+    lines += ["equation"]
+    lines += [f"der({n}) = {given.resolved(given.sides[f'der({n})'])};" for n in model.state_names]
+    lines += [f"der(integral_{n}) = {given.resolved(n)};" for n in model.output_names]
+    return "\n".join(["model Pure", *lines, "end Pure;"])
+
+
+def read_back(source: str, name: str) -> rumoca.SolveExport:
+    """Return rumoca's reading of a pure ODE: `rhs(t, x, u, p)`, and the names of x, u, p."""
+    return load(source, name).to_casadi()
+
+
+def right_side_error(model: Model, text: str, points: int = 5) -> float:
+    """Return the largest relative difference of derivatives and outputs at random points.
+
+    At the last point the voltage is held: its rate is below `hold_rate`.
+    """
+    read = read_back(pure_ode(model, text), "Pure")
+    defaults = dict(zip(read.parameter_names, read.default_parameters, strict=True))
+    parameters = [defaults[n] for n in read.parameter_names]
+    draw = np.random.default_rng(1)
+    worst = 0.0
+    for k in range(points + 1):
+        x = model.state_nominals() * draw.normal(size=len(model.state_names))
+        sizes = np.array([50.0, 100.0, 10.0])[: len(model.input_names)]
+        u = np.array([i.start for i in model.structure.inputs]) + sizes * draw.normal(
+            size=len(sizes)
+        )
+        if k == points:
+            u[0], x[0] = (
+                0.0,
+                0.7 * model.values["hold_rate"] * (model.values["R_s"] * model.values["C_p"]),
+            )
+        time = float(draw.uniform(0.1, 5.0))
+        at = {**dict(zip(model.state_names, x, strict=True)),
+              **{f"integral_{n}": 0.0 for n in model.output_names}}  # fmt: skip
+        inputs = dict(zip(model.input_names, u, strict=True))
+        rates = read.rhs(
+            time,
+            [at[n] for n in read.state_names],
+            [inputs[n] for n in read.input_names],
+            parameters,
+        )
+        got = dict(zip(read.state_names, np.array(rates).ravel(), strict=True))
+        expected = model.structure.f(time, x, u, model.parameter_vector())
+        values = np.concatenate([np.array(v).ravel() for v in expected])
+        for name, value in zip(at, values, strict=True):
+            difference = abs(got[name] - value) / max(abs(value), 1e-300)
+            worst = max(worst, difference) if np.isfinite(difference) else np.inf
+    return worst
