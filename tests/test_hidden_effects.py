@@ -23,6 +23,8 @@ SEED = 1
 OTHER_FORM = {"rate_dependent_hysteresis"}
 #: Lags that a slow record hardly tells apart.
 LAGS = {"drive_lag", "sensor_lag", "sensor_delay"}
+#: Share of the noise below which nothing of an effect is left beside the base.
+HARDLY = 0.1
 #: Fresh records in every run.
 FRESH = 4
 
@@ -53,7 +55,10 @@ def test_the_hidden_effect_is_named_and_the_gain_is_real(effect: str, tmp_path: 
 
 @pytest.mark.parametrize("effect", sorted(LAGS))
 def test_a_lag_is_named_as_a_lag(effect: str, tmp_path: Path) -> None:
-    found, _ = diagnose(effect, SEED, tmp_path)
+    found, truth = diagnose(effect, SEED, tmp_path)
+    if found.verdict == "adequate":  # the base's own lags have taken it over
+        assert truth.visible < HARDLY
+        return
     assert found.causes
     assert found.causes[0].effect in LAGS
     assert found.extended_errors.holdout_rms_m < found.base_errors.holdout_rms_m

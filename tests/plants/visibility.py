@@ -18,6 +18,8 @@ from tests.plants.stack import FloatArray, Stack
 
 COARSE_SUB_INTERVALS = 6
 RELATIVE_STEP = 0.02
+#: Largest change of a parameter in a fit, in its logarithm.
+_WIDEST = 12.0
 FREE = ("r_s", "a", "beta", "gamma", "n", "delta", "tau")
 
 
@@ -51,18 +53,29 @@ def visible_ratio(directions: FloatArray, contribution: FloatArray, sigma: float
 
 def refitted_ratio(run: Run, contribution: FloatArray, sigma: float) -> float:
     """As `visible_ratio`, with the base fitted again instead of linearised: what a lag leaves once
-    R_s C_p and tau have taken over what they can. A few seconds; coarse grid.
+    R_s C_p, tau and the dampings have taken over what they can. A few seconds; coarse grid.
+
+    The dampings' own lags, c_P/k_P and c_B/k_B, may be far below the sampling interval, where no
+    slope leads out: a second fit frees them from half of it.
     """
     start = simulate_base(run.stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
 
     def rest(logs: FloatArray) -> FloatArray:
-        factors = dict(zip((*FREE, "k_l"), np.exp(logs).tolist(), strict=True))
+        # without the dampings' logarithms they stay as they are
+        factors = dict(zip((*FREE, "k_l", "c_p", "c_b"), np.exp(logs).tolist(), strict=False))
         moved = {name: getattr(run.stack, name) * factor for name, factor in factors.items()}
         stack: Stack = replace(run.stack, **moved)
         fitted = simulate_base(stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
         left = (contribution + start - fitted) / sigma
         return np.asarray(left - left.mean(), dtype=np.float64)
 
-    start_logs = np.zeros(len(FREE) + 1)
-    found = least_squares(rest, start_logs, bounds=(-4.0, 4.0), diff_step=[1e-3], max_nfev=12)
-    return math.sqrt(2.0 * float(found.cost) / run.times.size)
+    half = 0.5 * float(run.times[1] - run.times[0])
+    lags = run.stack.c_p / run.stack.k_p, run.stack.c_b / run.stack.k_b
+    plain = np.zeros(len(FREE) + 1)
+    damped = np.concatenate([plain, np.clip(np.log(half / np.array(lags)), -_WIDEST, _WIDEST)])
+    bounds = (-_WIDEST - 1.0, _WIDEST + 1.0)
+    costs = [
+        float(least_squares(rest, logs, bounds=bounds, diff_step=[1e-3], max_nfev=12).cost)
+        for logs in (plain, damped)
+    ]
+    return math.sqrt(2.0 * min(costs) / run.times.size)
