@@ -9,19 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from psa_casadi.export.fmu_instance import CO_SIMULATION as CO_SIMULATION2
-from psa_casadi.export.fmu_instance import Fmu
+from psa_casadi.export.fmu_instance import CO_SIMULATION, DISCARD, ERROR, MODEL_EXCHANGE, OK, Fmu
+from psa_casadi.export.fmu_instance3 import Update
 from psa_casadi.export.variable_table import variable_table
-from tests.fmi3_instances import (
-    CO_SIMULATION,
-    DISCARD,
-    ERROR,
-    MODEL_EXCHANGE,
-    OK,
-    Instance3,
-    Update,
-    loaded,
-)
+from tests.fmi3_instances import Instance3, loaded
 from tests.fmu_models import exported, model_named
 
 FloatArray = npt.NDArray[np.float64]
@@ -129,7 +120,7 @@ def test_both_versions_and_interfaces_agree_at_a_point() -> None:
         Instance3(loaded(name), MODEL_EXCHANGE) as exchange,
         Instance3(loaded(name), CO_SIMULATION) as stepping,
         Fmu(exported(name)) as fmu,
-        fmu.start(CO_SIMULATION2, values=point) as older,
+        fmu.start(CO_SIMULATION, values=point) as older,
     ):
         for instance in (exchange, stepping):
             instance.start(point)
@@ -169,7 +160,7 @@ def _stepped(
     instance = Instance3(loaded(name)).start(values, tolerance=tolerance)
     time = 0.0
     for size in sizes:
-        assert instance.step(time, size).status == OK
+        assert instance.try_step(time, size).status == OK
         time += size
     return instance
 
@@ -211,7 +202,7 @@ def test_sensitivities_of_steps_multiply() -> None:
     states = _names(name)["state"]
     with _stepped(name, point, [2e-5], 1e-8) as instance:
         first = _jacobian(instance, states, states)
-        assert instance.step(2e-5, 3e-5).status == OK
+        assert instance.try_step(2e-5, 3e-5).status == OK
         second = _jacobian(instance, states, states)
     with _stepped(name, point, [5e-5], 1e-8) as instance:
         both = _jacobian(instance, states, states)
@@ -236,7 +227,7 @@ def test_what_is_set_after_a_step_does_not_change_its_sensitivity() -> None:
         data = instance.serialized()
         instance.set({"voltage": -5.0, "C_p": 1e-6})
         assert np.array_equal(_jacobian(instance, states, knowns), before)
-        assert instance.step(2e-4, 1e-4).status == OK
+        assert instance.try_step(2e-4, 1e-4).status == OK
         assert not np.array_equal(_jacobian(instance, states, knowns), before)
         assert instance.try_restore(data) == OK
         assert np.array_equal(_jacobian(instance, states, knowns), before)
@@ -252,7 +243,7 @@ def test_step_that_ended_early_has_the_sensitivity_up_to_its_end() -> None:
     watched = Instance3(loaded(name), watcher=lambda _, u: u.time if u.time > 2e-5 else None)
     with watched as instance:
         instance.start(point, tolerance=1e-8)
-        done = instance.step(0.0, 1e-4)
+        done = instance.try_step(0.0, 1e-4)
         assert done.early
         found = _jacobian(instance, states, knowns)
     with _stepped(name, point, [done.time], 1e-8) as instance:
@@ -269,7 +260,7 @@ def test_unknown_step_sensitivity_is_refused_with_the_reason() -> None:
 
     with Instance3(loaded(name), watcher=watcher) as instance:
         instance.start({"voltage": 50.0})
-        assert instance.step(0.0, 1e-3).status == OK
+        assert instance.try_step(0.0, 1e-3).status == OK
         vectors = (instance.references(["u"]), one, instance.references(["C_p"]), one)
         rest = (value, one, value, one)
         assert instance.call("GetDirectionalDerivative", *vectors, *rest) == DISCARD
@@ -277,6 +268,6 @@ def test_unknown_step_sensitivity_is_refused_with_the_reason() -> None:
         instance.directional(["current"], ["u"], [1.0])
     with Instance3(loaded(name)) as instance:
         instance.start({"voltage": 1e300})
-        assert instance.step(0.0, 1e-3).status == DISCARD
+        assert instance.try_step(0.0, 1e-3).status == DISCARD
         assert instance.call("GetAdjointDerivative", *vectors, *rest) == DISCARD
         assert "that step failed" in instance.messages[-1]

@@ -54,32 +54,32 @@ def test_indicator_is_the_rate_of_the_voltage_in_fmi_2() -> None:
 
 
 def test_indicator_is_the_rate_of_the_voltage_in_fmi_3() -> None:
-    with fmi3.Instance3(fmi3.loaded(STACK), fmi3.MODEL_EXCHANGE) as instance:
+    with fmi3.Instance3(fmi3.loaded(STACK), MODEL_EXCHANGE) as instance:
         instance.start({"u": 30.0, "voltage": 50.0})
         z = instance.vector("GetEventIndicators", 1)
         assert z[0] == pytest.approx(_rate(30.0, 50.0) + _margin(), rel=1e-12)
         assert instance.get([SWITCH])[0] == z[0]
-        assert instance.try_set({SWITCH: 0.0}) == fmi3.ERROR
-        instance.must("EnterEventMode")
+        assert instance.try_set({SWITCH: 0.0}) == ERROR
+        instance.require("EnterEventMode")
         assert instance.update_discrete_states() == [False] * 5
-        instance.must("EnterContinuousTimeMode")
+        instance.require("EnterContinuousTimeMode")
         nothing = (c_double * 1)()
-        assert instance.call("GetEventIndicators", nothing, c_size_t(0)) == fmi3.ERROR
+        assert instance.call("GetEventIndicators", nothing, c_size_t(0)) == ERROR
         flags = [c_bool(True), c_bool(True)]
-        instance.must("CompletedIntegratorStep", True, *(ctypes.byref(f) for f in flags))
+        instance.require("CompletedIntegratorStep", True, *(ctypes.byref(f) for f in flags))
 
 
 def test_indicator_faces_the_other_way_after_an_event_and_noise_makes_none() -> None:
     """Beyond the margin an event update turns it round; within the margin it does not."""
     values = model_named(STACK).values
     step = 2.0 * _margin() * values["R_s"] * values["C_p"]  # [V], two margins of the rate
-    with fmi3.Instance3(fmi3.loaded(STACK), fmi3.MODEL_EXCHANGE) as instance:
+    with fmi3.Instance3(fmi3.loaded(STACK), MODEL_EXCHANGE) as instance:
         instance.start({"u": 50.0, "voltage": 50.0})
         for share, facing in ((0.2, 1.0), (1.0, -1.0), (-0.2, -1.0), (-1.0, 1.0)):
-            instance.must("EnterEventMode")
+            instance.require("EnterEventMode")
             instance.set({"voltage": 50.0 - share * step})
             assert instance.update_discrete_states() == [False] * 5
-            instance.must("EnterContinuousTimeMode")
+            instance.require("EnterContinuousTimeMode")
             expected = facing * _rate(50.0, 50.0 - share * step) + _margin()
             assert instance.vector("GetEventIndicators", 1)[0] == pytest.approx(expected, rel=1e-6)
 

@@ -44,8 +44,8 @@ Watcher = Callable[["Instance3", Update], float | None]
 class Instance3(Instance):
     """One instance; `logger` is "own", or "none" for no logger.
 
-    `watcher` is called between two steps of the solver (intermediate update), `events` asks for
-    event mode in co-simulation.
+    `watcher` is called between two steps of the solver (intermediate update) and may end the step
+    there if `early`; `events` asks for event mode in co-simulation.
     """
 
     get_function, set_function = "GetFloat64", "SetFloat64"
@@ -54,19 +54,20 @@ class Instance3(Instance):
     has_input_rates = False
 
     def __init__(
-        self, fmu: "Fmu", interface: int, *, token: str | None = None, name: str = "check",
-        logger: str = "own", events: bool = False, watcher: Watcher | None = None,
+        self, fmu: "Fmu", interface: int, *, token: str | None = None,
+        name: str | None = "check", logger: str = "own", events: bool = False,
+        early: bool = True, watcher: Watcher | None = None,
     ) -> None:  # fmt: skip
         self.fmu, self.interface, self._watcher = fmu, interface, watcher
         self.messages: list[str] = []
         self._logger = _LOGGER(self._log) if logger == "own" else None
         self._update = _UPDATE(self._look) if watcher else None
         proof = (fmu.token if token is None else token).encode()
-        head = (name.encode(), proof, None, c_bool(False), c_bool(False))
+        head = (None if name is None else name.encode(), proof, None, c_bool(False), c_bool(False))
         if interface == CO_SIMULATION:
-            early = (c_bool(events), c_bool(True), None, c_size_t(0))
+            allowed = (c_bool(events), c_bool(early), None, c_size_t(0))
             made = fmu.library.fmi3InstantiateCoSimulation(
-                *head, *early, None, self._logger, self._update
+                *head, *allowed, None, self._logger, self._update
             )
         else:
             made = fmu.library.fmi3InstantiateModelExchange(*head, None, self._logger)
