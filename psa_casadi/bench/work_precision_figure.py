@@ -5,6 +5,7 @@ from typing import Protocol
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 _FONT = 10.5
 _STYLES = (("#0072b2", "o"), ("#d55e00", "s"), ("#009e73", "^"), ("#9a6fb0", "v"))
@@ -52,6 +53,7 @@ def _curves(axes: Axes, runs: Sequence[Measured], across: str, label: str) -> No
             [getattr(r, across) for r in mine], [r.error for r in mine], color=colour,
             marker=marker, markersize=5, linewidth=1.4, label=method,
         )  # fmt: skip
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel(label, fontsize=_FONT)
     axes.set_ylabel("largest error / range", fontsize=_FONT)
     axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)

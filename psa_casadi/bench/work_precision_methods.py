@@ -115,7 +115,7 @@ def _cvode(case: Case, fmu: Fmu, tolerance: float) -> Solved:
     which costs a moving voltage all accuracy; here they are set with every time.
     """
     t, calls, last = case.times, [0], [0.0]
-    with fmu.start(MODEL_EXCHANGE) as instance:
+    with fmu.start(MODEL_EXCHANGE, tolerance=tolerance) as instance:
 
         def set_time(time: float) -> None:
             instance.require("SetTime", float(time))
@@ -152,7 +152,7 @@ def _cvode(case: Case, fmu: Fmu, tolerance: float) -> Solved:
 def _scipy(solver: Any, case: Case, fmu: Fmu, tolerance: float) -> Solved:
     """Integrate the right-hand side of the model-exchange FMU, restarted at jumps."""
     calls, t = [0], case.times
-    with fmu.start(MODEL_EXCHANGE) as instance:
+    with fmu.start(MODEL_EXCHANGE, tolerance=tolerance) as instance:
         states = fmu.states()
         x, atol = instance.get(states), tolerance * np.array([fmu.nominals[s] for s in states])
         rows = [instance.get([_OUTPUT])]
