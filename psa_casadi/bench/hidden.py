@@ -9,8 +9,10 @@ from multiprocessing import get_context
 import numpy as np
 
 from psa_casadi.bench.hidden_cases import Case, Found, plants, run_case, study
+from psa_casadi.bench.hidden_controls import control_table
 from psa_casadi.bench.hidden_figure import picture
 from psa_casadi.bench.outcome import Outcome, Progress, TitledTable
+from psa_casadi.diagnosis.task import Method
 from psa_casadi.report.tables import Table
 
 #: Seeds for each effect, and the first of them.
@@ -24,15 +26,20 @@ def run(progress: Progress, quick: bool) -> Outcome:
     """Draw and diagnose all cases on all cores; the seeds are the same in every run."""
     _, known, foreign = plants()
     found = diagnose_all(study(known, foreign, QUICK_SEEDS if quick else SEEDS, FIRST), progress)
-    tables = (_summary(found), _by_effect(found), _reliability(found))
-    return Outcome(tables, lambda: picture(found, known, foreign))
+    tables = [_summary(found), _by_effect(found), _reliability(found)]
+    if not quick:
+        counted = [f for kind in ("known", "foreign") for f in of_kind(found, kind)]
+        tables.append(control_table(counted, FIRST, lambda c, m: diagnose_all(c, progress, m)))
+    return Outcome(tuple(tables), lambda: picture(found, known, foreign))
 
 
-def diagnose_all(cases: Sequence[Case], progress: Progress) -> list[Found]:
+def diagnose_all(
+    cases: Sequence[Case], progress: Progress, method: Method | None = None
+) -> list[Found]:
     """Diagnose the cases side by side."""
     found: list[Found] = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [pool.submit(run_case, case) for case in cases]
+        jobs = [pool.submit(run_case, case, method) for case in cases]
         for job in as_completed(jobs):
             one = job.result()
             found.append(one)

@@ -18,6 +18,7 @@ import numpy as np
 
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis, Verdict
+from psa_casadi.diagnosis.task import Method
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.experiment.reading import read_record
@@ -45,8 +46,9 @@ class Found:
     """What a diagnosis said of a case.
 
     `rho` was reached, 0 where nothing is hidden; `named` are the causes, `within` the named ones
-    with what they cannot be told from. `probability` is that of each effect in the first step;
-    `ratio` the held-out rms over that of the noise; `seconds` the processor time.
+    with what they cannot be told from. `confidence` is that of the first cause; `probability` and
+    `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
+    the noise; `seconds` the processor time.
     """
 
     case: Case
@@ -56,6 +58,7 @@ class Found:
     within: tuple[str, ...]
     confidence: float
     probability: Mapping[str, float]
+    evidence: Mapping[str, float]
     ratio: float
     seconds: float
 
@@ -80,7 +83,7 @@ def plants() -> tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]:
     return import_module("tests.plants.make").make_record, table.KNOWN, table.FOREIGN
 
 
-def run_case(case: Case) -> Found:
+def run_case(case: Case, method: Method | None = None) -> Found:
     """Make the record of a case, diagnose the file, and compare."""
     make_record, _, _ = plants()
     with tempfile.TemporaryDirectory() as folder:
@@ -97,7 +100,7 @@ def run_case(case: Case) -> Found:
         record = read_record(path)
     table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.effect]
     begin = time.process_time()
-    d = diagnose([record], effects=table)
+    d = diagnose([record], effects=table, method=method)
     return _found(case, d, truth, time.process_time() - begin)
 
 
@@ -115,6 +118,7 @@ def _found(case: Case, d: Diagnosis, truth: Any, seconds: float) -> Found:
         within=tuple(dict.fromkeys((*named, *alike))),
         confidence=d.causes[0].confidence if d.causes else 0.0,
         probability={c.effect: c.probability for c in d.candidates},
+        evidence={c.effect: c.evidence for c in d.candidates},
         ratio=d.extended_errors.holdout_rms_m / level,
         seconds=seconds,
     )

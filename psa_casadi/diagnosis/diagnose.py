@@ -18,6 +18,7 @@ from psa_casadi.diagnosis.retries import (
 )
 from psa_casadi.diagnosis.rounds import Round, examine, search_cause
 from psa_casadi.diagnosis.selection import OF_FIRST
+from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.diagnosis.verdict import PARTLY, conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
@@ -49,14 +50,15 @@ def diagnose(
     model: Model | None = None,
     stiffness: float | None = None,
     effects: Sequence[Component] | None = None,
+    method: Method | None = None,
     progress: Progress = lambda _: None,
 ) -> Diagnosis:
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
     Held-out data are the records `holdout`, else a quarter of every record in blocks (see
     `split`); they choose nothing but whether an extension may stay. `model` is where the base fit
-    starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search. Raises
-    InputError.
+    starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search; `method` can
+    leave parts of the method out (for its negative controls). Raises InputError.
     """
     table = list(effects if effects is not None else EFFECTS.values())
     experiments = _experiments([cleaned(r) for r in records], [cleaned(r) for r in holdout])
@@ -66,7 +68,8 @@ def diagnose(
     there = {c.name for c in start.components}
     table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
     base = fit_base(start, experiments, progress=progress)
-    rounds = _search(base, experiments, table, progress)
+    task = Task(experiments, tuple(table), method or Method(), progress)
+    rounds = _search(base, task)
     progress("judging")
     return conclude(rounds, experiments, table, stiffness is not None)
 
@@ -89,23 +92,21 @@ def _experiments(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[
     return (*(whole(r) for r in records), *held)
 
 
-def _search(
-    base: Fit, experiments: Sequence[Experiment], table: Sequence[Component], progress: Progress
-) -> list[Round]:
+def _search(base: Fit, task: Task) -> list[Round]:
     """Forward selection: add the best effect until nothing is seen or nothing helps."""
-    rounds = _forward(base, experiments, table, progress)
+    rounds = _forward(base, task)
     if _open(rounds):
-        better = from_resonances(rounds[0].fit, experiments, progress)
+        better = from_resonances(rounds[0].fit, task.experiments, task.progress)
         if better is not None and better.rms < BETTER_BASE * rounds[0].fit.rms:
-            rounds = _forward(better, experiments, table, progress)
+            rounds = _forward(better, task)
     if _open(rounds):
-        resonant = from_band(rounds[0].fit, rounds[-1].fit, experiments, progress)
+        before = rounds[-1].fit
+        resonant = from_band(rounds[0].fit, before, task.experiments, task.progress)
         if resonant is not None:
-            other = _forward(resonant, experiments, table, progress)
+            other = _forward(resonant, task)
             if other[-1].fit.rms < rounds[-1].fit.rms:
                 rounds = other
-    rounds = without_needless(rounds, experiments, progress)
-    return _settle(rounds, experiments, progress)
+    return _settle(without_needless(rounds, task), task)
 
 
 def _open(rounds: Sequence[Round]) -> bool:
@@ -115,27 +116,18 @@ def _open(rounds: Sequence[Round]) -> bool:
     return rounds[-1].test.alarm and first - last < PARTLY * excess
 
 
-def _forward(
-    base: Fit, experiments: Sequence[Experiment], table: Sequence[Component], progress: Progress
-) -> list[Round]:
+def _forward(base: Fit, task: Task) -> list[Round]:
     """Make sure of the base where something is missing, then add causes."""
-    first = _round(base, experiments, table, progress)
-    fast = min(e.record.sample_time for e in experiments) < FAST
+    first = _round(base, task)
+    fast = min(e.record.sample_time for e in task.experiments) < FAST
     if fast and first.test.alarm:
-        resonant = from_resonances(first.fit, experiments, progress)
+        resonant = from_resonances(first.fit, task.experiments, task.progress)
         if resonant is not None and resonant.rms < BETTER_BASE * first.fit.rms:
-            first = _round(resonant, experiments, table, progress)
-    return _causes(first, experiments, table, progress, retry=True)
+            first = _round(resonant, task)
+    return _causes(first, task, retry=True)
 
 
-def _causes(
-    start: Round,
-    experiments: Sequence[Experiment],
-    table: Sequence[Component],
-    progress: Progress,
-    *,
-    retry: bool,
-) -> list[Round]:
+def _causes(start: Round, task: Task, *, retry: bool) -> list[Round]:
     """Add the best effect until nothing is seen or nothing helps.
 
     With `retry` the base is fitted again from where an effect led; that base replaces the effect,
@@ -145,29 +137,20 @@ def _causes(
     while len(rounds) <= MOST_CAUSES and _worth_searching(rounds):
         current = rounds[-1]
         first = rounds[0].chosen if len(rounds) > 1 else None
-        search_cause(current, len(rounds), experiments, progress, first)
+        search_cause(current, len(rounds), task, first)
         chosen = current.chosen
         if chosen is None:
             break
-        better = _retried(rounds, tried, experiments, progress) if retry else None
+        better = _retried(rounds, tried, task) if retry else None
         if better is not None:
-            again = _round(better, experiments, table, progress)
-            other = _causes(again, experiments, table, progress, retry=False)
+            other = _causes(_round(better, task), task, retry=False)
             if not other[-1].test.alarm or other[-1].fit.rms < AS_GOOD * chosen.fit.rms:
                 return other
-        left = [c for c in table if c not in chosen.fit.model.components]
-        rounds.append(
-            examine(chosen.fit, chosen.predicted, experiments, left, progress, current.trials)
-        )
+        rounds.append(examine(chosen.fit, chosen.predicted, task, current.trials))
     return rounds
 
 
-def _retried(
-    rounds: Sequence[Round],
-    tried: set[str],
-    experiments: Sequence[Experiment],
-    progress: Progress,
-) -> Fit | None:
+def _retried(rounds: Sequence[Round], tried: set[str], task: Task) -> Fit | None:
     """Fit the base from where the last round led, once in each way; None if it is not better."""
     base, current = rounds[0].fit, rounds[-1]
     chosen = current.chosen
@@ -176,38 +159,34 @@ def _retried(
     rings = chosen.effect.tone is not None and chosen.effect.belongs_to == "plant"
     if rings and "mode" not in tried:
         tried.add("mode")
-        own = from_mode(base, current.fit, chosen, experiments, progress)
+        own = from_mode(base, current.fit, chosen, task.experiments, task.progress)
         if own is not None:
             return own
     if len(rounds) > 1 or "extension" in tried:
         return None
     tried.add("extension")
-    progress("base fit, from the extension's parameters")
-    again = from_extension(base, chosen, experiments)
+    task.progress("base fit, from the extension's parameters")
+    again = from_extension(base, chosen, task.experiments)
     return again if again is not None and again.rms < BETTER_BASE * base.rms else None
 
 
-def _round(
-    base: Fit, experiments: Sequence[Experiment], table: Sequence[Component], progress: Progress
-) -> Round:
-    return examine(base, tuple(base.predicted(experiments)), experiments, table, progress)
+def _round(base: Fit, task: Task) -> Round:
+    return examine(base, tuple(base.predicted(task.experiments)), task)
 
 
-def _settle(
-    rounds: list[Round], experiments: Sequence[Experiment], progress: Progress
-) -> list[Round]:
+def _settle(rounds: list[Round], task: Task) -> list[Round]:
     """Where two causes or more leave structure, fit all their parameters together once more."""
     last = rounds[-1]
     if len(rounds) < 3 or not last.test.alarm:
         return rounds
-    progress("all causes together, to the end")
+    task.progress("all causes together, to the end")
     try:
-        again = refit(last.fit, experiments, last.fit.unknowns.names)
+        again = refit(last.fit, task.experiments, last.fit.unknowns.names)
     except PsaError:
         return rounds
-    predicted = tuple(again.predicted(experiments))
-    before = held_out_rms(experiments, last.predicted)
-    if held_out_rms(experiments, predicted) < before:
+    predicted = tuple(again.predicted(task.experiments))
+    before = held_out_rms(task.experiments, last.predicted)
+    if held_out_rms(task.experiments, predicted) < before:
         rounds[-1] = replace(last, fit=again, predicted=predicted)
     return rounds
 

@@ -69,6 +69,22 @@ def probabilities(evidences: Mapping[str, float]) -> dict[str, float]:
     return dict(zip(evidences, weights.tolist(), strict=True))
 
 
+def bic_probabilities(before: Fit, after: Mapping[str, Fit], colour: Colour) -> dict[str, float]:
+    """Return probabilities from the Bayesian information criterion of fits with one more effect.
+
+    They are proportional to exp(-BIC/2), BIC = n ln(S/n) + k ln(n) of k unknowns: those of
+    `evidence` are better calibrated, which the controls of `psa bench diagnose` show.
+    """
+    n = len(before.residuals)
+    values = {
+        name: -0.5 * n * float(np.log(np.mean(colour.whiten(fit.residuals) ** 2)))
+        - 0.5 * len(_added(before, fit)) * float(np.log(n))
+        for name, fit in after.items()
+    }
+    total = float(np.logaddexp.reduce(list(values.values()))) if values else 0.0
+    return {name: float(np.exp(v - total)) for name, v in values.items()}
+
+
 def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, ...]:
     """Return the fewest effects whose probabilities sum to `level`, the most probable first."""
     chosen, total = [], 0.0

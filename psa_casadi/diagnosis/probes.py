@@ -45,17 +45,22 @@ class Direction:
 
 
 def directions(
-    fit: Fit, experiments: Sequence[Experiment], effects: Sequence[Component]
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    effects: Sequence[Component],
+    *,
+    finite_steps: bool = True,
 ) -> list[Direction]:
     """Return the directions of all effects over their probe values, at the fitted model.
 
+    Without `finite_steps` only derivatives are taken, which some effects have not at their null.
     They are simulated side by side: the stepper does not hold Python's lock.
     """
     peaks = residual_peaks(fit, experiments)
     tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
-        return list(_directions_at(fit, experiments, *task))
+        return list(_directions_at(fit, experiments, *task, finite_steps))
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         return [d for found in pool.map(one, tasks) for d in found]
@@ -103,7 +108,11 @@ def _probe_values(
 
 
 def _directions_at(
-    fit: Fit, experiments: Sequence[Experiment], effect: Component, values: dict[str, float]
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    effect: Component,
+    values: dict[str, float],
+    finite_steps: bool,
 ) -> Iterator[Direction]:
     model = fit.model.with_effect(effect, values)
     gain = effect.gain or ""
@@ -111,7 +120,7 @@ def _directions_at(
     scale = parameter.typical({**model.values, gain: 0.0})
     one_sided = parameter.bounds[0] >= 0
     for memory in _histories(fit, experiments, effect, model):
-        steps = [s * scale for s in effect.finite_step] or [0.0]
+        steps = [s * scale for s in effect.finite_step if finite_steps] or [0.0]
         for step in steps:
             try:
                 column = _column(fit, experiments, model, gain, memory, step, scale)

@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.colour import colour_of
 from psa_casadi.diagnosis.errors_of import held_out_rms
-from psa_casadi.diagnosis.evidence import estimated, probabilities
+from psa_casadi.diagnosis.evidence import bic_probabilities, estimated, probabilities
 from psa_casadi.diagnosis.extension import (
     Extension,
     extend,
@@ -21,10 +22,9 @@ from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.probes import Direction, directions
 from psa_casadi.diagnosis.screening import Screening, copies, screen
 from psa_casadi.diagnosis.selection import choose, leading
-from psa_casadi.experiment.split import Experiment
+from psa_casadi.diagnosis.task import Task
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.noise import high_frequency_noise
-from psa_casadi.identification.refitting import Progress
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -59,29 +59,24 @@ class Round:
 
 
 def examine(
-    fit: Fit,
-    predicted: tuple[FloatArray, ...],
-    experiments: Sequence[Experiment],
-    table: Sequence[Component],
-    progress: Progress,
-    known: Sequence[Direction] = (),
+    fit: Fit, predicted: tuple[FloatArray, ...], task: Task, known: Sequence[Direction] = ()
 ) -> Round:
-    """Screen the effects at a fit and test its residual.
+    """Screen the effects that a fit does not hold yet, and test its residual.
 
     Directions that are `known` from the fit before are used again: what an effect adds hardly
     changes with another effect beside it, and a full fit judges.
     """
-    progress("screening effects")
+    task.progress("screening effects")
+    table = [e for e in task.table if e not in fit.model.components]
     kept = [d for d in known if d.effect in table]
     if known:
         lines = [e for e in table if e.tone is not None]  # the residual's lines are new ones
-        kept = [d for d in kept if d.effect not in lines] + directions(fit, experiments, lines)
+        kept = [d for d in kept if d.effect not in lines] + _directions(fit, task, lines)
     else:
-        kept = directions(fit, experiments, table)
-    lengths = [int(e.used.sum()) for e in experiments]
-    screening = screen(fit, kept, lengths, [known_colour(e.record) for e in experiments])
-    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
-    time = np.concatenate([e.record.time[e.used] for e in experiments])
+        kept = _directions(fit, task, table)
+    screening = _screened(fit, kept, task)
+    voltage = np.concatenate([e.record.voltage[e.used] for e in task.experiments])
+    time = np.concatenate([e.record.time[e.used] for e in task.experiments])
     floor = high_frequency_noise(fit.residuals)
     test = omnibus(fit.residuals, voltage, time, screening.colour, floor)
     guess = estimated(fit, screening)
@@ -96,20 +91,26 @@ def examine(
     )
 
 
-def search_cause(
-    current: Round,
-    number: int,
-    experiments: Sequence[Experiment],
-    progress: Progress,
-    first: Extension | None = None,
-) -> None:
+def _directions(fit: Fit, task: Task, effects: Sequence[Component]) -> list[Direction]:
+    return directions(fit, task.experiments, effects, finite_steps=task.method.finite_steps)
+
+
+def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
+    lengths = [int(e.used.sum()) for e in task.experiments]
+    known = [known_colour(e.record) for e in task.experiments]
+    if task.method.whiten_from == "residual":
+        return screen(fit, trials, lengths, colour=colour_of(fit.residuals, lengths))
+    return screen(fit, trials, lengths, known)
+
+
+def search_cause(current: Round, number: int, task: Task, first: Extension | None = None) -> None:
     """Fit the leading effects and what could imitate the best, and choose among them.
 
     `first` is the first cause where this is a further one.
     """
-    colour = current.screening.colour
+    colour, experiments = current.screening.colour, task.experiments
     for name, scores in leading(current.screening):
-        progress(f"cause {number}: fitting {name}")
+        task.progress(f"cause {number}: fitting {name}")
         extension = extend(current.fit, experiments, scores, colour)
         if extension is not None:
             current.extensions.append(extension)
@@ -117,32 +118,40 @@ def search_cause(
     floor = high_frequency_noise(current.fit.residuals)
     lost = [k for k, e in enumerate(current.extensions) if k == 0 or e.evidence < 0][:AFRESH]
     for k in lost if current.extensions and current.extensions[0].fit.rms > SETTLED * floor else ():
-        progress(f"cause {number}: {current.extensions[k].effect.name} afresh")
+        task.progress(f"cause {number}: {current.extensions[k].effect.name} afresh")
         again = extend_afresh(current.fit, experiments, current.extensions[k], colour)
         current.extensions[k] = again
     _sort(current)
-    _polish(current, number, experiments, progress)
-    if current.extensions:
-        _imitators(current, number, experiments, progress)
-        _polish(current, number, experiments, progress)
+    _polish(current, number, task)
+    if current.extensions and task.method.imitators:
+        _imitators(current, number, task)
+        _polish(current, number, task)
     before = held_out_rms(experiments, current.predicted)
     ranked = choose(current.extensions, experiments, current.fit, before, floor, colour, first)
+    _weigh(current, ranked, task)
+    current.chosen = ranked[0] if ranked else None
+
+
+def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:
+    """Give every effect its evidence and, unless a full fit showed it unfit, its probability."""
     fitted = {e.effect.name: e.evidence for e in current.extensions}
-    refused = {name for name in fitted if name not in {e.effect.name for e in ranked}}
+    refused = {name for name in fitted if name not in {e.effect.name for e in worth}}
     current.evidence = {**current.evidence, **fitted}
+    if task.method.weights == "bic":
+        current.probability = bic_probabilities(
+            current.fit, {e.effect.name: e.fit for e in worth}, current.screening.colour
+        )
+        return
     current.probability = probabilities(
         {name: v for name, v in current.evidence.items() if name not in refused}
     )
-    current.chosen = ranked[0] if ranked else None
 
 
 def _sort(current: Round) -> None:
     current.extensions.sort(key=lambda e: -e.evidence)
 
 
-def _polish(
-    current: Round, number: int, experiments: Sequence[Experiment], progress: Progress
-) -> None:
+def _polish(current: Round, number: int, task: Task) -> None:
     """Fit the best extensions to the end, where that is not done yet."""
     if not current.extensions:
         return
@@ -150,16 +159,14 @@ def _polish(
     limit = min(RUNNER_UP * best, best - NEAR)
     for k, extension in enumerate(current.extensions[:FINALISTS]):
         if extension.evidence > limit and not extension.final:
-            progress(f"cause {number}: {extension.effect.name} to the end")
+            task.progress(f"cause {number}: {extension.effect.name} to the end")
             current.extensions[k] = polish(
-                current.fit, extension, experiments, current.screening.colour
+                current.fit, extension, task.experiments, current.screening.colour
             )
     _sort(current)
 
 
-def _imitators(
-    current: Round, number: int, experiments: Sequence[Experiment], progress: Progress
-) -> None:
+def _imitators(current: Round, number: int, task: Task) -> None:
     """Fit the effects that could copy what the best one adds, the base being free to follow.
 
     A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is below
@@ -169,7 +176,7 @@ def _imitators(
     added = np.concatenate(
         [
             (p - q)[e.used]
-            for p, q, e in zip(best.predicted, current.predicted, experiments, strict=True)
+            for p, q, e in zip(best.predicted, current.predicted, task.experiments, strict=True)
         ]
     )
     fitted = {e.effect.name: e for e in current.extensions}
@@ -179,8 +186,8 @@ def _imitators(
     near = [n for n in left if n not in fitted and left[n] < NEAR]
     lost = [n for n in left if n in fitted and fitted[n].evidence < best.evidence - left[n] - NEAR]
     for name in sorted([*near, *lost], key=lambda n: left[n])[:IMITATORS]:
-        progress(f"cause {number}: fitting {name}, which could look like {best.effect.name}")
-        extension = extend_like(current.fit, best, experiments, found[name], current.screening)
+        task.progress(f"cause {number}: fitting {name}, which could look like {best.effect.name}")
+        extension = extend_like(current.fit, best, task.experiments, found[name], current.screening)
         if extension is None:
             continue
         if name not in fitted:

@@ -65,15 +65,18 @@ def screen(
     trials: Sequence[Direction],
     lengths: Sequence[int],
     known: Sequence[FloatArray | None] | None = None,
+    *,
+    colour: Colour | None = None,
 ) -> Screening:
     """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples.
 
-    `known` is the colour of the records' noise where it is known without a model.
+    `known` is the colour of the records' noise where it is known without a model; `colour` replaces
+    the whole estimate.
     """
     basis = _basis(fit.jacobian)
     none: FloatArray = np.zeros((len(fit.residuals), 0))
     columns = np.hstack([none, *(d.column[:, None] for d in trials)])
-    colour = colour_of(_remainder(fit.residuals, basis, columns), lengths, known)
+    colour = colour or colour_of(_remainder(fit.residuals, basis, columns), lengths, known)
     white_basis = _basis(colour.whiten(fit.jacobian))
     residual = _project(colour.whiten(fit.residuals), white_basis)
     white = _project(colour.whiten(columns), white_basis)

@@ -1,0 +1,35 @@
+"""What a search for causes works on, and by which method."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from psa_casadi.component import Component
+from psa_casadi.experiment.split import Experiment
+
+
+@dataclass(frozen=True)
+class Method:
+    """The parts of the method that a diagnosis can go without, to show what each is good for.
+
+    `whiten_from`: the noise's colour is that of what neither the base nor any candidate explains
+    ("remainder"), or that of the residual itself. `finite_steps`: effects whose derivative vanishes
+    at their null are screened by a step. `imitators`: effects that could look like the best one are
+    fitted too. `weights`: probabilities come from the evidence, tempered as measured, or from the
+    Bayesian information criterion.
+    """
+
+    whiten_from: Literal["remainder", "residual"] = "remainder"
+    finite_steps: bool = True
+    imitators: bool = True
+    weights: Literal["evidence", "bic"] = "evidence"
+
+
+@dataclass(frozen=True)
+class Task:
+    """The records, the table of effects to search, the method, and who is told of the progress."""
+
+    experiments: tuple[Experiment, ...]
+    table: tuple[Component, ...]
+    method: Method = field(default_factory=Method)
+    progress: Callable[[str], None] = lambda _: None
