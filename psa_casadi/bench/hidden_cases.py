@@ -23,15 +23,17 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.experiment.reading import read_record
 
-Kind = Literal["known", "weak", "clean", "left out", "foreign", "two"]
+Kind = Literal["known", "weak", "clean", "left out", "foreign", "two", "poor"]
 
 #: Ranges of rho, from which a case's is drawn evenly in its logarithm.
 ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
+#: Classes of voltages that show less than a rich one.
+POOR = ("sine", "triangle", "steps", "slow", "loops")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One record: what is hidden in it, with which noise, from which seed."""
+    """One record: what is hidden in it, with which noise and voltage, from which seed."""
 
     kind: Kind
     effect: str | None
@@ -39,14 +41,16 @@ class Case:
     rho: tuple[float, float] = ORDINARY
     second: str | None = None
     noise: str = "white"
+    excitation: str = "rich"
 
 
 @dataclass(frozen=True)
 class Found:
     """What a diagnosis said of a case.
 
-    `rho` was reached, 0 where nothing is hidden; `named` are the causes, `within` the named ones
-    with what they cannot be told from. `confidence` is that of the first cause; `probability` and
+    `rho` was reached, of two causes the smaller, 0 where nothing is hidden; `named` are the causes,
+    `within` the named ones with what they cannot be told from; `blind` the effects that the record
+    is said not to show. `confidence` is that of the first cause; `probability` and
     `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
     the noise; `seconds` the processor time.
     """
@@ -56,6 +60,7 @@ class Found:
     verdict: Verdict
     named: tuple[str, ...]
     within: tuple[str, ...]
+    blind: tuple[str, ...]
     confidence: float
     probability: Mapping[str, float]
     evidence: Mapping[str, float]
@@ -93,6 +98,7 @@ def run_case(case: Case, method: Method | None = None) -> Found:
             case.seed,
             path,
             noise=case.noise,
+            excitation=case.excitation,
             visible=case.rho if case.effect else None,
             second=case.second,
             second_visible=case.rho if case.second else None,
@@ -112,10 +118,11 @@ def _found(case: Case, d: Diagnosis, truth: Any, seconds: float) -> Found:
     level = float(np.sqrt(np.mean(noise[held] ** 2)))
     return Found(
         case=case,
-        rho=float(truth.visible),
+        rho=min(float(h.visible) for h in (truth, truth.second) if h is not None),
         verdict=d.verdict,
         named=named,
         within=tuple(dict.fromkeys((*named, *alike))),
+        blind=tuple(b.effect for b in d.blind_to),
         confidence=d.causes[0].confidence if d.causes else 0.0,
         probability={c.effect: c.probability for c in d.candidates},
         evidence={c.effect: c.evidence for c in d.candidates},
@@ -138,4 +145,7 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
     for k in range(3 * seeds):
         one, other = rng.choice(known, 2, replace=False)
         cases.append(Case("two", str(one), first + k, STRONG, str(other)))
+    for k in range(4 * seeds):
+        effect, excitation = str(rng.choice(known)), POOR[k % len(POOR)]
+        cases.append(Case("poor", effect, first + k, excitation=excitation))
     return cases

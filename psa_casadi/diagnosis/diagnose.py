@@ -29,7 +29,7 @@ from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.refitting import Progress, refit
 from psa_casadi.identification.search import fit_base
-from psa_casadi.identification.starting import starting_model
+from psa_casadi.identification.starting import chosen_start
 from psa_casadi.model.compose import Model
 
 #: Most causes that are named for one set of records.
@@ -62,16 +62,15 @@ def diagnose(
     """
     table = list(effects if effects is not None else EFFECTS.values())
     experiments = _experiments([cleaned(r) for r in records], [cleaned(r) for r in holdout])
-    start = (model or starting_model(records, stiffness)).without(
-        c.name for c in table if c.gain is not None
-    )
+    start, scale_given = chosen_start(records, model, stiffness)
+    start = start.without(c.name for c in table if c.gain is not None)
     there = {c.name for c in start.components}
     table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
     base = fit_base(start, experiments, progress=progress)
     task = Task(experiments, tuple(table), method or Method(), progress)
     rounds = _search(base, task)
     progress("judging")
-    return conclude(rounds, experiments, table, stiffness is not None)
+    return conclude(rounds, experiments, table, scale_given)
 
 
 def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:

@@ -16,7 +16,7 @@ from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.refitting import Progress, record_rms, refit
 from psa_casadi.identification.search import Search, StartOutcome, search
-from psa_casadi.identification.starting import starting_model
+from psa_casadi.identification.starting import chosen_start
 from psa_casadi.model.compose import Model
 from psa_casadi.variables import Provenance
 from psa_casadi.version import __version__
@@ -72,7 +72,7 @@ def identify(
     ready = [prepared(r) for r in records]
     fitted = [r for r, _ in ready]
     experiments = tuple(whole(r) for r in fitted)
-    start = model or starting_model(fitted, stiffness)
+    start, given = chosen_start(fitted, model, stiffness)
     linear = None
     if model is None:
         progress("starting values from the records")
@@ -88,7 +88,6 @@ def identify(
     determined = determinacy(
         best, experiments, not_unique=found.not_unique, assumed=assumed_ratio(best, experiments)
     )
-    given = stiffness is not None or (model is not None and model.provenance.force_scale == "given")
     open_ones = free_combinations(best.model, determined, force_scale_given=given)
     advised: tuple[Advice, ...] = ()
     if not best.interrupted:

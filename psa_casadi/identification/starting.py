@@ -55,6 +55,31 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     return compose(BASE, {**values, **_lags(values, sample_time)})
 
 
+def chosen_start(
+    records: Sequence[Record], model: Model | None, stiffness: float | None
+) -> tuple[Model, bool]:
+    """Return where a fit starts, and whether its force scale is known.
+
+    A `model` is taken as it is; a `stiffness` [N/m] beside it changes its force scale.
+    """
+    if model is None:
+        return starting_model(records, stiffness), stiffness is not None
+    if stiffness is None:
+        return model, model.provenance.force_scale == "given"
+    return with_stiffness(model, stiffness), True
+
+
+def with_stiffness(model: Model, stiffness: float) -> Model:
+    """Return a model of the same displacement whose free stiffness [N/m] is the one given.
+
+    All forces, stiffnesses, dampings and masses are multiplied by one factor, which displacements
+    do not show.
+    """
+    own = next(model.values[name] for name in ("k_B", "k") if name in model.values)
+    forces = [p for p in model.structure.parameters if p.unit == "kg" or p.unit[:1] == "N"]
+    return model.with_values({p.name: model.values[p.name] * stiffness / own for p in forces})
+
+
 def loop_starts(model: Model) -> list[dict[str, float]]:
     """Return starting values for the hysteresis, scaled to the model's k_L."""
     k_l = model.values["k_L"]

@@ -1,0 +1,42 @@
+"""The same device once more: another voltage and fresh noise, or a voltage that was designed."""
+
+from pathlib import Path
+
+import numpy as np
+
+from tests.plants.base import simulate_base
+from tests.plants.excitations import draw_excitation
+from tests.plants.hide import effect_called
+from tests.plants.make import Truth, write_csv
+from tests.plants.noise import disturb
+from tests.plants.stack import FloatArray
+
+
+def play_again(
+    truth: Truth,
+    seed: int,
+    path: Path,
+    played: tuple[FloatArray, FloatArray] | None = None,
+) -> FloatArray:
+    """Write a further record of a device and return its displacement without noise, (N,) [m].
+
+    `truth` is the device: its stack, its effects with their gains, the kind of its noise. `played`
+    are uniform times (N,) [s] and commands (N,) [V], beginning at 0 V; else a voltage of the class
+    of the first record is drawn. The seed decides what is drawn, and the noise.
+    """
+    rng = np.random.default_rng([seed, 2])
+    times, command = played or draw_excitation(rng, truth.excitation, truth.stack.u_rated)
+    run = simulate_base(truth.stack, times, command)
+    clean, temperature = run.displacement, None
+    parts = [] if truth.effect is None else [(truth.effect, truth.parameters, truth.gain)]
+    if truth.second is not None:
+        second = truth.second
+        parts.append((second.effect.name, second.parameters, second.gain))
+    for name, parameters, gain in parts:
+        effect = effect_called(name)
+        clean = clean + effect.contribution(run, parameters, gain)
+        if effect.room is not None:
+            temperature = effect.room(times, parameters)
+    read, _ = disturb(rng, truth.noise, clean)
+    write_csv(path, times, command, read, temperature)
+    return clean

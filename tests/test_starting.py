@@ -1,0 +1,51 @@
+"""The scale of force that a fit starts with: a data sheet gives it, no displacement shows it."""
+
+import numpy as np
+import pytest
+
+from psa_casadi.components import SIMPLIFIED
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment import Record
+from psa_casadi.identification.starting import chosen_start, with_stiffness
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.variables import Provenance
+
+TIME = np.linspace(0.0, 0.02, 400)
+VOLTAGE = 50.0 * (1.0 - np.cos(2 * np.pi * 100.0 * TIME))
+RECORD = Record("r", TIME, VOLTAGE, 1e-7 * VOLTAGE)
+
+
+def _extended() -> Model:
+    names = ("structural_mode", "hysteresis_memory", "load_stiffness", "slow_creep")
+    stack = stack_model("P-885.51")
+    model = stack.with_components((*stack.components, *(EFFECTS[n] for n in names)))
+    return model.with_values({str(c.gain): 0.05 for c in model.effects})
+
+
+@pytest.mark.parametrize(
+    "model", [_extended(), compose(SIMPLIFIED)], ids=["extended cascade", "one mass"]
+)
+def test_another_stiffness_changes_forces_and_no_displacement(model: Model) -> None:
+    own = "k_B" if "k_B" in model.values else "k"
+    moved = with_stiffness(model, 3.0 * model.values[own])
+    assert moved.values[own] == pytest.approx(3.0 * model.values[own])
+    before, after = simulate(model, TIME, VOLTAGE), simulate(moved, TIME, VOLTAGE)
+    size = np.ptp(before.displacement)
+    assert np.max(np.abs(after.displacement - before.displacement)) < 1e-6 * size
+    ratio = np.ptp(after.outputs["blocked_force"]) / np.ptp(before.outputs["blocked_force"])
+    assert ratio == pytest.approx(3.0, rel=1e-4)
+
+
+def test_a_start_says_whether_its_force_scale_is_known() -> None:
+    stack = stack_model("P-885.51")
+    assumed = stack.with_values({}, provenance=Provenance(force_scale="assumed"))
+    given = stack.with_values({}, provenance=Provenance(force_scale="given"))
+    assert chosen_start([RECORD], None, None)[1] is False
+    assert chosen_start([RECORD], None, 6e7)[1] is True
+    assert chosen_start([RECORD], assumed, None) == (assumed, False)
+    assert chosen_start([RECORD], given, None) == (given, True)
+    both, known = chosen_start([RECORD], assumed, 6e7)
+    assert known
+    assert both.values["k_B"] == pytest.approx(6e7)
