@@ -43,7 +43,9 @@ def gain_table(known: Sequence[str], first: int, progress: Progress) -> TitledTa
     """Diagnose one record with each effect and compare its gain with that of further records."""
     found: list[Covered] = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [pool.submit(covered, effect, first) for effect in known]
+        jobs = [
+            pool.submit(covered, effect, first + 100 * k) for k, effect in enumerate(known, start=1)
+        ]
         for job in as_completed(jobs):
             one = job.result()
             if one is not None:

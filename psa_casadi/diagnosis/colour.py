@@ -38,7 +38,7 @@ class Colour:
 
     def whiten(self, signal: FloatArray) -> FloatArray:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
-        if not any(a.size for a in self.autoregression):
+        if not signal.size or not any(a.size for a in self.autoregression):
             return signal
         white = signal.copy()
         first = 0

@@ -56,14 +56,15 @@ def gain_of(
     base: Sequence[FloatArray],
     extended: Sequence[FloatArray],
 ) -> Gain:
-    """Return the reduction of the held-out rms, with a t-interval on the logarithm of the ratio.
+    """Return the reduction of the held-out rms, with a jackknife interval of the errors' ratio.
 
-    The interval runs over the held-out experiments where there are at least four, else over eight
-    blocks of the held-out samples.
+    With L the logarithm of the ratio over all parts and L_i that without part i of k, the interval
+    is L +- t_(k-1) sqrt((k-1)/k sum (L_i - mean)^2) (Efron and Tibshirani 1993, chapter 11). The
+    parts are the held-out experiments where there are at least four, else eight blocks of the
+    held-out samples.
     """
     before = held_out_residuals(experiments, base)
     after = held_out_residuals(experiments, extended)
-    ratio = rms(np.concatenate(after)) / max(rms(np.concatenate(before)), 1e-300)
     pairs = [(b, a) for b, a in zip(before, after, strict=True) if len(b)]
     if len(pairs) < 4:
         pairs = [
@@ -74,18 +75,21 @@ def gain_of(
             )
             if len(b)
         ]
-    logs = np.array([np.log(max(rms(a), 1e-300) / max(rms(b), 1e-300)) for b, a in pairs])
-    half = 0.0
-    if len(logs) > 1:
-        half = float(stats.t.ppf(0.975, len(logs) - 1) * np.std(logs, ddof=1) / np.sqrt(len(logs)))
-    centre = float(np.log(ratio))
-    return Gain(
-        100.0 * (1.0 - ratio),
-        (
-            100.0 * (1.0 - float(np.exp(centre + half))),
-            100.0 * (1.0 - float(np.exp(centre - half))),
-        ),
-    )
+    sums = np.array([[float(b @ b), float(a @ a)] for b, a in pairs]).reshape(-1, 2)
+    centre = _log_ratio(np.sum(sums, axis=0))
+    half, k = 0.0, len(sums)
+    if k > 1:
+        without = np.array([_log_ratio(np.sum(np.delete(sums, i, 0), axis=0)) for i in range(k)])
+        spread = float(np.sqrt((k - 1) * np.var(without)))
+        half = float(stats.t.ppf(0.975, k - 1)) * spread
+    low, high = (100.0 * (1.0 - float(np.exp(centre + side * half))) for side in (1.0, -1.0))
+    return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high))
+
+
+def _log_ratio(sums: FloatArray) -> float:
+    """Logarithm of the errors' ratio [-], from their sums of squares before and after [m^2]."""
+    before, after = (max(float(s), 1e-300) for s in sums)
+    return 0.5 * float(np.log(after / before))
 
 
 def rms(values: FloatArray) -> float:

@@ -1,0 +1,108 @@
+"""The parts of the method that its negative controls leave out, and how controls are counted."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psa_casadi.bench.hidden_cases import Case, Found
+from psa_casadi.bench.hidden_controls import CONTROLS, control_table
+from psa_casadi.components import BASE
+from psa_casadi.diagnosis.evidence import bic_probabilities
+from psa_casadi.diagnosis.rounds import examine
+from psa_casadi.diagnosis.task import Method, Task
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment import Record
+from psa_casadi.experiment.split import Experiment, split
+from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.model.compose import compose
+from psa_casadi.simulation.simulate import simulate
+
+NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Fit, tuple[Experiment, ...]]:
+    """A short record with a drift that the base lacks."""
+    time = np.linspace(0.0, 2.0, 600)
+    voltage = 40.0 * (1.0 - np.cos(2 * np.pi * time))
+    model = compose(BASE)
+    clean = simulate(model, time, voltage).displacement
+    noise = 2e-3 * np.ptp(clean) * np.random.default_rng(4).standard_normal(time.size)
+    bent = 0.02 * np.ptp(clean) * (time / time[-1]) ** 2
+    experiments = (split(Record("r", time, voltage, clean + bent + noise)),)
+    return fit(model, experiments, ["k_L"], sigma=[float(np.std(noise))]), experiments
+
+
+def _round(fitted: tuple[Fit, tuple[Experiment, ...]], method: Method) -> dict[str, float]:
+    found, experiments = fitted
+    table = tuple(EFFECTS[n] for n in NAMES)
+    task = Task(experiments, table, method)
+    current = examine(found, tuple(found.predicted(experiments)), task)
+    scores = {n: s.decrease for n, s in current.screening.best_by_effect().items()}
+    return {**scores, "correlation": float(np.sum(current.screening.colour.autoregression[0]))}
+
+
+def test_without_finite_steps_an_effect_with_a_threshold_is_not_seen(
+    fitted: tuple[Fit, tuple[Experiment, ...]],
+) -> None:
+    assert "current_limit" in _round(fitted, Method())
+    assert "current_limit" not in _round(fitted, Method(finite_steps=False))
+
+
+def test_the_residual_alone_takes_what_is_missing_for_the_colour_of_noise(
+    fitted: tuple[Fit, tuple[Experiment, ...]],
+) -> None:
+    own, alone = _round(fitted, Method()), _round(fitted, Method(whiten_from="residual"))
+    assert alone["correlation"] > own["correlation"] + 0.3
+    assert alone["slow_creep"] < 0.5 * own["slow_creep"]
+
+
+def test_bic_weights_are_those_of_the_criterion(
+    fitted: tuple[Fit, tuple[Experiment, ...]],
+) -> None:
+    """Two fits of one model that differ by a tenth of the residual: exp(-BIC/2) in closed form."""
+    found, experiments = fitted
+    task = Task(experiments, (), Method())
+    colour = examine(found, tuple(found.predicted(experiments)), task).screening.colour
+    better = replace(found, residuals=0.99 * found.residuals)
+    weights = bic_probabilities(found, {"as before": found, "better": better}, colour)
+    odds = np.exp(-len(found.residuals) * np.log(0.99))
+    assert weights["better"] == pytest.approx(odds / (1.0 + odds))
+    assert sum(weights.values()) == pytest.approx(1.0)
+
+
+def _found(effect: str, named: tuple[str, ...], kind: str = "known") -> Found:
+    case = Case(kind, effect, 1)  # type: ignore[arg-type]  # the kinds below are those it knows
+    return Found(
+        case,
+        1.0,
+        "cause_named" if named else "unexplained",
+        named,
+        named,
+        (),
+        0.9,
+        {},
+        {},
+        1.0,
+        1.0,
+    )
+
+
+def test_shuffled_labels_and_weaker_methods_show_in_the_table() -> None:
+    right = [_found(n, (n,)) for n in NAMES] + [_found("dry_friction", (), "foreign")]
+    misled = {n: _found(n, ("backlash",)) for n in NAMES}
+    asked: list[Method] = []
+
+    def diagnose_all(cases: Sequence[Case], method: Method) -> list[Found]:
+        asked.append(method)
+        return [misled.get(str(c.effect), _found(str(c.effect), (), c.kind)) for c in cases]
+
+    table = control_table(right, 1, diagnose_all).table
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert rows["the method"] == ("3 of 3", "3 of 3", "0 of 4", "90 %, 100 %")
+    assert rows["shuffled labels"] == ("0 of 3", "0 of 3", "3 of 3", "90 %, 0 %")
+    assert asked == list(CONTROLS.values())
+    for name in CONTROLS:
+        assert rows[name] == ("0 of 3", "0 of 3", "3 of 4", "90 %, 0 %")
