@@ -4,7 +4,8 @@
 
 fmi2Status fmi2EnterEventMode(fmi2Component c) {
     ENTER(PSA_CALL_ENTER_EVENT);
-    MOVE_TO(PSA_EVENT);
+    psa_enter_event(core);
+    return fmi2OK;
 }
 
 fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
@@ -14,14 +15,13 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
     info->terminateSimulation = fmi2False;
     info->nominalsOfContinuousStatesChanged = fmi2False;
     info->valuesOfContinuousStatesChanged = fmi2False;
-    info->nextEventTimeDefined = fmi2False;
-    info->nextEventTime = 0.0;
+    info->nextEventTimeDefined = psa_next_event(core, &info->nextEventTime);
     return psa_fmi2_status(psa_update_events(core));
 }
 
 fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) {
     ENTER(PSA_CALL_ENTER_CONTINUOUS);
-    MOVE_TO(PSA_CONTINUOUS);
+    return psa_fmi2_status(psa_enter_continuous(core));
 }
 
 fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean noSetFMUStatePriorToCurrentPoint,

@@ -7,7 +7,8 @@ fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
     if (core->state.interface == PSA_CO_SIMULATION && !((psa_component3 *)instance)->event_mode_used)
         return psa_fmi3_status(
             psa_say(core, PSA_ERROR, "%s: this instance was made without event mode.", __func__));
-    MOVE_TO(PSA_EVENT);
+    psa_enter_event(core);
+    return fmi3OK;
 }
 
 fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance) {
@@ -15,7 +16,7 @@ fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance) {
     return fmi3OK;
 }
 
-/* The model has no discrete states: an event changes the inputs and nothing in here. */
+/* Sampled states follow the inputs at an instant until event mode is left; nothing is left to repeat. */
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *needUpdate,
                                     fmi3Boolean *terminate, fmi3Boolean *nominalsChanged,
                                     fmi3Boolean *valuesChanged, fmi3Boolean *nextEventTimeDefined,
@@ -28,14 +29,13 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *needUpda
     *terminate = fmi3False;
     *nominalsChanged = fmi3False;
     *valuesChanged = fmi3False;
-    *nextEventTimeDefined = fmi3False;
-    *nextEventTime = 0.0;
+    *nextEventTimeDefined = psa_next_event(core, nextEventTime) != 0;
     return psa_fmi3_status(psa_update_events(core));
 }
 
 fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
     ENTER(PSA_CALL_ENTER_CONTINUOUS);
-    MOVE_TO(PSA_CONTINUOUS);
+    return psa_fmi3_status(psa_enter_continuous(core));
 }
 
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
@@ -93,7 +93,7 @@ fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *count) 
 
 fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *count) {
     ENTER(PSA_CALL_COUNT_VECTORS);
-    return tell(core, count, PSA_NX);
+    return tell(core, count, PSA_STATES);
 }
 
 fmi3Status fmi3EnterStepMode(fmi3Instance instance) {
@@ -135,7 +135,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 point, fmi3Float64 size
     int early = 0;
     const psa_result result = psa_do_step(
         core, point, size, ((psa_component3 *)instance)->update ? intermediate : NULL, &early);
-    *eventHandlingNeeded = fmi3False;
+    *eventHandlingNeeded = ((psa_component3 *)instance)->event_mode_used && core->state.at_instant;
     *terminateSimulation = fmi3False;
     *earlyReturn = early != 0;
     *lastSuccessfulTime = core->state.solver.t;

@@ -7,9 +7,9 @@
 #include "model.h"
 
 /* Value references count through the variables: time, then states, their derivatives, inputs, outputs,
-   parameters and event indicators, each in the order of the model's vectors. */
+   parameters, event indicators and sampled states, each in the order of the model's vectors. */
 #define PSA_FIRST_STATE 1
-#define PSA_VARIABLES (1 + 2 * PSA_NX + PSA_NU + PSA_NY + PSA_NP + PSA_NZ)
+#define PSA_VARIABLES (1 + 2 * PSA_STATES + PSA_NU + PSA_NY + PSA_NP + PSA_NZ + PSA_NS)
 
 typedef enum {
     PSA_TIME,
@@ -18,7 +18,8 @@ typedef enum {
     PSA_INPUT,
     PSA_OUTPUT,
     PSA_PARAMETER,
-    PSA_INDICATOR
+    PSA_INDICATOR,
+    PSA_SAMPLED
 } psa_kind;
 
 typedef struct {
@@ -33,7 +34,7 @@ extern const char psa_model_identifier[];
 extern const psa_variable psa_variables[PSA_VARIABLES]; /* indexed by value reference */
 extern const double psa_start_states[PSA_NX + 1];
 extern const double psa_start_inputs[PSA_NU + 1];
-extern const double psa_start_parameters[PSA_NP + 1];
+extern const double psa_start_parameters[PSA_HELD + 1]; /* behind them the sampled states */
 extern const double psa_state_nominals[PSA_NX + 1];
 /* What the states' nominal values move each switch by: the size of its noise at a tolerance of 1. */
 extern const double psa_switch_scales[PSA_NZ + 1];

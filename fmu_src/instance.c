@@ -3,6 +3,8 @@
 #include <math.h>
 #include <string.h>
 
+#include "instants.h"
+
 #define DEFAULT_TOLERANCE 1e-6
 #define LOOSEST_TOLERANCE 1e-2
 /* The solver bounds the error of one step. What an importer means is the error of the trajectory, which
@@ -100,6 +102,7 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
     state->phase = PSA_INSTANTIATED;
     state->interface = interface;
+    psa_schedule(instance);
     instance->fresh = 0;
 }
 
@@ -119,6 +122,7 @@ psa_result psa_setup(psa_instance *instance, int tolerance_defined, double toler
     state->input.origin = start;
     state->stop_defined = stop_defined;
     state->stop_time = stop_defined ? stop : 0.0;
+    psa_schedule(instance);
     instance->fresh = 0;
     return PSA_FINE;
 }
@@ -144,18 +148,20 @@ static void look(void *owner, double *t_end) {
     psa_instance *const instance = owner;
     psa_state *const state = &instance->state;
     const double now = state->solver.t;
-    double end = *t_end;
+    double end = instance->goal;
     carry_input(state);
     instance->fresh = 0;
     const psa_input input = state->input;
     state->phase = PSA_INTERMEDIATE;
-    const int early = instance->update(instance->owner, now, now < *t_end, &end);
+    const int early = instance->update(instance->owner, now, now < instance->goal, &end);
     state->phase = PSA_STEP_COMPLETE;
     if (early && !(end > now)) end = now;
-    if (now < *t_end && memcmp(&input, &state->input, sizeof input)) state->last.kind = PSA_STEP_VARIED;
-    if (!early || !(end < *t_end)) return;
+    if (now < instance->goal && memcmp(&input, &state->input, sizeof input))
+        state->last.kind = PSA_STEP_VARIED;
+    if (!early || !(end < instance->goal)) return;
     if (end > now) state->last.kind = PSA_STEP_VARIED;
-    *t_end = end;
+    instance->goal = end;
+    *t_end = fmin(*t_end, end);
 }
 
 /* Keep what the coming communication step starts from, for its sensitivities. */
@@ -168,21 +174,41 @@ static void remember(psa_state *state, double target) {
     last->kind = PSA_STEP_KNOWN;
 }
 
-static psa_result advance(psa_instance *instance, double target) {
+/* Run the solver to the goal of the communication step, with stops at the sample instants before it. */
+static psa_status run_solver(psa_instance *instance) {
     psa_state *const state = &instance->state;
     psa_solver *const solver = &state->solver;
     const psa_watch watch = {look, instance};
+    for (;;) {
+        const double period = state->p[PSA_PERIOD];
+        const int stop = PSA_NS > 0 && !psa_reached(state->next_instant, instance->goal, period);
+        const double end = stop ? state->next_instant : instance->goal;
+        const psa_status status = psa_solver_advance(solver, &instance->work, end, &state->input,
+                                                     state->p, NULL, instance->update ? &watch : NULL);
+        carry_input(state);
+        instance->fresh = 0;
+        if (status != PSA_OK) return status;
+        if (!stop || psa_reached(solver->t, instance->goal, period)) return PSA_OK;
+        if (psa_sample_within(instance) != PSA_FINE) return PSA_NOT_FINITE;
+    }
+}
+
+static psa_result advance(psa_instance *instance, double target) {
+    psa_state *const state = &instance->state;
+    psa_solver *const solver = &state->solver;
     const double begin = solver->t;
+    const int sampled = PSA_NS > 0 && state->at_instant;
     const int64_t steps = solver->steps, rejected = solver->rejected;
     for (int i = 0; i < PSA_NU; ++i)
         if (!state->rate_given[i]) state->input.rate[i] = 0.0;
     state->input.origin = begin;
+    if (psa_leave_instant(instance) != PSA_FINE) return PSA_DISCARD;
     remember(state, target);
-    const psa_status status = psa_solver_advance(solver, &instance->work, target, &state->input,
-                                                 state->p, NULL, instance->update ? &watch : NULL);
-    carry_input(state);
+    if (sampled) state->last.kind = PSA_STEP_SAMPLED;
+    instance->goal = target;
+    const psa_status status = run_solver(instance);
     memset(state->rate_given, 0, sizeof state->rate_given);
-    instance->fresh = 0;
+    psa_arrive(instance);
     psa_whisper(instance, "Step from %.9g s to %.9g s: %ld solver steps, %ld rejected.", begin, solver->t,
             (long)(solver->steps - steps), (long)(solver->rejected - rejected));
     if (status == PSA_OK) return PSA_FINE;
@@ -191,7 +217,8 @@ static psa_result advance(psa_instance *instance, double target) {
     return psa_say(instance, PSA_DISCARD,
                    "The step from %.9g s to %.9g s stopped at %.9g s in state '%s': %s. Likely an input"
                    " or a parameter is far from its physical range, or the tolerance is too tight.",
-                   begin, target, solver->t, psa_variables[PSA_FIRST_STATE + solver->culprit].name,
+                   begin, target, solver->t,
+                   PSA_STATES > 0 ? psa_variables[PSA_FIRST_STATE + solver->culprit].name : "sampled",
                    reason(status));
 }
 

@@ -60,13 +60,14 @@ typedef enum {
     PSA_NO_STEP = 0,
     PSA_STEP_KNOWN = 1,
     PSA_STEP_VARIED = 2, /* the importer changed inputs or the end within the step */
-    PSA_STEP_BROKEN = 3  /* it failed */
+    PSA_STEP_BROKEN = 3, /* it failed */
+    PSA_STEP_SAMPLED = 4 /* a sample instant fell into it */
 } psa_step_kind;
 
 typedef struct {
     psa_solver solver;
     psa_input input;
-    double p[PSA_NP + 1];
+    double p[PSA_HELD + 1];
     double target; /* end that the importer asked for */
     int64_t kind;  /* psa_step_kind */
 } psa_last_step;
@@ -76,13 +77,18 @@ typedef struct {
 typedef struct {
     psa_solver solver; /* time and continuous states live here, in model exchange too */
     psa_input input;
-    double p[PSA_NP + 1];
+    double p[PSA_HELD + 1];
     psa_last_step last;
     int64_t rate_given[PSA_NU + 1]; /* the importer gave this input's rate for the next step */
     /* An event indicator is facing * switch + margin. Facing changes its sign at an event, so that the
        noise of an importer's solver about a held input makes no further ones. */
     double facing[PSA_NZ + 1];
     double event_margin; /* share of psa_switch_scales */
+    /* Sampled states: while the present time is an instant, those in p follow from those before it and
+       from the inputs of now, which an importer may still set. They are kept when time moves on. */
+    double before[PSA_NS + 1];
+    double next_instant; /* the first one that has not been reached */
+    int64_t at_instant;
     double stop_time;
     int64_t stop_defined;
     int64_t phase;     /* psa_phase */
@@ -102,6 +108,7 @@ typedef struct {
     double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1]; /* valid while `fresh` */
     int fresh;
     psa_update *update; /* during a communication step; may be NULL */
+    double goal;        /* end of that step */
     psa_reporter *report; /* may be NULL */
     void *owner;
     void *(*allocate)(size_t count, size_t size);
@@ -131,6 +138,24 @@ psa_result psa_do_step(psa_instance *instance, double point, double size, psa_up
                        int *early);
 /* Why an instance of this name and token cannot be made, or NULL. */
 const char *psa_objection(const char *name, const char *token);
+
+/* sampling.c: sampled states between their instants. In co-simulation the instant at a communication
+   point belongs to the step that starts there, and outputs are read as if it had happened. */
+/* The present time is where the instance starts; the period may have changed. */
+void psa_schedule(psa_instance *instance);
+/* The present time is an instant if the next one has been reached. */
+void psa_arrive(psa_instance *instance);
+/* Put the sampled states to their values after an instant at the present time, if it is one. */
+psa_result psa_sample_now(psa_instance *instance);
+/* Time moves on from here. */
+psa_result psa_leave_instant(psa_instance *instance);
+/* An instant within a communication step. */
+psa_result psa_sample_within(psa_instance *instance);
+/* Enter event mode, or continuous-time mode. */
+void psa_enter_event(psa_instance *instance);
+psa_result psa_enter_continuous(psa_instance *instance);
+/* 1 and the time of the next instant, or 0 if the model has none. */
+int psa_next_event(const psa_instance *instance, double *time);
 
 /* values.c: variables by value reference, vectors of model exchange, rates */
 /* The variable of a value reference, or NULL and a report. */
@@ -175,7 +200,7 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
 
 /* One number for each variable that can be known: a direction, or a gradient. */
 typedef struct {
-    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_NP + 1];
+    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1];
 } psa_knowns;
 
 /* Change of the states at the end of the last communication step along each direction: moved is

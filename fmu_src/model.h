@@ -5,6 +5,12 @@
 
 #include "model_config.h"
 
+/* The vectors have PSA_NX states, PSA_NU inputs, PSA_NY outputs and PSA_HELD numbers that are constant
+   over a step: PSA_NP parameters and behind them, in p too, PSA_NS sampled states, which change at the
+   instants k * p[PSA_PERIOD] only. A model that has nothing but sampled states (PSA_STATES is 0) has one
+   state in here that stays as it is. */
+#define PSA_HELD (PSA_NP + PSA_NS)
+
 /* x' = f(t, x, u, p) */
 int psa_model_ode(double t, const double *x, const double *u, const double *p, double *xdot);
 /* df/dx, column-major, PSA_NX by PSA_NX */
@@ -13,6 +19,8 @@ int psa_model_jacobian(double t, const double *x, const double *u, const double 
 int psa_model_outputs(double t, const double *x, const double *u, const double *p, double *y);
 /* z, PSA_NZ values: f has a kink where one of them is zero */
 int psa_model_switches(double t, const double *x, const double *u, const double *p, double *z);
+/* The sampled states after an instant, PSA_NS values, from those before it at the end of p. */
+int psa_model_sample(double t, const double *x, const double *u, const double *p, double *sampled);
 
 #ifdef PSA_WITH_SENSITIVITIES
 /* df/dx and df/dp, column-major */

@@ -45,6 +45,19 @@ int psa_model_switches(double t, const double *x, const double *u, const double 
     return call(psa_switches, t, x, u, p, z, NULL);
 }
 
+#if PSA_NS > 0
+casadi_function psa_sample;
+
+int psa_model_sample(double t, const double *x, const double *u, const double *p, double *sampled) {
+    return call(psa_sample, t, x, u, p, sampled, NULL);
+}
+#else
+int psa_model_sample(double t, const double *x, const double *u, const double *p, double *sampled) {
+    (void)t, (void)x, (void)u, (void)p, (void)sampled;
+    return 0;
+}
+#endif
+
 #ifdef PSA_WITH_SENSITIVITIES
 casadi_function psa_sensitivity, psa_output_sensitivity;
 

@@ -5,12 +5,14 @@
 
 /* psa_state without gaps: otherwise its bytes would depend on the platform. Does not compile if there are. */
 #define WORDS_OF_POINT \
-    ((12 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_NP + 1)) /* solver, input, parameters */
+    ((12 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_HELD + 1)) /* solver, input, parameters */
 typedef char psa_state_has_no_gaps
-    [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + 5) ? 1 : -1];
+    [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + (PSA_NS + 1) + 7)
+         ? 1
+         : -1];
 
 /* Raise it whenever psa_state or psa_solver changes its meaning. */
-#define SNAPSHOT_VERSION 3u
+#define SNAPSHOT_VERSION 4u
 
 /* In front of the bytes of a psa_state: who wrote them, and whether they arrived whole. A machine of
    another byte order or struct layout fails the comparison of version or size. */

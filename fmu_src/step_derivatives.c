@@ -32,6 +32,10 @@ static void stop_there(void *owner, double *t_end) {
 
 static psa_result refuse(psa_instance *instance) {
     const int failed = instance->state.last.kind == PSA_STEP_BROKEN;
+    if (instance->state.last.kind == PSA_STEP_SAMPLED)
+        return psa_say(instance, PSA_DISCARD,
+                       "The sensitivity of the last step is not known, because a sample instant fell into"
+                       " it; take a step between two instants.");
     return psa_say(instance, PSA_DISCARD,
                    "The sensitivity of the last step is not known, because %s; take a step from the start"
                    " of it %s.",

@@ -2,17 +2,20 @@
 
 #include <string.h>
 
-/* Write one sample; d y/d theta = dg/dx s + dg/dp. Returns 0, or 1 when the model failed. */
-static int write_sample(psa_trajectory *run, const psa_solver *solver, const psa_sensitivities *sens,
-                        long sample) {
+#include "instants.h"
+
+/* Write one sample; d y/d theta = dg/dx s + dg/dp. Returns 0, or 1 when the model failed. `p` has the
+   sampled states behind the parameters. */
+static int write_sample(psa_trajectory *run, const psa_solver *solver, const double *p,
+                        const psa_sensitivities *sens, long sample) {
     const double *u = run->u + sample * PSA_NU;
     if (run->x) memcpy(run->x + sample * PSA_NX, solver->x, sizeof solver->x);
-    if (run->y && psa_model_outputs(solver->t, solver->x, u, run->p, run->y + sample * PSA_NY))
-        return 1;
+    if (run->z) memcpy(run->z + sample * PSA_NS, p + PSA_NP, sizeof(double) * PSA_NS);
+    if (run->y && psa_model_outputs(solver->t, solver->x, u, p, run->y + sample * PSA_NY)) return 1;
 #ifdef PSA_WITH_SENSITIVITIES
     if (run->count > 0) {
         double jac[PSA_NY * PSA_NX], param[PSA_NY * PSA_NP];
-        if (psa_model_output_sensitivity(solver->t, solver->x, u, run->p, jac, param)) return 1;
+        if (psa_model_output_sensitivity(solver->t, solver->x, u, p, jac, param)) return 1;
         for (int c = 0; c < run->count; ++c) {
             double sum = run->which[c] >= 0 ? param[run->output + run->which[c] * PSA_NY] : 0.0;
             for (int i = 0; i < PSA_NX; ++i)
@@ -57,12 +60,56 @@ static void set_input(const psa_trajectory *run, long sample, psa_input *input) 
     }
 }
 
+/* The sampled states of a trajectory: they stand behind the parameters in p. */
+typedef struct {
+    double p[PSA_HELD + 1];
+    double next; /* time of the next instant */
+} psa_held;
+
+static int sample_at(psa_solver *solver, const double *u, psa_held *held) {
+    if (psa_take_sample(solver->t, solver->x, u, held->p)) return PSA_NOT_FINITE;
+    held->next = psa_instant_after(solver->t, held->p[PSA_PERIOD]);
+    psa_solver_invalidate(solver);
+    return PSA_OK;
+}
+
+/* The sampled states before the first time, and after an instant at that time. */
+static int start_held(const psa_trajectory *run, psa_solver *solver, psa_held *held) {
+    memset(held, 0, sizeof *held);
+    memcpy(held->p, run->p, sizeof(double) * PSA_NP);
+    if (PSA_NS == 0) return PSA_OK;
+    memcpy(held->p + PSA_NP, run->z0, sizeof(double) * PSA_NS);
+    held->next = psa_instant_after(solver->t, held->p[PSA_PERIOD]);
+    if (!psa_at_instant(solver->t, held->p[PSA_PERIOD])) return PSA_OK;
+    return sample_at(solver, run->u, held);
+}
+
+/* Integrate over one interval between samples; steps end at the instants inside. One at its end is taken
+   with the next sample's input, which is the one after a jump where the input is held. */
+static int next_sample(const psa_trajectory *run, psa_solver *solver, psa_work *work, psa_held *held,
+                       psa_sensitivities *sens, long sample) {
+    const double end = run->t[sample + 1], period = held->p[PSA_PERIOD];
+    double u[PSA_NU + 1];
+    psa_input input;
+    set_input(run, sample, &input);
+    while (PSA_NS > 0 && !psa_reached(held->next, end, period)) {
+        int status = (int)psa_solver_advance(solver, work, held->next, &input, held->p, sens, NULL);
+        if (status != PSA_OK) return status;
+        psa_input_at(&input, solver->t, u);
+        status = sample_at(solver, u, held);
+        if (status != PSA_OK) return status;
+    }
+    const int status = (int)psa_solver_advance(solver, work, end, &input, held->p, sens, NULL);
+    if (status != PSA_OK || PSA_NS == 0 || !psa_reached(end, held->next, period)) return status;
+    return sample_at(solver, run->u + (sample + 1) * PSA_NU, held);
+}
+
 int psa_run(psa_trajectory *run) {
     psa_solver solver;
     psa_work work;
-    psa_input input;
+    psa_held held;
     psa_sensitivities sens = {0}, *carried = NULL;
-    int status = PSA_OK;
+    int status;
     psa_solver_start(&solver, run->t[0], run->x0, run->nominal, run->rtol);
     solver.max_step = run->max_step;
     solver.steps_limit = run->steps_limit;
@@ -78,11 +125,11 @@ int psa_run(psa_trajectory *run) {
         memcpy(sens.s, run->s0, sizeof(double) * (size_t)size);
         carried = &sens;
     }
-    if (write_sample(run, &solver, carried, 0)) status = PSA_NOT_FINITE;
+    status = start_held(run, &solver, &held);
+    if (status == PSA_OK && write_sample(run, &solver, held.p, carried, 0)) status = PSA_NOT_FINITE;
     for (long sample = 0; sample + 1 < run->samples && status == PSA_OK; ++sample) {
-        set_input(run, sample, &input);
-        status = (int)psa_solver_advance(&solver, &work, run->t[sample + 1], &input, run->p, carried, NULL);
-        if (status == PSA_OK && write_sample(run, &solver, carried, sample + 1))
+        status = next_sample(run, &solver, &work, &held, carried, sample);
+        if (status == PSA_OK && write_sample(run, &solver, held.p, carried, sample + 1))
             status = PSA_NOT_FINITE;
     }
     run->steps = (long)solver.steps;

@@ -17,13 +17,15 @@ typedef struct {
     int zero_order_hold;    /* 1: the input is constant between samples, 0: linear */
     const double *p;        /* [PSA_NP] */
     const double *x0;       /* [PSA_NX] */
+    const double *z0;       /* [PSA_NS] sampled states before the first instant */
     const double *nominal;  /* [PSA_NX] */
     double rtol;
     double max_step;
     long steps_limit;       /* between two samples; 0: 10 million */
     double *x;              /* [samples][PSA_NX] or NULL */
+    double *z;              /* [samples][PSA_NS] or NULL: after an instant, if there is one */
     double *y;              /* [samples][PSA_NY] or NULL */
-    int count;              /* unknowns of the sensitivities, 0: none */
+    int count;              /* unknowns of the sensitivities, 0: none; with sampled states always 0 */
     const int *which;       /* [count] parameter index, -1: initial value */
     const double *s0;       /* [PSA_NX][count] d x0 / d theta */
     int output;             /* output whose sensitivity is wanted */

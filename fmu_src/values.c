@@ -7,6 +7,8 @@ psa_result psa_refresh(psa_instance *instance) {
     const psa_state *const state = &instance->state;
     double u[PSA_NU + 1];
     if (instance->fresh) return PSA_FINE;
+    const psa_result result = psa_sample_now(instance);
+    if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.t, u);
     if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
         psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y) ||
@@ -27,6 +29,12 @@ const psa_variable *psa_variable_of(psa_instance *instance, unsigned vr) {
     return NULL;
 }
 
+/* Until the initialization is over a sampled state is its start value. */
+static double sampled_value(const psa_state *state, int index) {
+    const int starting = (state->phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)) != 0;
+    return starting && state->at_instant ? state->before[index] : state->p[PSA_NP + index];
+}
+
 static double value_of(const psa_instance *instance, const psa_variable *v) {
     switch (v->kind) {
     case PSA_TIME: return instance->state.solver.t;
@@ -35,6 +43,7 @@ static double value_of(const psa_instance *instance, const psa_variable *v) {
     case PSA_INPUT: return instance->state.input.value[v->index];
     case PSA_OUTPUT: return instance->y[v->index];
     case PSA_INDICATOR: return instance->z[v->index];
+    case PSA_SAMPLED: return sampled_value(&instance->state, v->index);
     default: return instance->state.p[v->index];
     }
 }
@@ -45,7 +54,8 @@ psa_result psa_get(psa_instance *instance, const unsigned *vr, size_t count, dou
     for (size_t i = 0; i < count; ++i) {
         const psa_variable *const v = psa_variable_of(instance, vr[i]);
         if (!v) return PSA_ERROR;
-        if (v->kind == PSA_DERIVATIVE || v->kind == PSA_OUTPUT || v->kind == PSA_INDICATOR) {
+        if (v->kind == PSA_DERIVATIVE || v->kind == PSA_OUTPUT || v->kind == PSA_INDICATOR ||
+            v->kind == PSA_SAMPLED) {
             result = psa_refresh(instance);
             if (result != PSA_FINE) return result;
         }
@@ -67,11 +77,15 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
     if (instance->state.phase == PSA_INTERMEDIATE && v->kind != PSA_INPUT)
         return psa_say(instance, PSA_ERROR,
                        "'%s' cannot be set in an intermediate update, only inputs can.", v->name);
-    if (v->kind == PSA_STATE && instance->state.interface == PSA_CO_SIMULATION &&
+    if ((v->kind == PSA_SAMPLED ||
+         (v->kind == PSA_STATE && instance->state.interface == PSA_CO_SIMULATION)) &&
         !(instance->state.phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)))
         return psa_say(instance, PSA_ERROR,
                        "State '%s' can be set only before the first step.", v->name);
-    if (v->kind != PSA_STATE && v->kind != PSA_INPUT && v->kind != PSA_PARAMETER)
+    if (PSA_NS > 0 && v->kind == PSA_PARAMETER && v->index == PSA_PERIOD && value < v->low)
+        return psa_say(instance, PSA_ERROR, "The sample period '%s' cannot be set to %g, below %g.",
+                       v->name, value, v->low);
+    if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT && v->kind != PSA_PARAMETER)
         return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be set.", v->name);
     if (value < v->low || value > v->high)
         return psa_say(instance, PSA_WARNING, "'%s' is set to %g, outside its interval [%g, %g].",
@@ -79,14 +93,17 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
     return PSA_FINE;
 }
 
-static void set_one(psa_state *state, const psa_variable *v, double value) {
+static void set_one(psa_instance *instance, const psa_variable *v, double value) {
+    psa_state *const state = &instance->state;
     if (v->kind == PSA_INPUT) {
         state->input.value[v->index] = value;
         if (!state->rate_given[v->index]) state->input.rate[v->index] = 0.0;
         return;
     }
     if (v->kind == PSA_STATE) state->solver.x[v->index] = value;
+    else if (v->kind == PSA_SAMPLED) state->p[PSA_NP + v->index] = state->before[v->index] = value;
     else state->p[v->index] = value;
+    if (v->kind == PSA_PARAMETER && v->index == PSA_PERIOD) psa_schedule(instance);
     psa_solver_invalidate(&state->solver);
 }
 
@@ -99,14 +116,14 @@ psa_result psa_set(psa_instance *instance, const unsigned *vr, size_t count, con
         if (result > worst) worst = result;
     }
     if (worst > PSA_WARNING) return worst;
-    for (size_t i = 0; i < count; ++i) set_one(&instance->state, &psa_variables[vr[i]], value[i]);
+    for (size_t i = 0; i < count; ++i) set_one(instance, &psa_variables[vr[i]], value[i]);
     instance->fresh = 0;
     return worst;
 }
 
 static int mismatch(psa_instance *instance, const void *vector, size_t count) {
-    if (count == PSA_NX && vector) return 0;
-    psa_say(instance, PSA_ERROR, "The model has %d continuous states; a vector of %lu was passed.", PSA_NX,
+    if (count == PSA_STATES && (vector || count == 0)) return 0;
+    psa_say(instance, PSA_ERROR, "The model has %d continuous states; a vector of %lu was passed.", PSA_STATES,
             vector ? (unsigned long)count : 0UL);
     return 1;
 }
@@ -121,18 +138,18 @@ psa_result psa_set_time(psa_instance *instance, double time) {
 
 psa_result psa_set_states(psa_instance *instance, const double *x, size_t count) {
     if (mismatch(instance, x, count)) return PSA_ERROR;
-    for (int i = 0; i < PSA_NX; ++i)
+    for (int i = 0; i < PSA_STATES; ++i)
         if (!isfinite(x[i]))
             return psa_say(instance, PSA_DISCARD, "State '%s' was set to a value that is not finite.",
                            psa_variables[PSA_FIRST_STATE + i].name);
-    memcpy(instance->state.solver.x, x, sizeof instance->state.solver.x);
+    if (count > 0) memcpy(instance->state.solver.x, x, sizeof(double) * count);
     instance->fresh = 0;
     return PSA_FINE;
 }
 
 psa_result psa_get_states(psa_instance *instance, double *x, size_t count) {
     if (mismatch(instance, x, count)) return PSA_ERROR;
-    memcpy(x, instance->state.solver.x, sizeof instance->state.solver.x);
+    if (count > 0) memcpy(x, instance->state.solver.x, sizeof(double) * count);
     return PSA_FINE;
 }
 
@@ -140,7 +157,7 @@ psa_result psa_get_derivatives(psa_instance *instance, double *xdot, size_t coun
     if (mismatch(instance, xdot, count)) return PSA_ERROR;
     const psa_result result = psa_refresh(instance);
     if (result != PSA_FINE) return result;
-    for (int i = 0; i < PSA_NX; ++i) {
+    for (int i = 0; i < PSA_STATES; ++i) {
         xdot[i] = instance->xdot[i];
         if (!isfinite(xdot[i]))
             return psa_say(instance, PSA_DISCARD, "The derivative of '%s' is not finite at t = %.9g s.",
@@ -173,7 +190,7 @@ psa_result psa_update_events(psa_instance *instance) {
 
 psa_result psa_get_nominals(psa_instance *instance, double *nominal, size_t count) {
     if (mismatch(instance, nominal, count)) return PSA_ERROR;
-    memcpy(nominal, psa_state_nominals, sizeof(double) * PSA_NX);
+    if (count > 0) memcpy(nominal, psa_state_nominals, sizeof(double) * count);
     return PSA_FINE;
 }
 
@@ -204,7 +221,7 @@ psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_
 psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size_t count,
                                 const int *order, double *rate) {
     const psa_state *const state = &instance->state;
-    const double none[PSA_NP + 1] = {0.0};
+    const double none[PSA_HELD + 1] = {0.0};
     double dy[PSA_NY + 1], u[PSA_NU + 1];
     if (psa_lacks(instance, count, vr, rate) || psa_lacks(instance, count, order, order))
         return PSA_ERROR;

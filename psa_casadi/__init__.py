@@ -32,15 +32,34 @@ if TYPE_CHECKING:
     from psa_casadi.export.check import CheckReport, check_fmu
     from psa_casadi.export.fmu import export_fmu
     from psa_casadi.export.modelica import export_modelica
+    from psa_casadi.export.ssp import export_ssp
     from psa_casadi.identification.identify import Identification, identify
+    from psa_casadi.input_design.mechanism import (
+        design_mechanism,
+        mechanism_model,
+        port_model,
+    )
+    from psa_casadi.input_design.observer import FeedForward, HysteresisObserver, stack_values
+    from psa_casadi.input_design.recursive_least_squares import (
+        AdaptiveFeedForward,
+        OnlineIdentification,
+        identifier_for,
+    )
     from psa_casadi.model.compose import Model, compose
+    from psa_casadi.model.from_casadi import ode_model
     from psa_casadi.model.model_file import load_model, save_model
+    from psa_casadi.model.nanopositioner import nanopositioner
+    from psa_casadi.model.parts import PARTS, compensator_for, part_model
     from psa_casadi.model.stacks import STACKS, stack_model
+    from psa_casadi.model.system import System, connect
+    from psa_casadi.model.tuning import controller_for, margins_of
     from psa_casadi.report.figure import save_figure
     from psa_casadi.report.fit_page import write_fit_report
     from psa_casadi.report.page import write_report
     from psa_casadi.report.text import story
     from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
+    from psa_casadi.simulation.stepper import run
+    from psa_casadi.variables import Input, Output, Parameter, State
 
 #: Where each public name lives.
 _HOMES = {
@@ -64,10 +83,47 @@ _HOMES = {
         "Model",
         "compose",
     ),
+    "psa_casadi.input_design.mechanism": (
+        "design_mechanism",
+        "mechanism_model",
+        "port_model",
+    ),
+    "psa_casadi.input_design.observer": (
+        "FeedForward",
+        "HysteresisObserver",
+        "stack_values",
+    ),
+    "psa_casadi.input_design.recursive_least_squares": (
+        "AdaptiveFeedForward",
+        "OnlineIdentification",
+        "identifier_for",
+    ),
+    "psa_casadi.model.parts": (
+        "PARTS",
+        "part_model",
+        "compensator_for",
+    ),
+    "psa_casadi.model.tuning": (
+        "controller_for",
+        "margins_of",
+    ),
+    "psa_casadi.model.system": (
+        "System",
+        "connect",
+    ),
+    "psa_casadi.model.nanopositioner": ("nanopositioner",),
+    "psa_casadi.model.from_casadi": ("ode_model",),
+    "psa_casadi.variables": (
+        "Input",
+        "Output",
+        "Parameter",
+        "State",
+    ),
     "psa_casadi.model.model_file": (
         "load_model",
         "save_model",
     ),
+    "psa_casadi.simulation.stepper": ("run",),
     "psa_casadi.simulation.simulate": (
         "Trajectory",
         "simulate",
@@ -85,6 +141,7 @@ _HOMES = {
     "psa_casadi.report.fit_page": ("write_fit_report",),
     "psa_casadi.export.fmu": ("export_fmu",),
     "psa_casadi.export.modelica": ("export_modelica",),
+    "psa_casadi.export.ssp": ("export_ssp",),
     "psa_casadi.export.check": (
         "CheckReport",
         "check_fmu",
@@ -109,11 +166,25 @@ __all__ = [
     "stack_model",
     "Model",
     "compose",
+    "PARTS",
+    "part_model",
+    "compensator_for",
+    "controller_for",
+    "margins_of",
+    "System",
+    "connect",
+    "nanopositioner",
+    "ode_model",
+    "Input",
+    "Output",
+    "Parameter",
+    "State",
     "load_model",
     "save_model",
     "Trajectory",
     "simulate",
     "simulate_record",
+    "run",
     "Identification",
     "identify",
     "diagnose",
@@ -122,8 +193,18 @@ __all__ = [
     "save_figure",
     "write_report",
     "write_fit_report",
+    "HysteresisObserver",
+    "FeedForward",
+    "stack_values",
+    "OnlineIdentification",
+    "AdaptiveFeedForward",
+    "identifier_for",
+    "design_mechanism",
+    "mechanism_model",
+    "port_model",
     "export_fmu",
     "export_modelica",
+    "export_ssp",
     "CheckReport",
     "check_fmu",
     "InputError",

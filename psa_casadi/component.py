@@ -55,18 +55,21 @@ class Equations:
 
     `switches` names expressions at whose zeros its equations have a kink or a jump; the solver ends
     a step there. Components that kink at the same expression give it the same name.
+    `next` gives the value of each sampled state after a sample instant; in it, symbols of sampled
+    states, and balances that depend on them, have their values before the instant.
     """
 
     der: Mapping[str, Expression] = field(default_factory=dict)
     add: Mapping[str, Expression] = field(default_factory=dict)
     out: Mapping[str, Expression] = field(default_factory=dict)
     switches: Mapping[str, Expression] = field(default_factory=dict)
+    next: Mapping[str, Expression] = field(default_factory=dict)
 
 
 class Symbols:
     """Read access to every symbol of a model by attribute: `s.k_L`, `s.f_H`, `s.displacement`.
 
-    Parameters, states, inputs, `time` and balances share one name space.
+    Parameters, states, sampled states, inputs, `time` and balances share one name space.
     """
 
     def __init__(self, table: Mapping[str, Expression]) -> None:
@@ -92,6 +95,11 @@ class Component:
     the last two stay out of exported plants. `needs` names components without which this one
     means nothing. `trial_starts` are starts of its memory states at which it is looked for, where
     it does nothing at their ordinary start.
+
+    `sampled` are states that change at sample instants only: at every time that is a multiple of
+    the parameter `sample_period` [s], whoever declares it, each takes the value in
+    `Equations.next` and keeps it up to the next instant. All components of a model share one
+    period.
     """
 
     name: str
@@ -111,3 +119,5 @@ class Component:
     belongs_to: str = "plant"
     needs: tuple[str, ...] = ()
     trial_starts: tuple[Mapping[str, float], ...] = ()
+    sampled: tuple[State, ...] = ()
+    sample_period: str | None = None

@@ -35,7 +35,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class State:
-    """A continuous state (FMI: local, continuous, initial exact).
+    """A state (FMI: local, initial exact), continuous, or discrete where a component samples it.
 
     A state with `memory` remembers a history that the record does not show (hysteresis, creep): its
     deviation from rest at the start of a record is unknown and is estimated; all others start at

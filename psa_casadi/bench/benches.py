@@ -51,5 +51,20 @@ BENCHES: dict[str, Bench] = {
             "fmu",
             "error against work: the FMU's own solver beside CVode, Radau and LSODA",
         ),
+        _later(
+            "coupling",
+            "coupling",
+            "a positioner of FMUs against one model: error over communication step, stability",
+        ),
+        _later(
+            "nonlinearity",
+            "nonlinearity",
+            "a positioner's nonlinearity: open and closed loop, with and without the compensator",
+        ),
+        _later(
+            "design",
+            "design",
+            "designed inputs: causes told apart, paths followed, hysteresis compensated",
+        ),
     )
 }

@@ -8,10 +8,15 @@ from psa_casadi.cli.bench import bench
 from psa_casadi.cli.check import check
 from psa_casadi.cli.datasets import datasets
 from psa_casadi.cli.demo import demo
+from psa_casadi.cli.design_experiment import experiment
+from psa_casadi.cli.design_input import input_
+from psa_casadi.cli.design_mechanism import mechanism
 from psa_casadi.cli.diagnose import diagnose
 from psa_casadi.cli.effects import effects
+from psa_casadi.cli.examples import examples
 from psa_casadi.cli.export_fmu import fmu
 from psa_casadi.cli.export_modelica import modelica
+from psa_casadi.cli.export_ssp import ssp
 from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.simulate import simulate
@@ -27,6 +32,10 @@ app = typer.Typer(
     add_completion=False,
 )
 export = typer.Typer(help="Write a model in a format that other tools read.", no_args_is_help=True)
+design = typer.Typer(
+    help="Design the next experiment, a voltage that follows a path, or a mounting.",
+    no_args_is_help=True,
+)
 
 
 def _print_version(wanted: bool) -> None:
@@ -64,7 +73,22 @@ export.command(epilog="Example: psa export fmu --model extended.json -o stack.fm
 export.command(epilog="Example: psa export modelica --model extended.json -o PiezoStack.mo")(
     guarded(modelica)
 )
+export.command(epilog="Example: psa export ssp --stack P-885.51 -o stage.ssp")(guarded(ssp))
+app.add_typer(design, name="design")
+design.command(
+    epilog="Example: psa design experiment --stack P-885.51 --duration 2"
+    " --separate sensor_delay drive_lag -o voltage.csv"
+)(guarded(experiment))
+design.command(epilog="Example: psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json")(
+    guarded(mechanism)
+)
+design.command(
+    "input",
+    epilog="Example: psa design input --stack P-885.51 --move 2 10 --min-voltage -20"
+    " --max-voltage 120 -o move.csv",
+)(guarded(input_))
 app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))
+app.command(epilog="Example: psa examples van_der_pol -o van_der_pol")(guarded(examples))
 app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(datasets))
 app.command(epilog="Example: psa bench identify --quick")(guarded(bench))
 

@@ -47,6 +47,14 @@ def diagnose(
     json: Annotated[Path | None, typer.Option(help="DIAGNOSIS.json to write.")] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     figure: Annotated[Path | None, typer.Option(help="PNG picture to write.")] = None,
+    following: Annotated[
+        Path | None,
+        typer.Option(
+            "--next",
+            help="VOLTAGE.csv to write if the verdict is ambiguous: the record that would tell;"
+            " without it, beside the JSON or the page.",
+        ),
+    ] = None,
     columns: ColumnsOption = None,
     origin: OriginOption = Origin.MEASURED,
     quiet: Quiet = False,
@@ -62,7 +70,7 @@ def diagnose(
     given, held = Given(), holdout or []
     given.stiffness(stiffness)
     outputs = {"--output": output, "--json": json, "--report": report, "--figure": figure}
-    given.outputs(outputs, [*records, *held, model])
+    given.outputs({**outputs, "--next": following}, [*records, *held, model])
     found = given.records(records, held_out=held, columns=columns)
     start = given.model(model)
     given.check()
@@ -75,12 +83,42 @@ def diagnose(
             stiffness=stiffness,
             progress=progress,
         )
+        d = _with_next(d, following or _beside(json or report), progress)
         progress("writing")
         _write(d, outputs, origin.value)
     show(story(d, origin=origin.value, width=width()), quiet)
-    tell_written(*outputs.values(), quiet=quiet)
+    told = d.next_experiment.voltage_csv
+    tell_written(*outputs.values(), told, quiet=quiet)
     if output is not None and not d.causes:
         show(f"nothing was added: {output} holds the base model", quiet)
+
+
+def _beside(path: Path | None) -> Path | None:
+    """Return where the next voltage goes if no place is named."""
+    return path.with_name(f"{path.stem}_next.csv") if path is not None else None
+
+
+def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> "Diagnosis":
+    """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
+    from dataclasses import replace
+
+    from psa_casadi.diagnosis.result import NextExperiment
+    from psa_casadi.errors import PsaError
+    from psa_casadi.input_design.experiment import resolving_experiment
+    from psa_casadi.report.experiment_part import sentences, write_voltage
+
+    if path is None or d.verdict != "ambiguous":
+        return d
+    try:
+        design = resolving_experiment(d, progress=progress)
+    except PsaError as error:
+        why = f"{d.next_experiment.why} No record could be designed: {error}"
+        return replace(d, next_experiment=replace(d.next_experiment, why=why))
+    write_voltage(path, design.record)
+    said = " ".join(sentences(design, d.model.values.get("C_p")))
+    why = f"Play {path} and diagnose all records together. {said}"
+    following = NextExperiment(str(path), design.names, why, dict(design.chance))
+    return replace(d, next_experiment=following)
 
 
 def _write(d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str) -> None:

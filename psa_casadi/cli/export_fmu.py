@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written, working
+from psa_casadi.cli.screen import PartOption, Quiet, StackOption, show, tell_written, working
 
 
 class FmiVersion(StrEnum):
@@ -20,6 +20,7 @@ def fmu(
     output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
     stack: StackOption = None,
+    part: PartOption = None,
     fmi: Annotated[FmiVersion, typer.Option(help="Version of the standard.")] = FmiVersion.TWO,
     platforms: Annotated[
         str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
@@ -41,7 +42,7 @@ def fmu(
     given.outputs({"--output": output}, [model])
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
-    chosen = given.model_or_stack(model, stack, any_model=True)
+    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     given.check()
     if chosen is None or targets is None:
         return

@@ -5,13 +5,14 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written
+from psa_casadi.cli.screen import PartOption, Quiet, StackOption, show, tell_written
 
 
 def modelica(
     output: Annotated[Path, typer.Option("-o", "--output", help="Modelica file to write.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
     stack: StackOption = None,
+    part: PartOption = None,
     name: Annotated[str, typer.Option(help="Name of the package.")] = "PiezoStack",
     include_sensor: Annotated[
         bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
@@ -24,7 +25,7 @@ def modelica(
 
     given = Given()
     given.outputs({"--output": output}, [model])
-    chosen = given.model_or_stack(model, stack, any_model=True)
+    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     given.check()
     if chosen is None:
         return

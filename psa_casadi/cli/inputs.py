@@ -11,6 +11,7 @@ from psa_casadi.experiment.column_map import parse_columns
 from psa_casadi.experiment.columns import ColumnMap
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
+from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 
 T = TypeVar("T")
@@ -100,15 +101,25 @@ class Given:
         return model
 
     def model_or_stack(
-        self, path: Path | None, stack: str | None, *, any_model: bool = False
+        self,
+        path: Path | None,
+        stack: str | None,
+        *,
+        part: str | None = None,
+        any_model: bool = False,
     ) -> Model | None:
-        """Read a model or compose a named stack; exactly one of the two must be given.
+        """Read a model, or compose a named stack or part; exactly one of them must be given.
 
         With `any_model` the file need not hold a stack.
         """
-        if path is not None and stack is not None:
-            self.add("--model and --stack are both given; leave one of them out.")
+        options = {"--model": path, "--stack": stack, "--part": part}
+        given = [name for name, value in options.items() if value is not None]
+        if len(given) > 1:
+            all_of_them = "both" if len(given) == 2 else "all"
+            self.add(f"{' and '.join(given)} are {all_of_them} given; leave one of them out.")
             return None
+        if part is not None:
+            return self.attempt(lambda: part_model(part))
         if stack is not None:
             return self.attempt(lambda: stack_model(stack))
         if path is None:

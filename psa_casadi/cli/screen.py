@@ -23,6 +23,15 @@ StackOption = Annotated[
     typer.Option("--stack", help="Named stack in place of a model; `psa stacks` lists them."),
 ]
 
+PartOption = Annotated[
+    str | None,
+    typer.Option(
+        "--part",
+        help="A part that stands around a stack, in place of a model: flexure_stage,"
+        " position_controller, hysteresis_compensator, voltage_amplifier, charge_amplifier.",
+    ),
+]
+
 ColumnsOption = Annotated[
     str | None,
     typer.Option(

@@ -1,9 +1,14 @@
-"""Base physics: drive, forces, lag, mechanics, sensor; and the stage a stack can push on."""
+"""Base physics: drive, forces, lag, mechanics, sensor; and the parts of systems around a stack."""
 
 from psa_casadi.component import Component
+from psa_casadi.components.amplifiers import CHARGE_AMPLIFIER, VOLTAGE_AMPLIFIER
 from psa_casadi.components.drive import DRIVE
 from psa_casadi.components.flexure import FLEXURE
+from psa_casadi.components.hysteresis_compensator import HYSTERESIS_COMPENSATOR
 from psa_casadi.components.mechanics import CASCADE_MECHANICS, SINGLE_MASS
+from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
+from psa_casadi.components.position_controller import POSITION_CONTROLLER
+from psa_casadi.components.prestress import PRESTRESS_MECHANISM, PRESTRESS_PORT
 from psa_casadi.components.sensor import SENSOR
 from psa_casadi.components.wafers import BOUC_WEN, CREEP_LAG, LINEAR_FORCE
 
@@ -18,6 +23,13 @@ COMPONENTS: dict[str, Component] = {
         SINGLE_MASS,
         SENSOR,
         FLEXURE,
+        POSITION_CONTROLLER,
+        HYSTERESIS_COMPENSATOR,
+        VOLTAGE_AMPLIFIER,
+        CHARGE_AMPLIFIER,
+        ONLINE_IDENTIFICATION,
+        PRESTRESS_MECHANISM,
+        PRESTRESS_PORT,
     )
 }
 

@@ -24,6 +24,8 @@ FloatArray = npt.NDArray[np.float64]
 #: effects are not the true equations, so that their evidence differs by more than noise, and the
 #: more the stronger the effect is. Checked by the reliability table of `psa bench diagnose`.
 TEMPERATURE, FORM = 3.0, 0.007
+#: The set of effects that cannot be told apart holds the cause with this probability.
+CREDIBLE = 0.95
 
 
 def evidence(before: Fit, after: Fit, colour: Colour) -> float:

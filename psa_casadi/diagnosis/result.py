@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -95,11 +95,25 @@ class Remaining:
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """The experiment that would tell the rivals apart."""
+    """The experiment that would tell the rivals apart.
+
+    `voltage_csv` is the file with the voltage to play, where one was written; `chance` is for each
+    rival the probability that it is then named if it is the cause.
+    """
 
     voltage_csv: str | None
     separates: tuple[str, ...]
     why: str
+    chance: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """An effect that may be the cause: its fit, and ln of the Bayes factor over the base."""
+
+    effect: str
+    fit: Fit
+    evidence: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +123,7 @@ class Diagnosis:
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` are the
     predictions [m] of every record in full, in the order of `experiments`. `noise` is the floor of
     every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
-    records with enough samples.
+    records with enough samples. `contenders` are the fitted rivals of an ambiguous verdict.
     """
 
     verdict: Verdict
@@ -132,6 +146,7 @@ class Diagnosis:
     noise: tuple[NoiseFloor, ...] = ()
     misfit: tuple[Misfit, ...] = ()
     remainder: tuple[Misfit, ...] = ()
+    contenders: tuple[Contender, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of DIAGNOSIS.json."""

@@ -6,8 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.contenders import contenders
 from psa_casadi.diagnosis.errors_of import errors_of, gain_of, held_out_rms
-from psa_casadi.diagnosis.evidence import credible_set
+from psa_casadi.diagnosis.evidence import CREDIBLE, credible_set
 from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor, pooled_level
@@ -32,8 +33,6 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Share of the held-out excess error that a closest known cause must remove.
 PARTLY = 0.8
-#: The set of effects that cannot be told apart holds the cause with this probability.
-CREDIBLE = 0.95
 
 
 def conclude(
@@ -104,6 +103,7 @@ def conclude(
         noise=noise,
         misfit=missed,
         remainder=_misfits(experiments, errors, noise) if named else missed,
+        contenders=contenders(chosen[0], experiments) if verdict == "ambiguous" else (),
     )
 
 

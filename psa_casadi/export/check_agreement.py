@@ -61,7 +61,8 @@ def has_reference(model: Model) -> bool:
 def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
     """Return the outputs (n, ny) by the reference, or by the simulator for a model with effects.
 
-    At a jump of inputs that are held the outputs are those before it.
+    At a jump of inputs that are held the outputs are those before it; with sampled states, which
+    take their samples after it, those after it.
     """
     if not has_reference(model):
         return _simulated(model, times, inputs)
@@ -96,7 +97,7 @@ def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
     start = np.array([s.start for s in model.structure.states])
     hold = "zero" if inputs.held else "linear"
     steps = run(model, grid, inputs.at(grid), start, rtol=1e-11, hold=hold)
-    if not inputs.held:
+    if not inputs.held or model.sampled_names:
         return steps.y[np.isin(grid, times)]
     p = np.array([[model.values[n]] * len(grid) for n in model.parameter_names])
     before = inputs.at(grid, before=True)
@@ -119,22 +120,23 @@ def agreements(fmu: Fmu, model: Model) -> Iterator[Agreement]:
     linear = expected_outputs(model, times, slow)
     compare = _Comparison(model, _scale(model, linear))
     names, grid = model.output_names, grids[1e-3]
+    settled = bool(model.sampled_names)
     found = integrate(fmu, grid, slow, names, tolerance=_TOLERANCE)
     yield compare("model exchange", found, linear[np.searchsorted(times, grid)])
     if fmu.version == 3:
         slow, fast = (replace(s, held=True) for s in (slow, fast))
     expected = expected_outputs(model, times, slow) if slow.held else linear
     for step, grid in grids.items():
-        found = co_simulate(fmu, grid, slow, names, tolerance=_TOLERANCE)
+        found = co_simulate(fmu, grid, slow, names, tolerance=_TOLERANCE, settled=settled)
         truth = expected[np.searchsorted(times, grid)]
         yield compare(f"co-simulation, step {step:g} s", found, truth)
     grid = grids[1e-3]
     truth = expected[np.searchsorted(times, grid)]
-    found = co_simulate(fmu, grid, slow, names)
+    found = co_simulate(fmu, grid, slow, names, settled=settled)
     yield compare("co-simulation, default tolerance", found, truth, DEFAULT_LIMIT)
     grid = _grid(_FAST_STEP, _FAST_STEP * _FAST_COUNT)
     truth = expected_outputs(model, grid, fast)
-    found = co_simulate(fmu, grid, fast, names, tolerance=_TOLERANCE)
+    found = co_simulate(fmu, grid, fast, names, tolerance=_TOLERANCE, settled=settled)
     yield compare(f"co-simulation, step {_FAST_STEP:g} s", found, truth)
 
 

@@ -26,7 +26,7 @@ def _common(fmu: Fmu) -> Calls:
     beyond = (c_uint * 1)(max(fmu.references.values()) + 1)
     co, me = CO_SIMULATION, MODEL_EXCHANGE
     moved = (fmu.names("input") or fmu.names("parameter"))[0]
-    state, output = fmu.states()[0], fmu.names("output")[0]
+    state, output = (*fmu.states(), *fmu.sampled())[0], fmu.names("output")[0]
     wide = len(fmu.states()) + 1
     return {
         "a step before initialization": (co, False, lambda i: i.step(0.0, 1.0)),

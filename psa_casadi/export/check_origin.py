@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from psa_casadi.export.dependencies import Key, dependencies
+from psa_casadi.export.dependencies import Key, dependencies, without_sampled
 from psa_casadi.export.description_common import generation_tool
 from psa_casadi.export.fmu import DESCRIPTIONS
 from psa_casadi.export.fmu_archive import Archive
@@ -28,9 +28,11 @@ def wrong_start_values(archive: Archive, model: Model) -> Iterator[str]:
 def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
     """The dependencies are the sparsity of the model's Jacobian: none missing, none superfluous."""
     names = {(v.kind, v.index): v.name for v in variable_table(model)}
+    found = {names[unknown]: known for unknown, known in dependencies(model.structure).items()}
+    initial = {n: {names[k]: kind for k, kind in known.items()} for n, known in found.items()}
     truth = {
-        names[unknown]: {names[known]: kind for known, kind in entries.items()}
-        for unknown, entries in dependencies(model.structure).items()
+        n: {names[k]: kind for k, kind in without_sampled(known).items()}
+        for n, known in found.items()
     }
     yield from _listed(archive, names)
     described = archive.description
@@ -38,7 +40,7 @@ def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
     for entry in (*described.outputs, *described.derivatives, *indicators):
         yield from _differences(entry, truth.get(entry.variable.name, {}), kinds=True)
     for entry in described.initialUnknowns:
-        yield from _differences(entry, truth.get(entry.variable.name, {}), kinds=False)
+        yield from _differences(entry, initial.get(entry.variable.name, {}), kinds=False)
 
 
 def _listed(archive: Archive, names: dict[Key, str]) -> Iterator[str]:

@@ -36,6 +36,16 @@ def evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) -
     return instance.get(unknowns)
 
 
+def held_values(instance: Instance) -> list[FloatArray]:
+    """Return the vector of the sampled states in a list; an empty list if there are none."""
+    names = instance.fmu.sampled()
+    return [instance.get(names)] if names else []
+
+
+def _sampled_starts(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
+    return {n: float(fmu.nominals[n] * generator.uniform(-1.0, 1.0)) for n in fmu.sampled()}
+
+
 def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
     """Whatever moves an output, derivative or indicator is listed, parameters included."""
     generator = np.random.default_rng(1)
@@ -47,7 +57,8 @@ def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
             yield f"'{entry.variable.name}' lists no dependencies"
     unknowns = list(dict.fromkeys(e.variable.name for e in entries))
     found: dict[str, set[str]] = {name: set() for name in unknowns}
-    with fmu.start(MODEL_EXCHANGE) as instance:
+    starts = _sampled_starts(fmu, np.random.default_rng(6))
+    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
             point = random_point(fmu, generator)
             here = evaluate(instance, point, unknowns)
@@ -70,8 +81,8 @@ def directional_error(fmu: Fmu) -> float:
     generator = np.random.default_rng(2)
     unknowns = [u.variable.name for u in (*fmu.description.outputs, *fmu.description.derivatives)]
     unknowns += fmu.indicators()
-    worst = 0.0
-    with fmu.start(MODEL_EXCHANGE) as instance:
+    worst, starts = 0.0, _sampled_starts(fmu, np.random.default_rng(6))
+    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
             point = random_point(fmu, generator)
             knowns = [k for k in point if k != "time"]
@@ -92,7 +103,8 @@ def adjoint_error(fmu: Fmu) -> float:
     """Return the largest difference of adjoint from directional derivatives, FMI 3.0 only.
 
     Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step;
-    each row in nominal units of the knowns, relative to its largest entry.
+    each row in nominal units of the knowns, relative to its largest entry. Sampled states are held;
+    a step into which an instant falls is not differentiated.
     """
     generator = np.random.default_rng(4)
     unknowns = [*fmu.names("output"), *(u.variable.name for u in fmu.description.derivatives)]
@@ -106,7 +118,8 @@ def adjoint_error(fmu: Fmu) -> float:
     with fmu.start3(CO_SIMULATION) as instance:
         instance.set({n: point[n] for n in fmu.names("input")})
         instance.step(0.0, fmu.step_size)
-        return max(worst, _transposed(instance, [*unknowns, *fmu.states()], knowns, size))
+        through = [] if fmu.sampled() else fmu.states()
+        return max(worst, _transposed(instance, [*unknowns, *through], knowns, size))
 
 
 def _transposed(
@@ -124,8 +137,8 @@ def equation_error(fmu: Fmu, model: Model) -> float:
     """Return the largest relative difference of derivatives and outputs from the model's."""
     generator = np.random.default_rng(3)
     unknowns = [*(f"der({n})" for n in model.state_names), *model.output_names]
-    worst = 0.0
-    with fmu.start(MODEL_EXCHANGE) as instance:
+    worst, starts = 0.0, _sampled_starts(fmu, np.random.default_rng(6))
+    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
             point = random_point(fmu, generator)
             found = evaluate(instance, point, unknowns)
@@ -133,7 +146,7 @@ def equation_error(fmu: Fmu, model: Model) -> float:
                 np.array([point[n] for n in names])
                 for names in (model.state_names, model.input_names, model.parameter_names)
             ]
-            xdot, y = model.structure.f(point["time"], *vectors)
+            xdot, y = model.structure.f(point["time"], *vectors, *held_values(instance))
             expected = np.concatenate([np.array(xdot).ravel(), np.array(y).ravel()])
             size = np.abs(expected) + np.abs(found) + 1e-300
             worst = max(worst, float(np.max(np.abs(found - expected) / size)))

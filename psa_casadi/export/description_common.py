@@ -31,6 +31,7 @@ CAUSALITY = {
     "output": {"causality": "output", **_CONTINUOUS, "initial": "calculated"},
     "parameter": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
     "indicator": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
+    "sampled": {"causality": "local", "variability": "discrete", "initial": "exact"},
 }
 
 _FORCE_SCALE = {
@@ -69,12 +70,20 @@ def time_scale(model: Model) -> float:
     """Return the time in seconds that the model's slowest ordinary mode needs to settle.
 
     It is 4 / |lambda| of the smallest eigenvalue of df/dx at rest that is at least 1e-4 of the
-    largest: slow creep and held hysteresis do not count.
+    largest: slow creep and held hysteresis do not count. With sampled states, which are held in
+    df/dx, it is at least 25 sample periods.
     """
     s = model.structure
-    slopes = ca.Function("slopes", [s.time, s.x, s.u, s.p], [ca.jacobian(s.xdot, s.x)])
+    sampled = 25.0 * model.values[s.period] if s.period else 0.0
+    return max(_continuous_scale(model), sampled) if s.states else sampled
+
+
+def _continuous_scale(model: Model) -> float:
+    s = model.structure
+    slopes = ca.Function("slopes", s.arguments, [ca.jacobian(s.xdot, s.x)])
     rest = np.zeros(len(s.states))
-    matrix = np.array(slopes(0.0, rest, np.zeros(len(s.inputs)), model.parameter_vector()))
+    held = [np.zeros(len(s.sampled))] if s.sampled else []
+    matrix = np.array(slopes(0.0, rest, np.zeros(len(s.inputs)), model.parameter_vector(), *held))
     rates = np.abs(np.linalg.eigvals(matrix))
     ordinary = rates[rates > 1e-4 * rates.max(initial=0.0)]
     return float(4.0 / ordinary.min()) if ordinary.size else 1.0

@@ -35,6 +35,14 @@ Parameters are tunable: they can be set between steps. Directional derivatives w
 states, inputs and parameters are exact."""
 
 
+_SAMPLING = """\
+The sampled states change at the instants k {period}, k a whole number, on the absolute time axis
+(now every {value}), and are held in between. In model exchange the instants are time events. In
+co-simulation the steps of the solver end at them, wherever the communication points are; an instant
+that is a communication point belongs to the step that starts there: outputs read at that point
+already follow from the inputs set there, which may be set again before the step."""
+
+
 def documentation(model: Model, *, reference_run: bool = True) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
@@ -51,6 +59,7 @@ def documentation(model: Model, *, reference_run: bool = True) -> str:
         *(f"<p>{html.escape(note)}</p>" for note in model.provenance.notes),
         "<h2>Use</h2>",
         f"<p>{_USE}</p>",
+        _sampling(model, table),
         *_interface(table),
         "<h2>Equations</h2>",
         _equations(model),
@@ -85,8 +94,18 @@ def _shown(value: float | None, variable: Variable, digits: int = 6) -> str:
     return shown if unit == "1" else f"{shown} {unit}"
 
 
+def _sampling(model: Model, table: Sequence[Variable]) -> str:
+    period = next((v for v in table if v.name == model.structure.period), None)
+    if period is None:
+        return ""
+    return f"<p>{_SAMPLING.format(period=period.name, value=_shown(period.start, period))}</p>"
+
+
 def _interface(table: Sequence[Variable]) -> list[str]:
-    kinds = (("input", "Inputs"), ("output", "Outputs"), ("state", "States"))
+    kinds = (
+        ("input", "Inputs"), ("output", "Outputs"), ("state", "States"),
+        ("sampled", "Sampled states"),
+    )  # fmt: skip
     parts = []
     for kind, title in kinds:
         chosen = [v for v in table if v.kind == kind]

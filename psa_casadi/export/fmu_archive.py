@@ -80,6 +80,12 @@ class Archive:
         """Return the names of the continuous states, in the order of the state vector."""
         return [u.variable.derivative.name for u in self.description.derivatives]
 
+    def sampled(self) -> list[str]:
+        """Return the names of the sampled states: local variables that are discrete."""
+        variables = self.description.modelVariables
+        found = (v for v in variables if v.causality == "local" and v.variability == "discrete")
+        return [v.name for v in found]
+
     def indicators(self) -> list[str]:
         """Return the names of the variables that repeat the event indicators, in their order."""
         names = (v.name for v in self.description.modelVariables)

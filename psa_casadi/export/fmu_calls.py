@@ -48,6 +48,8 @@ class Instance(ABC):
     interface: int
     messages: list[str]
     component: int | None
+    #: Time of the next time event that the last update in event mode announced.
+    next_event_time: float | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -92,7 +94,10 @@ class Instance(ABC):
 
     @abstractmethod
     def update_discrete_states(self) -> list[bool]:
-        """Update in event mode; return whether to repeat, end, look at nominals, states, time."""
+        """Update in event mode; return whether to repeat, end, look at nominals, states, time.
+
+        The time is then in `next_event_time`, which is None without one.
+        """
 
     @abstractmethod
     def completed_integrator_step(self) -> tuple[bool, bool]:

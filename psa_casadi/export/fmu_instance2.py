@@ -81,6 +81,7 @@ class Instance2(Instance):
         """Call fmi2NewDiscreteStates and return its five flags."""
         info = _EventInfo(1, 1, 1, 1, 1, 0.0)
         self.require("NewDiscreteStates", ctypes.byref(info))
+        self.next_event_time = float(info.next_time) if info.next_defined else None
         return [bool(getattr(info, name)) for name, _ in _EventInfo._fields_[:5]]
 
     def completed_integrator_step(self) -> tuple[bool, bool]:

@@ -121,6 +121,7 @@ class Instance3(Instance):
         flags, time = [c_bool(True) for _ in range(5)], c_double()
         places = [ctypes.byref(f) for f in flags]
         self.require("UpdateDiscreteStates", *places, ctypes.byref(time))
+        self.next_event_time = time.value if flags[4].value else None
         return [f.value for f in flags]
 
     def completed_integrator_step(self) -> tuple[bool, bool]:

@@ -1,6 +1,6 @@
 """Two small importers of one FMU: stepping it (co-simulation), integrating it (model exchange)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -54,12 +54,13 @@ def communicate(
     outputs: Sequence[str],
     *,
     rates: bool = True,
+    settled: bool = False,
 ) -> FloatArray:
     """Step an initialised instance over communication points (n,); return outputs (n, ny).
 
     Inputs are set at the start of each step; with `rates` their slope over the step is set too
     unless they are held, or FMI 3.0 has no way to. Outputs are read at the end of each step, and at
-    the start.
+    the start; with `settled` after the inputs of that time are set, which counts where these jump.
     """
     samples = inputs.at(times)
     names = inputs.names
@@ -73,6 +74,8 @@ def communicate(
             slope = (samples[k + 1] - samples[k]) / size
             instance.set_rates(dict(zip(names, slope, strict=True)))
         instance.step(float(begin), size)
+        if settled:
+            instance.set(dict(zip(names, samples[k + 1], strict=True)))
         result[k + 1] = instance.get(outputs)
     return result
 
@@ -80,11 +83,12 @@ def communicate(
 def co_simulate(
     fmu: Fmu, times: FloatArray, inputs: Signals, outputs: Sequence[str], *,
     tolerance: float | None = None, rates: bool = True, values: dict[str, float] | None = None,
+    settled: bool = False,
 ) -> FloatArray:  # fmt: skip
     """Run a new co-simulation instance over communication points; return outputs (n, ny)."""
     start = float(times[0])
     with fmu.start(CO_SIMULATION, tolerance=tolerance, values=values, start_time=start) as instance:
-        return communicate(instance, times, inputs, outputs, rates=rates)
+        return communicate(instance, times, inputs, outputs, rates=rates, settled=settled)
 
 
 def integrate(
@@ -93,10 +97,14 @@ def integrate(
 ) -> FloatArray:  # fmt: skip
     """Integrate a new model exchange instance with LSODA, restarted at every knot of the inputs.
 
-    Returns the outputs (n, ny) at `times`. The error of a step is held below tolerance
-    (|state| + nominal / 100).
+    Returns the outputs (n, ny) at `times`, at an event those after it. The error of a step is held
+    below tolerance (|state| + nominal / 100). It restarts at the FMU's time events too.
     """
-    with fmu.start(MODEL_EXCHANGE, values=values, start_time=float(times[0])) as instance:
+    start = float(times[0])
+    with fmu.open(MODEL_EXCHANGE) as instance:
+        instance.setup(start_time=start, values=values)
+        instance.set(dict(zip(inputs.names, inputs.at(start)[0], strict=True)))
+        event = _updated(instance)
         states = fmu.states()
         x = instance.get(states)
         atol = 1e-2 * tolerance * np.array([fmu.nominals[s] for s in states])
@@ -108,17 +116,47 @@ def integrate(
             rates(t, x)
             return instance.get(outputs)
 
-        rows = [read(float(times[0]), x)]
+        rows = [read(start, x)]
         inside = inputs.times[(inputs.times > times[0]) & (inputs.times < times[-1])]
-        for begin, end in pairwise([float(times[0]), *inside, float(times[-1])]):
-            wanted = times[(times > begin) & (times <= end)]
-            solution = solve_ivp(
-                rates, (begin, end), x, method="LSODA", rtol=tolerance, atol=atol,
-                t_eval=np.union1d(wanted, [end]),
-            )  # fmt: skip
-            if not solution.success:
-                raise FmuError(f"model exchange stopped after {begin:g} s: {solution.message}")
-            points = zip(solution.t, solution.y.T, strict=True)
-            rows += [read(float(t), s) for t, s in points if t in wanted]
-            x = solution.y[:, -1]
+        knots, now = [*inside, float(times[-1])], start
+        same = 1e-12 * (times[-1] - times[0])  # times that differ only by rounding
+        while knots:
+            stop = event if event <= knots[0] + same else knots[0]
+            wanted = times[len(rows) :][times[len(rows) :] < stop - same]
+            points = [(t, x) for t in (*wanted, stop)]
+            if states:
+                points = _solved(rates, (now, stop), x, tolerance, atol, wanted)
+            rows += [read(float(t), s) for t, s in points[:-1]]
+            now, x = stop, points[-1][1]
+            rates(now, x)
+            after = inputs.at(max(now, min(knots[0], now + same)))[0]
+            instance.set(dict(zip(inputs.names, after, strict=True)))
+            if now == event:
+                instance.require("EnterEventMode")
+                event = _updated(instance)
+            if len(rows) < len(times) and times[len(rows)] <= now + same:
+                rows.append(instance.get(outputs))
+            knots = [k for k in knots if k > now + same]
         return np.array(rows)
+
+
+def _updated(instance: Instance) -> float:
+    """Update in event mode and leave it; return the time of the next time event, else infinity."""
+    while instance.update_discrete_states()[0]:
+        pass
+    instance.require("EnterContinuousTimeMode")
+    return np.inf if instance.next_event_time is None else instance.next_event_time
+
+
+def _solved(
+    rates: Callable[[float, FloatArray], FloatArray], span: tuple[float, float], x: FloatArray,
+    tolerance: float, atol: FloatArray, wanted: FloatArray,
+) -> list[tuple[float, FloatArray]]:  # fmt: skip
+    """Return times and states at the wanted times of a span, and at its end."""
+    solution = solve_ivp(
+        rates, span, x, method="LSODA", rtol=tolerance, atol=atol,
+        t_eval=np.union1d(wanted, [span[1]]),
+    )  # fmt: skip
+    if not solution.success:
+        raise FmuError(f"model exchange stopped after {span[0]:g} s: {solution.message}")
+    return list(zip(solution.t, solution.y.T, strict=True))

@@ -6,7 +6,7 @@ Source: FMI 2.0.5, sections 2.2 (schema), 3.3.1 (model exchange) and 4.3.1 (co-s
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from psa_casadi.export.dependencies import dependencies
+from psa_casadi.export.dependencies import dependencies, without_sampled
 from psa_casadi.export.description_common import (
     CAUSALITY,
     LOG_CATEGORIES,
@@ -103,9 +103,13 @@ def _structure(parent: ET.Element, structure: Structure, table: Sequence[Variabl
     outputs = [("output", i) for i in range(len(structure.outputs))]
     rates = [("derivative", i) for i in range(len(structure.states))]
     for tag, unknowns in (("Outputs", outputs), ("Derivatives", rates), ("InitialUnknowns", None)):
-        element = ET.SubElement(parent, tag)
-        for unknown in unknowns or sorted([*outputs, *rates], key=places.__getitem__):
-            known = {places[k]: kind for k, kind in found[unknown].items()}
+        chosen = (
+            sorted([*outputs, *rates], key=places.__getitem__) if unknowns is None else unknowns
+        )
+        element = ET.SubElement(parent, tag) if chosen else parent
+        for unknown in chosen:
+            listed = found[unknown] if unknowns is None else without_sampled(found[unknown])
+            known = {places[k]: kind for k, kind in listed.items()}
             attributes = {
                 "index": str(places[unknown]),
                 "dependencies": " ".join(str(k) for k in sorted(known)),

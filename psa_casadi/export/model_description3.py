@@ -6,7 +6,7 @@ Source: FMI 3.0.2, sections 2.4 (schema), 3.3 (model exchange) and 4.3 (co-simul
 from collections.abc import Sequence
 from xml.etree import ElementTree as ET
 
-from psa_casadi.export.dependencies import Key, dependencies
+from psa_casadi.export.dependencies import Key, dependencies, without_sampled
 from psa_casadi.export.description_common import (
     CAUSALITY,
     default_experiment,
@@ -108,8 +108,10 @@ def _structure(parent: ET.Element, structure: Structure, table: Sequence[Variabl
         ("EventIndicator", indicators),
     ):
         for unknown in unknowns:
-            known = {references[k]: kind for k, kind in found[unknown].items()}
-            if tag == "InitialUnknown":
+            initially = tag == "InitialUnknown"
+            listed = found[unknown] if initially else without_sampled(found[unknown])
+            known = {references[k]: kind for k, kind in listed.items()}
+            if initially:
                 known = {
                     k: "constant" if v == "constant" else "dependent" for k, v in known.items()
                 }

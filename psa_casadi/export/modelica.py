@@ -18,6 +18,10 @@ _USE = (
     "Signal needs no library. Acausal has pins and flanges of the Modelica Standard Library 4. All"
     " quantities are in SI units; states start at rest."
 )
+_SAMPLING = (
+    "The sampled states change at the multiples of their period from time 0 on, as sample(0, T)"
+    " says, and are constant in between."
+)
 
 
 def export_modelica(
@@ -49,7 +53,8 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
     for part in _parts(exported):
         lines += ["", *(f"  {line}" if line else line for line in "\n".join(part).split("\n"))]
     uses = ', uses(Modelica(version="4.0.0"))' if has_ports(exported) else ""
-    text = documentation([*about(exported), _USE])
+    sampled = [_SAMPLING] if exported.sampled_names else []
+    text = documentation([*about(exported), _USE, *sampled])
     return "\n".join([*lines, "", f"  annotation({text}{uses});", f"end {name};", ""])
 
 
@@ -91,9 +96,9 @@ def _icons() -> list[str]:
 def _refuse(model: Model) -> None:
     """Refuse a model that has no state, or outputs that share a name with another variable."""
     problems = Problems()
-    if not model.structure.states:
+    if not (model.structure.states or model.structure.sampled):
         problems.add(f"The model '{model.name}' has no state; add a component that has one.")
-    others = {*model.input_names, *model.state_names, *model.parameter_names}
+    others = {*model.input_names, *model.state_names, *model.parameter_names, *model.sampled_names}
     for name in sorted(others.intersection(model.output_names)):
         problems.add(
             f"Two variables of '{model.name}' are named '{name}', which Modelica does not allow;"

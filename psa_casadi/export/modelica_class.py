@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.export.modelica_equations import ModelEquations, Variable, model_equations
+from psa_casadi.export.modelica_sampling import when_lines
 from psa_casadi.export.modelica_words import comment, modifier, number, string, unit_text
 from psa_casadi.model.compose import Model
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
@@ -83,12 +84,13 @@ def size_text(size: float, name: str) -> str:
 
 
 def _components(model: Model, equations: ModelEquations, ports: Ports) -> list[str]:
-    """Return parameters and states under a comment that names their component."""
+    """Return parameters, states and sampled states under a comment that names their component."""
     lines = []
     for component in model.components:
         names = equations.names
         own = [_parameter(model, p, names[p.name], ports) for p in component.parameters]
         own += [_state(model, s, names[s.name]) for s in component.states]
+        own += [_state(model, s, names[s.name], "discrete Real") for s in component.sampled]
         if own:
             lines += ["  " + comment(f"{component.name}: {component.description}"), *own]
     return lines
@@ -105,7 +107,7 @@ def _parameter(model: Model, it: Parameter, name: str, ports: Ports) -> str:
     return f"  {prefix} {name}{modifier(attributes)} = {value} {string(it.description)};"
 
 
-def _state(model: Model, it: State, name: str) -> str:
+def _state(model: Model, it: State, name: str, prefix: str = "Real") -> str:
     start = number(it.start, f"The start of state '{it.name}'")
     attributes = (
         *_units(it),
@@ -113,7 +115,7 @@ def _state(model: Model, it: State, name: str) -> str:
         ("fixed", "true"),
         ("nominal", _nominal(model, it)),
     )
-    return f"  Real {name}{modifier(attributes)} {string(it.description)};"
+    return f"  {prefix} {name}{modifier(attributes)} {string(it.description)};"
 
 
 def _protected(model: Model, equations: ModelEquations, ports: Ports) -> list[str]:
@@ -124,12 +126,15 @@ def _protected(model: Model, equations: ModelEquations, ports: Ports) -> list[st
     ]
     public = {equations.names[o.name] for o in model.structure.outputs}
     hidden = [v for v in (*equations.balances, *equations.parts) if v.name not in public]
-    return lines + [_variable(v) for v in hidden]
+    lines += [_variable(v) for v in hidden]
+    return lines + [_variable(v, "discrete Real") for v in equations.sampled_parts]
 
 
-def _variable(it: Variable) -> str:
-    unit = string(it.unit) if it.unit else None
-    return f"  Real {it.name}{modifier([('unit', unit)])} {string(it.description)};"
+def _variable(it: Variable, prefix: str = "Real") -> str:
+    attributes = [("unit", string(it.unit) if it.unit else None)]
+    if prefix != "Real":
+        attributes += [("start", "0.0"), ("fixed", "true")]
+    return f"  {prefix} {it.name}{modifier(attributes)} {string(it.description)};"
 
 
 def _equation_lines(model: Model, equations: ModelEquations) -> list[str]:
@@ -147,6 +152,11 @@ def _equation_lines(model: Model, equations: ModelEquations) -> list[str]:
             lines += _flat(
                 _wrapped(f"der({equations.names[n]}) = {equations.derivatives[n]}") for n in own
             )
+    if model.structure.period is not None:
+        parts = [_wrapped(f"{v.name} = {v.text}") for v in equations.sampled_parts]
+        following = equations.following.items()
+        sides = {n: _wrapped(f"{equations.names[n]} = {text}") for n, text in following}
+        lines += when_lines(model, equations.names[model.structure.period], parts, sides)
     if equations.outputs:
         lines.append("  // outputs")
         lines += _flat(

@@ -1,5 +1,6 @@
 """The equations of a model as Modelica text: its balances, named parts, derivatives, outputs."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ from psa_casadi.component import BALANCES, Component, Equations, Expression, Sym
 from psa_casadi.export.modelica_expression import Graph
 from psa_casadi.export.modelica_parts import Part, known_parts
 from psa_casadi.export.modelica_printer import Printer
+from psa_casadi.export.modelica_sampling import before, following, is_before
 from psa_casadi.export.modelica_words import Identifiers
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
@@ -37,7 +39,8 @@ class Variable:
 class ModelEquations:
     """Right-hand sides by the name of their variable; `names` are the symbols' Modelica names.
 
-    A balance that is also an output is in `balances` only.
+    A balance that is also an output is in `balances` only. `following` are the values of the
+    sampled states after an instant; `sampled_parts` belong to them and change with them.
     """
 
     names: Mapping[str, str]
@@ -45,6 +48,8 @@ class ModelEquations:
     parts: tuple[Variable, ...]
     derivatives: Mapping[str, str]
     outputs: Mapping[str, str]
+    sampled_parts: tuple[Variable, ...]
+    following: Mapping[str, str]
 
 
 def model_equations(model: Model, taken: tuple[str, ...] = ()) -> ModelEquations:
@@ -58,9 +63,8 @@ def model_equations(model: Model, taken: tuple[str, ...] = ()) -> ModelEquations
     graph = Graph()
     sums = _balances(structure)
     outputs = _outputs(structure)
-    roots = [*sums.items(), *((s.name, structure.der[s.name]) for s in structure.states)]
-    roots += [(name, expression) for name, expression in outputs.items()]
-    numbers = graph.read([e for _, e in roots])
+    roots = [*sums.values(), *(structure.der[s.name] for s in structure.states)]
+    numbers = graph.read([*roots, *outputs.values(), *following(structure).values()])
     named = {
         number: names[name]
         for name, number in zip(sums, numbers, strict=False)
@@ -70,9 +74,11 @@ def model_equations(model: Model, taken: tuple[str, ...] = ()) -> ModelEquations
     parts.find_known(known_parts(Symbols(structure.symbols)))
     parts.find_repeated(_owners(graph, structure))
     names |= {f"der({s.name})": f"der({names[s.name]})" for s in structure.states}
+    names |= {before(s.name): before(names[s.name]) for s in structure.sampled}
     printer = Printer(graph, names, parts.named)
     texts = [printer.definition(n) for n in numbers]
-    first, second = len(sums), len(sums) + len(structure.states)
+    counts = (len(it) for it in (sums, structure.states, outputs))
+    first, second, third = itertools.accumulate(counts)
     terms = [_terms(graph, printer, structure, *it) for it in zip(sums, numbers, strict=False)]
     return ModelEquations(
         names=names,
@@ -80,9 +86,11 @@ def model_equations(model: Model, taken: tuple[str, ...] = ()) -> ModelEquations
             Variable(names[n], BALANCES[n].unit, BALANCES[n].description, text, added)
             for n, text, added in zip(sums, texts[:first], terms, strict=True)
         ),
-        parts=parts.variables(printer),
+        parts=parts.variables(printer, sampled=False),
         derivatives=dict(zip(model.state_names, texts[first:second], strict=True)),
-        outputs=dict(zip(outputs, texts[second:], strict=True)),
+        outputs=dict(zip(outputs, texts[second:third], strict=True)),
+        sampled_parts=parts.variables(printer, sampled=True),
+        following=dict(zip(model.sampled_names, texts[third:], strict=True)),
     )
 
 
@@ -127,11 +135,15 @@ class _Parts:
                 self._name(number, f"{owner}_part", None, f"repeated part of {owner}")
             sizes[number] = 1 if number in self.named else size
 
-    def variables(self, printer: Printer) -> tuple[Variable, ...]:
-        """Return the named nodes that are no balances, each after those it is made of."""
+    def variables(self, printer: Printer, *, sampled: bool) -> tuple[Variable, ...]:
+        """Return the named nodes that are no balances, each after those it is made of.
+
+        Either those that hold a state before an instant, or the others.
+        """
         return tuple(
             Variable(self.named[n], unit, description, printer.definition(n))
             for n, (unit, description) in sorted(self.chosen.items())
+            if any(is_before(self._graph.nodes[i].name) for i in self._graph.below([n])) == sampled
         )
 
     def _name(self, number: int, name: str, unit: str | None, description: str) -> None:
@@ -147,7 +159,8 @@ def component_equations(component: Component, structure: Structure) -> Equations
 def variable_names(structure: Structure, identifiers: Identifiers) -> dict[str, str]:
     """Return the Modelica names of symbols, balances and outputs; `time` is Modelica's own."""
     wanted = [i.name for i in structure.inputs]
-    wanted += [p.name for p in structure.parameters] + [s.name for s in structure.states]
+    wanted += [p.name for p in structure.parameters]
+    wanted += [s.name for s in (*structure.states, *structure.sampled)]
     wanted += [name for name in BALANCES if name in _used(structure)]
     wanted += [o.name for o in structure.outputs if o.name not in wanted]
     return {"time": "time"} | {name: identifiers.new(name) for name in wanted}
@@ -155,7 +168,8 @@ def variable_names(structure: Structure, identifiers: Identifiers) -> dict[str, 
 
 def _used(structure: Structure) -> set[str]:
     """Return the balances that have terms and those that are read."""
-    every = ca.vertcat(*structure.balances.values(), *structure.der.values())
+    sides = (structure.balances, structure.der, structure.next)
+    every = ca.vertcat(*(e for side in sides for e in side.values()))
     read = {s.name() for s in ca.symvar(ca.vertcat(every, *structure.out.values()))}
     return {name for name in BALANCES if name in structure.balances or name in read}
 
@@ -198,9 +212,11 @@ def _velocity(structure: Structure) -> Expression:
 def _owners(graph: Graph, structure: Structure) -> dict[int, str]:
     """Return the first component whose equations hold a node, for every node."""
     owners: dict[int, str] = {}
+    later = following(structure)
     for component in structure.components:
         equations = component_equations(component, structure)
         terms = [*equations.der.values(), *equations.add.values(), *equations.out.values()]
+        terms += [later[s.name] for s in component.sampled]
         for number in graph.below(graph.read(terms)):
             owners.setdefault(number, component.name)
     return owners

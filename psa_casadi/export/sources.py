@@ -18,14 +18,15 @@ from psa_casadi.export.model_description3 import model_description3
 from psa_casadi.export.variable_table import Variable, variable_table
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.codegen import generate_c
+from psa_casadi.simulation.codegen import c_arguments, c_slopes, generate_c
 from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
 
 #: The hand-written files of `fmu_src` that every FMU consists of, C files first.
 LOGIC = (
-    "derivatives.c", "instance.c", "linear.c", "log.c", "model_adjoint.c", "model_casadi.c",
-    "model_directional.c", "snapshot.c", "solver.c", "step_derivatives.c", "values.c",
-    "fmi_data.h", "instance.h", "linear.h", "model.h", "solver.h",
+    "derivatives.c", "instance.c", "instants.c", "linear.c", "log.c", "model_adjoint.c",
+    "model_casadi.c", "model_directional.c", "sampling.c", "snapshot.c", "solver.c",
+    "step_derivatives.c", "values.c",
+    "fmi_data.h", "instance.h", "instants.h", "linear.h", "model.h", "solver.h",
 )  # fmt: skip
 #: The files of `fmu_src` that speak one version of FMI.
 FACES = {
@@ -116,10 +117,11 @@ def _derivatives(structure: Structure) -> tuple[ca.Function, ca.Function]:
 
     psa_directional: (t, x, u, p, dt, dx, du, dp) to the derivatives of x', y and z along the seeds.
     psa_adjoint: (t, x, u, p, wx, wy, wz) to the gradient of wx.x' + wy.y + wz.z by t, x, u, p.
+    Sampled states are held; they stand in p (see `c_arguments`).
     """
     s = structure
-    point: list[Expression] = [s.time, s.x, s.u, s.p]
-    results: list[Expression] = [s.xdot, s.y, ca.vertcat(ca.SX(0, 1), *s.switches.values())]
+    point = c_arguments(s)
+    results: list[Expression] = [c_slopes(s), s.y, ca.vertcat(ca.SX(0, 1), *s.switches.values())]
     both = ca.vertcat(*results), ca.vertcat(*point)
     seeds = [ca.SX.sym("d" + n, v.numel()) for n, v in zip("txup", point, strict=True)]
     weights = [ca.SX.sym("w" + n, v.numel()) for n, v in zip("xyz", results, strict=True)]
@@ -177,10 +179,12 @@ def _switch_scales(model: Model, nominals: Sequence[float]) -> list[float]:
     """Return sum_j |dz/dx_j| nominal_j of every switch z at rest: its noise at a tolerance of 1."""
     s = model.structure
     slopes = ca.jacobian(ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.x)
-    at_rest = ca.Function("slopes", [s.time, s.x, s.u, s.p], [ca.densify(slopes)])
-    states, inputs = [0.0] * len(s.states), [0.0] * len(s.inputs)
-    found = np.array(at_rest(0.0, states, inputs, model.parameter_vector()), dtype=np.float64)
-    return [float(row @ np.array(nominals)) for row in np.abs(found.reshape(-1, len(s.states)))]
+    at_rest = ca.Function("slopes", s.arguments, [ca.densify(slopes)])
+    rest = [np.zeros(len(part)) for part in (s.states, s.inputs)]
+    held = [np.zeros(len(s.sampled))] if s.sampled else []
+    found = np.array(at_rest(0.0, *rest, model.parameter_vector(), *held), dtype=np.float64)
+    rows = np.abs(found.reshape(len(s.switches), len(s.states)))
+    return [float(row @ np.array(nominals)) for row in rows]
 
 
 def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) -> str:
@@ -191,6 +195,7 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
 
     nominals = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
     scales = _switch_scales(model, nominals)
+    held = [*starts("parameter"), *starts("sampled")]
     lines = [
         '#include "fmi_data.h"',
         "",
@@ -203,8 +208,8 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         "};",
         _vector("psa_start_states", "PSA_NX", starts("state")),
         _vector("psa_start_inputs", "PSA_NU", starts("input")),
-        _vector("psa_start_parameters", "PSA_NP", starts("parameter")),
-        _vector("psa_state_nominals", "PSA_NX", nominals),
+        _vector("psa_start_parameters", "PSA_HELD", held),
+        _vector("psa_state_nominals", "PSA_NX", nominals or [1.0]),
         _vector("psa_switch_scales", "PSA_NZ", scales),
         "",
     ]

@@ -12,10 +12,11 @@ from psa_casadi.variables import nominal_value
 class Variable:
     """One variable as FMI describes it, in SI units.
 
-    `kind` is time, state, derivative, input, output, parameter or indicator (zero where a
-    derivative has a kink); `index` is its place in the vector of its kind; the value reference is
-    the place in the table. Only a state, an input and a parameter have a `start`; a derivative has
-    no nominal; an indicator, of which only the sign counts, has neither unit nor nominal.
+    `kind` is time, state, derivative, input, output, parameter, indicator (zero where a derivative
+    has a kink) or sampled (a state that changes at sample instants only); `index` is its place in
+    the vector of its kind; the value reference is the place in the table. Only a state, an input, a
+    parameter and a sampled state have a `start`; a derivative has no nominal; an indicator, of
+    which only the sign counts, has neither unit nor nominal.
     """
 
     name: str
@@ -30,7 +31,7 @@ class Variable:
 
 
 def variable_table(model: Model) -> tuple[Variable, ...]:
-    """Return time, states, derivatives, inputs, outputs, parameters, event indicators.
+    """Return time, states, derivatives, inputs, outputs, parameters, indicators, sampled states.
 
     This is the layout of `fmi_data.h`. The indicator of a switch is named `switch.<name>`, as FMI's
     structured names have parentheses for der() only.
@@ -70,6 +71,11 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
                      f"zero where derivatives have a kink: {name.replace('_', ' ')}")
             for i, name in enumerate(s.switches)
         ),
+        *(
+            Variable(q.name, "sampled", i, q.unit, q.description, q.display_unit, q.start,
+                     nominal_value(q.nominal, values))
+            for i, q in enumerate(s.sampled)
+        ),
     ]  # fmt: skip
     _refuse(model, table)
     return tuple(table)
@@ -97,7 +103,7 @@ def _refuse(model: Model, table: list[Variable]) -> None:
         f"Two variables of '{model.name}' are named '{name}', which FMI does not allow; rename one."
         for name in sorted({n for n in names if names.count(n) > 1})
     ]
-    if not model.structure.states:
+    if not (model.structure.states or model.structure.sampled):
         problems.append(f"The model '{model.name}' has no state; add a component that has one.")
     if problems:
         raise InputError(problems)

@@ -40,6 +40,11 @@ class Model:
         return tuple(s.name for s in self.structure.states)
 
     @property
+    def sampled_names(self) -> tuple[str, ...]:
+        """Names of the states that change at sample instants only, in the order of their vector."""
+        return tuple(s.name for s in self.structure.sampled)
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the parameter vector."""
         return tuple(p.name for p in self.structure.parameters)
@@ -112,8 +117,8 @@ def compose(
 ) -> Model:
     """Compose components to a model; values override the components' defaults (SI units).
 
-    Raises InputError for a missing symbol, a name used twice, a loop among the balances, an
-    unknown parameter or a value out of bounds.
+    Raises InputError for a missing symbol, a name used twice, a loop among the balances, sample
+    periods that differ, an unknown parameter or a value out of bounds.
     """
     structure = structure_of(tuple(components))
     merged = {p.name: p.value for p in structure.parameters}

@@ -17,7 +17,11 @@ FORMAT = "psa_casadi.model/1"
 
 
 def dumps(model: Model) -> str:
-    """Return the text of MODEL.json; reading it back gives the same model exactly."""
+    """Return the text of MODEL.json; reading it back gives the same model exactly.
+
+    Raises InputError for a model with a component that is in no table of this package.
+    """
+    _refuse_foreign(model)
     origin = model.provenance
     parameters = {}
     for p in model.structure.parameters:
@@ -41,6 +45,18 @@ def dumps(model: Model) -> str:
         "package_version": origin.package_version,
     }
     return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _refuse_foreign(model: Model) -> None:
+    """The file names components; one that is in neither table could not be found again."""
+    known = (*COMPONENTS.values(), *EFFECTS.values())
+    foreign = [c.name for c in model.components if c not in known]
+    if foreign:
+        raise InputError(
+            f"The model '{model.name}' cannot be saved as MODEL.json: the file names components of"
+            f" this package, and {', '.join(foreign)} is not one (made by ode_model or connect?)."
+            " Keep the script that makes the model, or export the model as an FMU."
+        )
 
 
 def loads(text: str, source: str = "MODEL.json") -> Model:

@@ -1,13 +1,19 @@
 """The equations of a composed model: the components' terms added up, ordered and substituted."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 
 import casadi as ca
 
 from psa_casadi.component import BALANCES, Component, Equations, Expression, Symbols
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError
+from psa_casadi.model.declarations import (
+    check_declarations,
+    refuse_duplicates,
+    sample_period,
+    symbol_names,
+)
 from psa_casadi.variables import Input, Output, Parameter, State
 
 
@@ -19,6 +25,10 @@ class Structure:
     `balances` maps each balance to its terms' sum with balances kept as symbols (for people);
     `xdot`, `y` and `switches` (zero where xdot has a kink) have everything substituted (for
     machines).
+
+    `z` are the sampled states, constant but for the instants k T of the parameter `period`, T [s];
+    there they take the value `znext`, in which `z` stands for their values before the instant
+    (`next` is the same with balances kept as symbols).
     """
 
     components: tuple[Component, ...]
@@ -37,16 +47,35 @@ class Structure:
     xdot: Expression
     y: Expression
     switches: Mapping[str, Expression]
+    sampled: tuple[State, ...]
+    period: str | None
+    z: Expression
+    next: Mapping[str, Expression]
+    znext: Expression
+
+    @property
+    def arguments(self) -> list[Expression]:
+        """The symbols that the equations are functions of: time, x, u, p, and z if there is one."""
+        return [self.time, self.x, self.u, self.p, *([self.z] if self.sampled else [])]
 
     @cached_property
     def f(self) -> ca.Function:
-        """Casadi function `(time, x, u, p) -> (xdot, y)`; columns of nx, nu, np and nx, ny."""
+        """Casadi function `(time, x, u, p) -> (xdot, y)`; columns of nx, nu, np and nx, ny.
+
+        With sampled states `(time, x, u, p, z) -> (xdot, y)`, z a column of nz.
+        """
+        names = ["time", "x", "u", "p", "z"][: len(self.arguments)]
+        return ca.Function("f", self.arguments, [self.xdot, self.y], names, ["xdot", "y"])
+
+    @cached_property
+    def g(self) -> ca.Function:
+        """Casadi function `(time, x, u, p, z) -> z_next`: the sampled states after an instant."""
         return ca.Function(
-            "f",
-            [self.time, self.x, self.u, self.p],
-            [self.xdot, self.y],
-            ["time", "x", "u", "p"],
-            ["xdot", "y"],
+            "g",
+            [self.time, self.x, self.u, self.p, self.z],
+            [self.znext],
+            ["time", "x", "u", "p", "z"],
+            ["z_next"],
         )
 
 
@@ -55,14 +84,17 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     """Add up the components' terms, order the balances and substitute them.
 
     Raises InputError for a name used twice, a missing symbol, an unknown balance, a component that
-    declares what it does not give, and a loop among the balances.
+    declares what it does not give, a loop among the balances, and for sampled components of
+    different periods, or of a period that is no parameter or can be 0.
     """
     parameters = tuple(p for c in components for p in c.parameters)
     states = tuple(s for c in components for s in c.states)
     inputs = tuple(i for c in components for i in c.inputs)
     outputs = tuple(o for c in components for o in c.outputs)
-    _refuse_duplicates(components)
-    names = [n for c in components for n in _symbol_names(c)]
+    sampled = tuple(s for c in components for s in c.sampled)
+    refuse_duplicates(components)
+    period = sample_period(components)
+    names = [n for c in components for n in symbol_names(c)]
     table = {n: ca.SX.sym(n) for n in (*names, "time")}
     sums = {name: ca.SX.sym(name) for name in BALANCES}
     parts = [_equations_of(c, Symbols({**table, **sums})) for c in components]
@@ -70,13 +102,14 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     der = {k: v for e in parts for k, v in e.der.items()}
     out = {k: v for e in parts for k, v in e.out.items()}
     switches = {k: v for e in parts for k, v in e.switches.items()}
+    following = {k: v for e in parts for k, v in e.next.items()}
     full = _substitute_in_order(balances, sums)
 
     def resolve(expression: Expression) -> Expression:
         return ca.substitute([ca.SX(expression)], list(sums.values()), full)[0]
 
-    x = ca.vertcat(*[table[s.name] for s in states])
-    xdot = ca.vertcat(*[resolve(der[s.name]) for s in states])
+    x = _column(table[s.name] for s in states)
+    xdot = _column(resolve(der[s.name]) for s in states)
     if "displacement" in balances:
         shown = resolve(sums["displacement"])
         out["velocity"] = _time_derivative(shown, x, xdot, table["time"])
@@ -88,35 +121,25 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
         outputs=outputs,
         time=table["time"],
         x=x,
-        u=ca.vertcat(*[table[i.name] for i in inputs]),
-        p=ca.vertcat(*[table[q.name] for q in parameters]),
+        u=_column(table[i.name] for i in inputs),
+        p=_column(table[q.name] for q in parameters),
         symbols={**table, **sums},
         balances=balances,
         der=der,
         out=out,
         xdot=xdot,
-        y=ca.vertcat(*[resolve(out[o.name]) for o in outputs]),
+        y=_column(resolve(out[o.name]) for o in outputs),
         switches={name: resolve(expression) for name, expression in switches.items()},
+        sampled=sampled,
+        period=period,
+        z=_column(table[s.name] for s in sampled),
+        next=following,
+        znext=_column(resolve(following[s.name]) for s in sampled),
     )
 
 
-def _symbol_names(component: Component) -> list[str]:
-    names = [p.name for p in component.parameters]
-    names += [s.name for s in component.states]
-    return names + [i.name for i in component.inputs]
-
-
-def _refuse_duplicates(components: tuple[Component, ...]) -> None:
-    """Symbols share one name space with the balances and time, outputs have one of their own."""
-    symbols = [n for c in components for n in _symbol_names(c)]
-    outputs = [o.name for c in components for o in c.outputs]
-    problems = Problems()
-    for names in (symbols, outputs):
-        for name in sorted({n for n in names if names.count(n) > 1}):
-            problems.add(f"Two components declare '{name}'; rename one or leave one out.")
-    for name in sorted({*BALANCES, "time"}.intersection(symbols)):
-        problems.add(f"A component declares '{name}', the name of a balance or of time; rename it.")
-    problems.raise_if_any()
+def _column(parts: Iterable[Expression]) -> Expression:
+    return ca.vertcat(ca.SX(0, 1), *parts)
 
 
 def _equations_of(component: Component, symbols: Symbols) -> Equations:
@@ -127,26 +150,8 @@ def _equations_of(component: Component, symbols: Symbols) -> Equations:
             f"Component '{component.name}' cannot be composed: {error}; add the component that has"
             " it."
         ) from error
-    _check_declarations(component, equations)
+    check_declarations(component, equations)
     return equations
-
-
-def _check_declarations(component: Component, equations: Equations) -> None:
-    """A component gives what it declares and nothing else; velocity follows from displacement."""
-    outputs = {o.name for o in component.outputs} - {"velocity"}
-    problems = Problems()
-    for kind, declared, given in (
-        ("derivative of the state", {s.name for s in component.states}, set(equations.der)),
-        ("equation of the output", outputs, set(equations.out)),
-    ):
-        for name in sorted(declared - given):
-            problems.add(f"Component '{component.name}' lacks the {kind} '{name}'; declare it.")
-        for name in sorted(given - declared):
-            problems.add(
-                f"Component '{component.name}' has the {kind} '{name}', which it does not declare;"
-                " add a term to a balance instead, or declare it."
-            )
-    problems.raise_if_any()
 
 
 def _sum_terms(parts: list[Equations], components: tuple[Component, ...]) -> dict[str, Expression]:

@@ -8,9 +8,6 @@ import casadi as ca
 from psa_casadi.component import Expression
 from psa_casadi.model.compose import Structure
 
-#: The functions that the solver needs, and those that sensitivities need besides.
-_SOLVER_FUNCTIONS = ("psa_ode", "psa_jacobian", "psa_outputs", "psa_switches")
-
 _PRAGMAS = """\
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"
@@ -25,29 +22,48 @@ def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.F
     """Return the CasADi functions behind `model.h`, all of arguments (time, x, u, p).
 
     psa_ode: xdot; psa_jacobian: df/dx dense (nx, nx); psa_outputs: y; psa_switches: zero
-    where xdot has a kink. With sensitivities also psa_sensitivity: (df/dx, df/dp) dense;
-    psa_output_sensitivity: (dg/dx, dg/dp) dense.
+    where xdot has a kink; psa_sample, with sampled states: their values after an instant. With
+    sensitivities also psa_sensitivity: (df/dx, df/dp) dense; psa_output_sensitivity: (dg/dx, dg/dp)
+    dense. See `c_arguments` for x and p.
     """
     s = structure
-    arguments = [s.time, s.x, s.u, s.p]
-    jacobian = ca.densify(ca.jacobian(s.xdot, s.x))
+    arguments = c_arguments(s)
+    x, xdot = arguments[1], c_slopes(s)
+    jacobian = ca.densify(ca.jacobian(xdot, x))
     switches: Expression = ca.vertcat(ca.SX(0, 1), *s.switches.values())
     table = {
-        "psa_ode": [ca.densify(s.xdot)],
+        "psa_ode": [ca.densify(xdot)],
         "psa_jacobian": [jacobian],
         "psa_outputs": [ca.densify(s.y)],
         "psa_switches": [ca.densify(switches)],
     }
+    if s.sampled:
+        table["psa_sample"] = [ca.densify(s.znext)]
     if sensitivities:
-        table["psa_sensitivity"] = [jacobian, ca.densify(ca.jacobian(s.xdot, s.p))]
+        table["psa_sensitivity"] = [jacobian, ca.densify(ca.jacobian(xdot, s.p))]
         table["psa_output_sensitivity"] = [
-            ca.densify(ca.jacobian(s.y, s.x)),
+            ca.densify(ca.jacobian(s.y, x)),
             ca.densify(ca.jacobian(s.y, s.p)),
         ]
     return {
         name: ca.Function(name, arguments, ca.cse(outputs), {"cse": True})
         for name, outputs in table.items()
     }
+
+
+def c_arguments(structure: Structure) -> list[Expression]:
+    """Return the arguments (time, x, u, p) of the functions in C.
+
+    There the sampled states stand behind the parameters in p, as both are constant over a step; x
+    of a model that has only sampled states is one number that stays as it is.
+    """
+    s = structure
+    return [s.time, s.x if s.states else ca.SX.sym("unused"), s.u, ca.vertcat(s.p, s.z)]
+
+
+def c_slopes(structure: Structure) -> Expression:
+    """Return the derivative of `c_arguments`' x."""
+    return structure.xdot if structure.states else ca.SX(0)
 
 
 def generate_c(structure: Structure, *, sensitivities: bool) -> dict[str, str]:
@@ -67,11 +83,16 @@ def generate_c(structure: Structure, *, sensitivities: bool) -> dict[str, str]:
 
 def _config(structure: Structure, functions: list[ca.Function], sensitivities: bool) -> str:
     sizes = {
-        "PSA_NX": len(structure.states),
+        "PSA_NX": max(1, len(structure.states)),
+        "PSA_STATES": len(structure.states),
         "PSA_NU": len(structure.inputs),
         "PSA_NP": len(structure.parameters),
         "PSA_NY": len(structure.outputs),
         "PSA_NZ": len(structure.switches),
+        "PSA_NS": len(structure.sampled),
+        "PSA_PERIOD": next(
+            (i for i, p in enumerate(structure.parameters) if p.name == structure.period), 0
+        ),
         "PSA_SZ_ARG": max(4, *(f.sz_arg() for f in functions)),
         "PSA_SZ_RES": max(2, *(f.sz_res() for f in functions)),
         "PSA_SZ_IW": max(1, *(f.sz_iw() for f in functions)),

@@ -50,7 +50,8 @@ def simulate(
     value where not given. Between samples the voltage is linear (`hold="linear"`) or constant
     (`hold="zero"`). The model
     starts in the state that the first voltage and its rate imply, with `memory` deviations
-    (see `start_state`), or with every state at 0 if `from_rest_at_zero`. `rtol` is the relative
+    (see `start_state`), or with every state at 0 if `from_rest_at_zero`. Sampled states start at
+    their declared values. `rtol` is the relative
     tolerance of the error-controlled stepper.
 
     Raises SimulationError, and InputError for samples that do not fit the times or the model.
@@ -115,7 +116,10 @@ def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps) -> Tra
     return Trajectory(
         time=t,
         voltage=v,
-        states=dict(zip(model.state_names, steps.x.T, strict=True)),
+        states={
+            **dict(zip(model.state_names, steps.x.T, strict=True)),
+            **dict(zip(model.sampled_names, steps.z.T, strict=True)),
+        },
         outputs=dict(zip(model.output_names, steps.y.T, strict=True)),
         steps=steps.steps,
     )

@@ -92,7 +92,7 @@ def _fast_jacobian(structure: Structure) -> ca.Function:
     s = structure
     fast = [i for i, state in enumerate(s.states) if not state.memory]
     deviation = ca.SX.sym("deviation", sum(state.memory for state in s.states))
-    jacobian = ca.jacobian(s.xdot, s.x)[fast, fast]
+    jacobian = ca.jacobian(_slopes(s), s.x)[fast, fast]
     return ca.Function("fast", [s.time, s.x, s.u, s.p, deviation], [jacobian])
 
 
@@ -137,6 +137,13 @@ def _functions(structure: Structure) -> tuple[ca.Function, ca.Function]:
     )
 
 
+def _slopes(s: Structure) -> Expression:
+    """Return x' with the sampled states at their start values."""
+    if not s.sampled:
+        return s.xdot
+    return ca.substitute([s.xdot], [s.z], [ca.SX([q.start for q in s.sampled])])[0]
+
+
 def _at(s: Structure, expression: Expression, x: Expression) -> Expression:
     return ca.substitute([expression], [s.x], [x])[0]
 
@@ -156,8 +163,8 @@ def _placed(
 
 def _newton(s: Structure, rows: list[int], x: Expression) -> Expression:
     """One Newton step for the rows' derivatives to vanish; its derivative is the implicit one."""
-    jacobian = ca.jacobian(s.xdot, s.x)[rows, rows]
-    step = ca.solve(_at(s, jacobian, x), _at(s, s.xdot, x)[rows])
+    jacobian = ca.jacobian(_slopes(s), s.x)[rows, rows]
+    step = ca.solve(_at(s, jacobian, x), _at(s, _slopes(s), x)[rows])
     parts = [x[i] for i in range(len(s.states))]
     for k, i in enumerate(rows):
         parts[i] = parts[i] - step[k]
@@ -173,11 +180,11 @@ def _in_motion(
     rate: Expression,
 ) -> Expression:
     """Move the fast states from rest to a steady motion at the rate of inputs and memories."""
-    jacobian = _at(s, ca.jacobian(s.xdot, s.x), rest)
-    by_input = _at(s, ca.jacobian(s.xdot, s.u), rest)
+    jacobian = _at(s, ca.jacobian(_slopes(s), s.x), rest)
+    by_input = _at(s, ca.jacobian(_slopes(s), s.u), rest)
     drive = by_input[fast, :] @ rate
     if memory:
-        drive += jacobian[fast, memory] @ _at(s, s.xdot, x)[memory]
+        drive += jacobian[fast, memory] @ _at(s, _slopes(s), x)[memory]
     steady = -ca.solve(jacobian[fast, fast], drive)
     lag = ca.solve(jacobian[fast, fast], steady)
     parts = [rest[i] for i in range(len(s.states))]

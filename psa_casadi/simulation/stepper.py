@@ -22,7 +22,7 @@ from psa_casadi.simulation.compiler import shared_library
 FloatArray = npt.NDArray[np.float64]
 
 #: The files of `fmu_src` that integrate a model.
-SOURCES = ("solver.c", "linear.c", "model_casadi.c", "trajectory.c")
+SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")
 _STAGES = 6
 _POINTER = ctypes.c_void_p
 _REASONS = {
@@ -41,9 +41,10 @@ class _Run(ctypes.Structure):
 
     _fields_ = [
         ("samples", ctypes.c_long), ("t", _POINTER), ("u", _POINTER),
-        ("zero_order_hold", ctypes.c_int), ("p", _POINTER), ("x0", _POINTER), ("nominal", _POINTER),
+        ("zero_order_hold", ctypes.c_int), ("p", _POINTER), ("x0", _POINTER), ("z0", _POINTER),
+        ("nominal", _POINTER),
         ("rtol", ctypes.c_double), ("max_step", ctypes.c_double), ("steps_limit", ctypes.c_long),
-        ("x", _POINTER), ("y", _POINTER),
+        ("x", _POINTER), ("z", _POINTER), ("y", _POINTER),
         ("count", ctypes.c_int), ("which", _POINTER), ("s0", _POINTER), ("output", ctypes.c_int),
         ("dy", _POINTER), ("work", _POINTER), ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
         ("evaluations", ctypes.c_long), ("t_failed", ctypes.c_double), ("culprit", ctypes.c_int),
@@ -52,9 +53,13 @@ class _Run(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Steps:
-    """What a run returned: states (n, nx), outputs (n, ny), sensitivities (n, k), and its cost."""
+    """What a run returned: states (n, nx), outputs (n, ny), sensitivities (n, k), and its cost.
+
+    `z` are the sampled states (n, nz), at an instant those after it.
+    """
 
     x: FloatArray
+    z: FloatArray
     y: FloatArray
     sensitivity: FloatArray | None
     steps: int
@@ -85,6 +90,7 @@ def run(
     s0: FloatArray | None = None,
     output: str = "measured_displacement",
     values: Mapping[str, float] | None = None,
+    z0: FloatArray | None = None,
 ) -> Steps:
     """Integrate a model over the times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
 
@@ -92,11 +98,18 @@ def run(
     for the initial value of state k. `s0` (nx, k) is d x0 / d unknown, zero by default except for
     the initial values themselves. `steps_limit` bounds the work between two samples.
 
+    Sampled states start at `z0` (nz,), their declared starts by default. Steps end at their
+    instants, also between the times; one at t[0] is taken before the first output, one at another
+    time with the input of that time (the one after a jump where inputs are held).
+
     Raises SimulationError, which names state and time, and InputError for arrays of wrong shape,
     times that do not increase, or numbers that are not finite.
     """
     arrays = _arrays(model, values or model.values, (t, u, x0), unknowns, s0)
+    arrays["z0"] = _doubles(_sampled_starts(model) if z0 is None else z0)
     _check(model, arrays, hold)
+    nx = len(model.state_names)
+    arrays["x0"] = arrays["x0"] if nx else np.zeros(1)  # C has one unused state
     count = len(unknowns)
     request = _Run(
         samples=len(t),
@@ -110,13 +123,20 @@ def run(
     )
     status = _library(model.structure).psa_run(ctypes.byref(request))
     if status:
+        state = (*model.state_names, *model.sampled_names, "none")[request.culprit]
         raise SimulationError(
-            f"The simulation stopped at t = {request.t_failed:.6g} s in state"
-            f" '{model.state_names[request.culprit]}': {_REASONS[status]}. Parameter values far"
-            " from physical ones are the likely cause; check them, or loosen the tolerance."
+            f"The simulation stopped at t = {request.t_failed:.6g} s in state '{state}':"
+            f" {_REASONS[status]}. Parameter values far from physical ones are the likely cause;"
+            " check them, or loosen the tolerance."
         )
     cost = (request.steps, request.rejected, request.evaluations)
-    return Steps(arrays["x"], arrays["y"], arrays["dy"] if count else None, *cost)
+    return Steps(
+        arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"] if count else None, *cost
+    )
+
+
+def _sampled_starts(model: Model) -> FloatArray:
+    return np.array([s.start for s in model.structure.sampled])
 
 
 def _arrays(
@@ -131,8 +151,9 @@ def _arrays(
     return {
         **{name: _doubles(array) for name, array in zip(("t", "u", "x0"), given, strict=True)},
         "p": np.array([values[name] for name in model.parameter_names]),
-        "nominal": model.state_nominals(),
-        "x": np.empty((n, nx)),
+        "nominal": model.state_nominals() if nx else np.ones(1),
+        "x": np.empty((n, max(1, nx))),
+        "z": np.empty((n, len(model.sampled_names))),
         "y": np.empty((n, len(model.output_names))),
         "which": _which(model, unknowns),
         "s0": _initial_sensitivities(nx, unknowns) if s0 is None else _doubles(s0),
@@ -162,7 +183,8 @@ def _initial_sensitivities(nx: int, unknowns: Sequence[str | int]) -> FloatArray
 
 def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> None:
     n, nx, k = arrays["t"].size, len(model.state_names), arrays["which"].size
-    shapes = {"t": (n,), "u": (n, len(model.input_names)), "x0": (nx,), "s0": (nx, k)}
+    shapes: dict[str, tuple[int, ...]] = {"t": (n,), "u": (n, len(model.input_names)), "x0": (nx,)}
+    shapes |= {"s0": (nx, k), "z0": (len(model.sampled_names),)}
     problems = Problems()
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
@@ -174,6 +196,11 @@ def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> N
             problems.add(f"The array {name} holds numbers that are not finite; replace them.")
     if n == 0 or not (np.diff(arrays["t"], axis=0) > 0).all():
         problems.add("The times do not strictly increase; sort them and remove the repeated ones.")
+    if k and model.sampled_names:
+        problems.add(
+            f"Sensitivities of a model with sampled states ({', '.join(model.sampled_names)}) are"
+            " not computed; leave the sampled component out, or take differences of two runs."
+        )
     if hold not in ("linear", "zero"):
         problems.add(f"The hold '{hold}' does not exist; use 'linear' or 'zero'.")
     problems.raise_if_any()

@@ -1,0 +1,219 @@
+"""Tables of `psa bench design`: experiments that separate causes, and the time a design takes."""
+
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from importlib import import_module
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.bench.hidden_cases import plants
+from psa_casadi.bench.outcome import Progress, TitledTable
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.rounds import examine
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import PsaError
+from psa_casadi.experiment.reading import read_record
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import split
+from psa_casadi.identification.search import CORE, fit_base
+from psa_casadi.identification.starting import starting_model
+from psa_casadi.input_design.designs import Separated
+from psa_casadi.input_design.experiment import (
+    informative_experiment,
+    resolving_experiment,
+    rival_of_effect,
+    separating_experiment,
+    usual_records,
+)
+from psa_casadi.input_design.limits import Limits
+from psa_casadi.input_design.rivals import SensorNoise, rival_of_model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.report.tables import Table
+
+#: Ambiguous pairs that are resolved, and the seeds from which they are drawn.
+PAIRS, QUICK_PAIRS, FIRST = 20, 2, 7000
+#: Samples of a first record, of a class of voltage that users have, and the size of its effect.
+SAMPLES, CLASSES, RHO = 2000, ("sine", "triangle"), (0.3, 2.0)
+_PLAYED = ("designed", "sine", "triangle")
+_SIZES, _QUICK_SIZES = (250, 500, 1000, 2000, 4000), (250, 1000)
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """One ambiguous pair: what is hidden, its rival, and what was named after each further record.
+
+    `named` holds for each voltage played "right", "wrong" or "open"; `growth` the predicted least
+    ln of the Bayes factor; `chance` the predicted probability to name the hidden effect.
+    """
+
+    seed: int
+    effect: str
+    rival: str
+    voltage: str
+    kind: str
+    named: dict[str, str]
+    growth: dict[str, float]
+    chance: float
+    seconds: float
+
+
+def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
+    """Measure both tables; the seeds are the same in every run."""
+    found = resolve_pairs(QUICK_PAIRS if quick else PAIRS, FIRST, progress)
+    return (_summary(found), _by_pair(found), _times(progress, quick))
+
+
+def resolve_pairs(count: int, first: int, progress: Progress) -> list[Resolved]:
+    """Draw records until `count` ambiguous pairs are found, in the order of their seeds."""
+    found: list[Resolved] = []
+    workers = os.cpu_count() or 1
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        seed = first
+        while len(found) < count:
+            batch = range(seed, seed + 2 * workers)
+            for number, one in zip(batch, pool.map(resolve, batch), strict=True):
+                if one is not None and len(found) < count:
+                    found.append(one)
+                    said = ", ".join(f"{n} {v}" for n, v in one.named.items())
+                    progress(
+                        f"{len(found)} of {count} (seed {number}): {one.effect} or {one.rival}"
+                        f" after a {one.voltage}; {said} [{one.seconds:.0f} s to design]"
+                    )
+            seed = batch.stop
+    return found
+
+
+def resolve(seed: int) -> Resolved | None:
+    """Draw a device and a first record; if it is ambiguous, play what would tell.
+
+    A random effect of the table is hidden and diagnosed against the other effect that is most
+    probable after screening the whole table; None where the verdict is not ambiguous.
+    """
+    make_record, known, _ = plants()
+    rng = np.random.default_rng(seed)
+    effect = str(rng.choice([n for n in known if n != "temperature"]))
+    voltage = str(rng.choice(CLASSES))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "first.csv"
+        truth = make_record(effect, seed, path, excitation=voltage, visible=RHO)
+        first = read_record(path).slice(0, SAMPLES)
+    try:
+        rival = likely_rival(first, effect)
+        pair = [EFFECTS[effect], EFFECTS[rival]]
+        d = diagnose([first], effects=pair)
+        if d.verdict != "ambiguous" or len(d.contenders) < 2:
+            return None
+        designed = resolving_experiment(d)
+    except PsaError:
+        return None
+    usual = usual_records(designed.limits, designed.limits.steepest(None))
+    named = {}
+    for name, record in {"designed": designed.record, **usual}.items():
+        again = diagnose([first, played(truth, record, seed)], effects=pair)
+        named[name] = judged(again, effect)
+    return _resolved(seed, effect, rival, voltage, named, designed)
+
+
+def likely_rival(record: Record, effect: str) -> str:
+    """Return the effect, other than the hidden one, that is most probable after the screening."""
+    experiments = (split(record),)
+    base = fit_base(starting_model([record], None), experiments)
+    table = [e for e in EFFECTS.values() if not e.inputs and set(e.needs) <= _names(base.model)]
+    predicted = tuple(base.predicted(experiments))
+    seen = examine(base, predicted, Task(experiments, tuple(table)))
+    others = {n: p for n, p in seen.evidence.items() if n != effect}
+    return max(others, key=lambda n: others[n])
+
+
+def _names(model: Any) -> set[str]:
+    return {c.name for c in model.components}
+
+
+def played(truth: Any, record: Record, seed: int) -> Record:
+    """Return what the device measures when a planned voltage is played to it."""
+    again = import_module("tests.plants.again")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{record.name}.csv"
+        again.play_again(truth, seed, path, (record.time, record.voltage))
+        return read_record(path)
+
+
+def judged(d: Diagnosis, effect: str) -> str:
+    """Return "right" or "wrong" where one of the two was named alone, else "open"."""
+    if not d.causes or d.verdict == "ambiguous" or d.causes[0].cannot_be_told_from:
+        return "open"
+    return "right" if d.causes[0].effect == effect else "wrong"
+
+
+def _resolved(
+    seed: int, effect: str, rival: str, voltage: str, named: dict[str, str], s: Separated
+) -> Resolved:
+    growth = {"designed": min(p.designed for p in s.pairs)}
+    growth |= {n: min(p.usual[n] for p in s.pairs) for n in _PLAYED[1:]}
+    chance = s.chance[effect]
+    return Resolved(seed, effect, rival, voltage, s.kind, named, growth, chance, s.seconds)
+
+
+def _summary(found: Sequence[Resolved]) -> TitledTable:
+    rows = []
+    for name in _PLAYED:
+        counts = {v: sum(r.named[name] == v for r in found) for v in ("right", "wrong", "open")}
+        growth = float(np.median([r.growth[name] for r in found])) if found else float("nan")
+        asked = f"{round(0.9 * len(found))} of {len(found)} right" if name == "designed" else ""
+        rows.append((name, asked, *(str(c) for c in counts.values()), f"{growth:.3g}"))
+    head = ("further record", "asked", "right name", "wrong name", "open", "predicted ln B, median")
+    return TitledTable(
+        "Ambiguous pairs on independent plants, after one further record",
+        Table(head, tuple(rows)),
+        "All further records have the length, the sampling and the voltage range of the first. The"
+        " predicted ln B is the growth of the logarithm of the Bayes factor for the less favourable"
+        " of the two truths.",
+    )
+
+
+def _by_pair(found: Sequence[Resolved]) -> TitledTable:
+    rows = [
+        (
+            str(r.seed), r.effect, r.rival, r.voltage, r.kind,
+            *(f"{r.named[n]} ({r.growth[n]:.3g})" for n in _PLAYED),
+            f"{100.0 * r.chance:.0f} %", f"{r.seconds:.0f} s",
+        )
+        for r in found
+    ]  # fmt: skip
+    head = ("seed", "hidden", "rival", "first record", "family", "designed (ln B)",
+            "sine (ln B)", "triangle (ln B)", "predicted chance", "to design")  # fmt: skip
+    return TitledTable("Every pair", Table(head, tuple(rows)))
+
+
+def _times(progress: Progress, quick: bool) -> TitledTable:
+    """Measure the time of designs against their number of samples."""
+    model = stack_model("P-885.51")
+    free = [n for n in CORE if n in model.parameter_names]
+    effects = [EFFECTS["sensor_nonlinearity"], EFFECTS["load_stiffness"]]
+    rivals = [rival_of_effect(model, e, free) for e in effects]
+    noise = SensorNoise(20e-9)
+    rows = []
+    for samples in _QUICK_SIZES if quick else _SIZES:
+        progress(f"designs of {samples} samples")
+        limits = Limits(0.0, 100.0, 2.0, samples)
+        begin = time.perf_counter()
+        separating_experiment(rivals, noise, limits)
+        middle = time.perf_counter()
+        informative_experiment(rival_of_model("base", model, free), noise, limits)
+        taken = (middle - begin, time.perf_counter() - middle)
+        rows.append((f"{samples}", *(f"{t:.1f} s" for t in taken)))
+    return TitledTable(
+        "Time to design an experiment (asked: 1,000 samples in under a minute on two cores)",
+        Table(("samples", "separating two effects", "D-optimal, all parameters"), tuple(rows)),
+        "Voltages are compared on a grid of at most 1,000 samples, so that longer ones cost the"
+        " same but for the record itself.",
+    )

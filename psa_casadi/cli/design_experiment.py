@@ -1,0 +1,170 @@
+"""`psa design experiment`: the next record to measure, for parameters or to tell effects apart."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from psa_casadi.cli.screen import (
+    ColumnsOption,
+    Quiet,
+    StackOption,
+    show,
+    show_table,
+    tell_written,
+    working,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from psa_casadi.input_design.designs import Informative, Separated
+    from psa_casadi.input_design.rivals import Rival
+    from psa_casadi.model.compose import Model
+
+
+class Family(StrEnum):
+    """Families of voltages."""
+
+    ANY = "any"
+    FREE = "free"
+    TRIANGLES = "triangles"
+    STEPS = "steps"
+    MULTISINE = "multisine"
+
+
+class Optimality(StrEnum):
+    """What is made small of the parameters' confidence region."""
+
+    D = "D"
+    E = "E"
+    A = "A"
+
+
+def experiment(
+    more: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Further effects to separate.", show_default=False, metavar="EFFECT..."
+        ),
+    ] = None,
+    model: Annotated[Path | None, typer.Option(help="MODEL.json of the device.")] = None,
+    stack: StackOption = None,
+    record: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--record",
+            help="Record at hand (repeat for several); the rivals are fitted"
+            " to it, and its voltages and length are the design's.",
+        ),
+    ] = None,
+    separate: Annotated[
+        list[str] | None,
+        typer.Option("--separate", help="Effect to tell from the others that are named."),
+    ] = None,
+    parameter: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--parameter",
+            help="Parameter to determine (repeat for several); all that"
+            " records of loops determine where none is named.",
+        ),
+    ] = None,
+    optimality: Annotated[
+        Optimality, typer.Option(help="Volume, worst direction or mean square of the intervals.")
+    ] = Optimality.D,
+    family: Annotated[Family, typer.Option(help="Family of voltages.")] = Family.ANY,
+    low: Annotated[float | None, typer.Option(help="Lowest voltage [V].")] = None,
+    high: Annotated[float | None, typer.Option(help="Highest voltage [V].")] = None,
+    duration: Annotated[float | None, typer.Option(help="Length of the record [s].")] = None,
+    samples: Annotated[int | None, typer.Option(help="Number of samples.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Largest rate [V/s].")] = None,
+    current: Annotated[float | None, typer.Option(help="Largest current [A].")] = None,
+    bandwidth: Annotated[float | None, typer.Option(help="Bandwidth [Hz].")] = None,
+    noise: Annotated[
+        float | None, typer.Option(help="Noise of the sensor, rms [nm]; 0.1 % of the stroke.")
+    ] = None,
+    correlation: Annotated[
+        float, typer.Option(help="Correlation of the noise in neighbouring samples.")
+    ] = 0.0,
+    starts: Annotated[int, typer.Option(help="Voltages that are improved to the end.")] = 2,
+    seed: Annotated[int, typer.Option(help="Seed of the drawn voltages.")] = 1,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="CSV with the voltage to play.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+    columns: ColumnsOption = None,
+    quiet: Quiet = False,
+) -> None:
+    """Design the record to measure next: best for parameters, or to tell effects apart.
+
+    With --separate the rivals are fitted to the records at hand, or have ordinary sizes.
+    """
+    from psa_casadi.cli import design_given
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.input_design.candidates import KINDS
+    from psa_casadi.input_design.designs import Informative, Separated
+    from psa_casadi.input_design.experiment import informative_experiment, separating_experiment
+    from psa_casadi.input_design.search import Effort
+
+    given = Given()
+    given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
+    names = [*(separate or []), *(more or [])]
+    effects = design_given.effects(given, names, parameter or [])
+    chosen = given.model_or_stack(model, stack)
+    records = given.records(record, columns=columns) if record else []
+    design_given.check_noise(given, noise, correlation, starts)
+    wanted = {
+        "low": low, "high": high, "duration": duration, "samples": samples,
+        "rate": rate, "current": current, "bandwidth": bandwidth,
+    }  # fmt: skip
+    limits = given.attempt(lambda: design_given.limits(records, chosen, wanted))
+    given.check()
+    if chosen is None or limits is None:
+        return
+    kinds = KINDS if family is Family.ANY else tuple(k for k in KINDS if k == family.value)
+    effort = Effort(starts=starts, seed=seed)
+    level = design_given.noise(chosen, limits, noise, correlation)
+    with working("designing an experiment", quiet) as progress:
+        design: Informative | Separated
+        if effects:
+            base, rivals, fitted = design_given.rivals(chosen, effects, records, progress)
+            design = separating_experiment(
+                rivals, fitted or level, limits,
+                base=base, kinds=kinds, effort=effort, progress=progress,
+            )  # fmt: skip
+        else:
+            rivals = [design_given.whole(chosen, parameter or [])]
+            design = informative_experiment(
+                rivals[0], level, limits, names=parameter or (), optimality=optimality.value,
+                kinds=kinds, effort=effort, progress=progress,
+            )  # fmt: skip
+        _write(design, chosen, rivals, output, report)
+    _tell(design, chosen, quiet)
+    tell_written(output, report, quiet=quiet)
+
+
+def _write(
+    design: "Informative | Separated",
+    model: "Model",
+    rivals: "Sequence[Rival]",
+    output: Path | None,
+    report: Path | None,
+) -> None:
+    from psa_casadi.report.experiment_part import write_experiment_page, write_voltage
+
+    if output is not None:
+        write_voltage(output, design.record)
+    if report is not None:
+        write_experiment_page(report, design, model, {r.name: r for r in rivals})
+
+
+def _tell(design: "Informative | Separated", model: "Model", quiet: bool) -> None:
+    from psa_casadi.report.experiment_part import design_tables, sentences
+
+    for sentence in sentences(design, model.values.get("C_p")):
+        show(sentence, quiet)
+    for shown in design_tables(design, model):
+        show(f"\n{shown.title}\n", quiet)
+        show_table(shown.table, quiet)

@@ -1,0 +1,111 @@
+"""What `psa design experiment` is given, turned into limits, noise and rivals."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.component import Component
+    from psa_casadi.experiment.record import Record
+    from psa_casadi.input_design.limits import Limits
+    from psa_casadi.input_design.rivals import Rival, SensorNoise
+    from psa_casadi.model.compose import Model
+
+#: Noise of the sensor over the stroke where none is given, and samples of a record.
+_NOISE_SHARE, _SAMPLES = 1e-3, 1000
+
+
+def effects(
+    given: "Given", names: "Sequence[str]", parameters: "Sequence[str]"
+) -> "list[Component]":
+    """Return the effects to separate; all mistakes are noted."""
+    from psa_casadi.effects import EFFECTS
+
+    for name in dict.fromkeys(names):
+        if name not in EFFECTS:
+            given.add(f"There is no effect '{name}'; `psa effects` lists them.")
+    if len(set(names)) == 1:
+        given.add(f"{names[0]} alone cannot be told from anything; name two effects or more.")
+    if names and parameters:
+        given.add("--separate and --parameter are both given; design one record for each.")
+    return [EFFECTS[n] for n in dict.fromkeys(names) if n in EFFECTS]
+
+
+def check_noise(given: "Given", noise: float | None, correlation: float, starts: int) -> None:
+    """Note a noise or a number of starts that is none."""
+    if noise is not None and not noise > 0.0:
+        given.add(f"--noise is {noise:g} nm; give the positive rms of the sensor's noise.")
+    if not 0.0 <= correlation < 1.0:
+        given.add(f"--correlation is {correlation:g}; give a number from 0 to below 1.")
+    if starts < 1:
+        given.add(f"--starts is {starts}; give 1 or more.")
+
+
+def limits(
+    records: "Sequence[Record]", model: "Model | None", wanted: "Mapping[str, float | None]"
+) -> "Limits | None":
+    """Return the limits: as given, else those of the records, else the stack's rated voltage."""
+    from psa_casadi.errors import InputError
+    from psa_casadi.input_design.limits import Limits, limits_of
+
+    if records:
+        return limits_of(records, **wanted)
+    if model is None:
+        return None
+    own = {"low": 0.0, "high": model.values.get("u_rated"), "samples": _SAMPLES}
+    own |= {k: v for k, v in wanted.items() if v is not None}
+    if own.get("duration") is None:
+        raise InputError("No length is given; add --duration SECONDS, or --record with records.")
+    if own["high"] is None:
+        raise InputError("The model has no rated voltage; add --high VOLTS.")
+    samples = int(own.pop("samples") or _SAMPLES)
+    return Limits(samples=samples, **{k: float(v) for k, v in own.items() if v is not None})
+
+
+def noise(
+    model: "Model", limits: "Limits", noise: float | None, correlation: float
+) -> "SensorNoise":
+    """Return the noise [nm] as given, else a share of the stroke within the limits."""
+    from psa_casadi.input_design.rivals import SensorNoise
+    from psa_casadi.simulation.simulate import simulate
+
+    if noise is not None:
+        return SensorNoise(1e-9 * noise, correlation)
+    time = limits.grid(100)
+    ramp = limits.low + limits.span * time / time[-1]
+    reached = simulate(model, time, ramp).outputs["displacement"]
+    return SensorNoise(_NOISE_SHARE * float(reached.max() - reached.min()), correlation)
+
+
+def rivals(
+    model: "Model",
+    effects: "Sequence[Component]",
+    records: "Sequence[Record]",
+    progress: "Callable[[str], None]",
+) -> "tuple[Rival | None, list[Rival], SensorNoise | None]":
+    """Return the base, the rivals and the noise, fitted to records if there are any."""
+    from psa_casadi.diagnosis.contenders import fit_contenders
+    from psa_casadi.identification.search import CORE
+    from psa_casadi.input_design.experiment import rival_of_effect
+    from psa_casadi.input_design.rivals import noise_of_fit, rival_of_fit
+
+    if not records:
+        plain = model.without(e.name for e in effects)
+        free = [n for n in CORE if n in plain.parameter_names]
+        return None, [rival_of_effect(model, e, free) for e in effects], None
+    base, found, experiments = fit_contenders(records, effects, model=model, progress=progress)
+    noise, colour = noise_of_fit(min(found, key=lambda c: c.fit.rms).fit, experiments)
+    fitted = [rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in found]
+    return rival_of_fit("base", base, colour), fitted, noise
+
+
+def whole(model: "Model", wanted: "Sequence[str]") -> "Rival":
+    """Return the model with what records of loops determine as its unknowns, and what is wanted."""
+    from psa_casadi.identification.search import CORE, FIXED
+    from psa_casadi.input_design.rivals import rival_of_model
+
+    own = [p.name for e in model.effects for p in e.parameters if p.name not in FIXED]
+    free = [n for n in CORE if n in model.parameter_names]
+    names = dict.fromkeys([*free, *own, *(n for n in wanted if n in model.parameter_names)])
+    return rival_of_model(model.name, model, tuple(names))

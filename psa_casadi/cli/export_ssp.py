@@ -1,0 +1,81 @@
+"""`psa export ssp`: a closed-loop nanopositioner around a stack as an SSP archive."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written, working
+
+if TYPE_CHECKING:
+    from psa_casadi.export.ssp_structure import WiredParts
+
+
+def ssp(
+    output: Annotated[Path, typer.Option("-o", "--output", help="SSP archive to write.")],
+    model: Annotated[Path | None, typer.Option(help="MODEL.json of the stack.")] = None,
+    stack: StackOption = None,
+    no_compensator: Annotated[
+        bool, typer.Option("--no-compensator", help="Leave the hysteresis compensator out.")
+    ] = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the wiring to write, .svg or .png.")
+    ] = None,
+    platforms: Annotated[
+        str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
+    ] = "host",
+    quiet: Quiet = False,
+) -> None:
+    """Write a nanopositioner as SSP: controller, compensator, amplifier, stack, flexure, wired."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.export.platforms import chosen_platforms
+    from psa_casadi.export.ssp import export_ssp, layout_of, save_wiring, wiring_of
+    from psa_casadi.model.nanopositioner import nanopositioner
+
+    given = Given()
+    given.outputs({"--output": output, "--picture": picture}, [model])
+    if picture is not None and picture.suffix.lower() not in (".svg", ".png"):
+        given.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
+    wanted = [p.strip() for p in platforms.split(",") if p.strip()]
+    given.attempt(lambda: chosen_platforms(wanted))
+    chosen = given.model_or_stack(model, stack)
+    system = None
+    if chosen is not None:
+        system = given.attempt(lambda: nanopositioner(chosen, compensated=not no_compensator))
+    given.check()
+    if system is None:
+        return
+    with working("compiling", quiet) as progress:
+        progress(", ".join(system.parts))
+        export_ssp(system, output, platforms=wanted)
+    wiring = wiring_of(system)
+    if picture is not None:
+        save_wiring(wiring, layout_of(wiring), picture)
+    show(f"parts: {', '.join(system.parts)}", quiet)
+    _ports(wiring, quiet)
+    _steps(wiring, quiet)
+    tell_written(output, picture, quiet=quiet)
+
+
+def _ports(wiring: "WiredParts", quiet: bool) -> None:
+    from psa_casadi.export.ssp_layout import OUTSIDE, Port
+
+    for kind in ("input", "output"):
+        named = [
+            f"{name} [{wiring.unit(Port(OUTSIDE, name))}]"
+            for name, found in wiring.ports(OUTSIDE)
+            if found == kind
+        ]
+        show(f"{kind}s: {', '.join(named)}", quiet)
+
+
+def _steps(wiring: "WiredParts", quiet: bool) -> None:
+    from psa_casadi.export.ssp_steps import stable_step
+
+    if quiet:
+        return
+    held, sloped = (1e6 * stable_step(wiring, rates=rates) for rates in (False, True))
+    show(
+        f"communication step: unstable above {held:.3g} us with inputs held over a step, above"
+        f" {sloped:.3g} us with input derivatives"
+    )

@@ -1,0 +1,66 @@
+"""The fitted effects that a diagnosis could not choose among, for the design of what would tell."""
+
+from collections.abc import Sequence
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.evidence import CREDIBLE, credible_set
+from psa_casadi.diagnosis.extension import extend, polish
+from psa_casadi.diagnosis.result import Contender
+from psa_casadi.diagnosis.rounds import Round, examine
+from psa_casadi.diagnosis.selection import starts_of
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.errors import InputError
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import Experiment, whole
+from psa_casadi.experiment.suspects import cleaned
+from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.refitting import Progress
+from psa_casadi.identification.search import fit_base
+from psa_casadi.identification.starting import chosen_start
+from psa_casadi.model.compose import Model
+
+
+def contenders(
+    r: Round, experiments: Sequence[Experiment], names: Sequence[str] = ()
+) -> tuple[Contender, ...]:
+    """Return effects of one step of the search with their fits; those not fitted are fitted now.
+
+    Without `names` they are the fewest that hold the cause with the probability `CREDIBLE`. An
+    effect whose fit fails is left out.
+    """
+    names = names or credible_set(r.probability, CREDIBLE)
+    found = {e.effect.name: e for e in r.extensions}
+    for name in names:
+        if name not in found:
+            scores = starts_of(r.screening, name)
+            fitted = extend(r.fit, experiments, scores, r.screening.colour) if scores else None
+            if fitted is not None:
+                found[name] = polish(r.fit, fitted, experiments, r.screening.colour)
+    return tuple(Contender(n, found[n].fit, found[n].evidence) for n in names if n in found)
+
+
+def fit_contenders(
+    records: Sequence[Record],
+    effects: Sequence[Component],
+    *,
+    model: Model | None = None,
+    progress: Progress = lambda _: None,
+) -> tuple[Fit, tuple[Contender, ...], tuple[Experiment, ...]]:
+    """Fit the base and each of the named effects to records in full, without a verdict.
+
+    Raises InputError where an effect cannot be fitted to them.
+    """
+    experiments = tuple(whole(cleaned(r)) for r in records)
+    start = chosen_start(records, model, None)[0].without(e.name for e in effects)
+    base = fit_base(start, experiments, progress=progress)
+    predicted = tuple(base.predicted(experiments))
+    found = examine(base, predicted, Task(experiments, tuple(effects), progress=progress))
+    progress("fitting the rivals")
+    chosen = contenders(found, experiments, [e.name for e in effects])
+    lost = {e.name for e in effects} - {c.effect for c in chosen}
+    if lost:
+        raise InputError(
+            f"{', '.join(sorted(lost))} could not be fitted to these records, so there is nothing"
+            " to tell apart; leave the records out to design from ordinary sizes."
+        )
+    return base, chosen, experiments

@@ -1,0 +1,155 @@
+"""Models that a designed record shall tell apart or sharpen: values, unknowns, what is known.
+
+A rival's unknowns are coordinates delta around its values: its free parameters, and for the new
+record the initial states that no voltage tells, in nominal sizes, and the sensor's offset in um.
+What the records at hand say of the parameters is an information matrix, their own initial states
+and offsets eliminated: H = H_pp - H_pn H_nn^-1 H_np, with the weak priors of the fits.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psa_casadi.diagnosis.colour import Colour, colour_of
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.prediction import OUTPUT, predict_record
+from psa_casadi.identification.unknowns import MEMORY_PRIOR, Unknowns, unknowns_of
+from psa_casadi.input_design.limits import Limits
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.start import memory_names, start_state
+from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
+from psa_casadi.variables import nominal_value
+
+#: Tolerance of trajectories: far below what a step of the gradient changes.
+RTOL = 1e-6
+_STEPS = 4000
+_OFFSET = 1e-6
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of the sensor: `rms` [m], and the `correlation` of neighbouring samples, 0 if white."""
+
+    rms: float
+    correlation: float = 0.0
+
+    def on_grid(self, limits: Limits, samples: int) -> Colour:
+        """Return the noise on a grid of fewer samples that tells as much about slow signals.
+
+        On every m-th sample the correlation is r^m, and the variance is such that the density at
+        frequency 0, s^2 (1 + r)/(1 - r), over the number of samples stays what it is.
+        """
+        r = self.correlation
+        m = limits.samples / samples
+        coarse = r**m
+        density = self.rms**2 * (1.0 + r) / (1.0 - r) / m
+        variance = density * (1.0 - coarse) / (1.0 + coarse)
+        colour = np.array([coarse] if coarse > 0.0 else [])
+        return Colour((colour,), float(np.sqrt(variance * (1.0 - coarse**2))), (samples,))
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A model with the coordinates `theta` (k,) of its free parameters and what is known of them.
+
+    `known` (k, k) is the information of the records at hand and the priors; `evidence` is ln of the
+    Bayes factor over the base that those records give.
+    """
+
+    name: str
+    model: Model
+    unknowns: Unknowns
+    theta: FloatArray
+    known: FloatArray
+    evidence: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates for a new record: parameters, initial states, offset."""
+        return len(self.theta) + len(memory_names(self.model.structure)) + 1
+
+    @property
+    def information(self) -> FloatArray:
+        """Return what is known of all coordinates, (size, size); nothing of the offset."""
+        count, states = len(self.theta), len(memory_names(self.model.structure))
+        full = np.zeros((self.size, self.size))
+        full[:count, :count] = self.known
+        where = np.arange(count, count + states)
+        full[where, where] = 1.0 / MEMORY_PRIOR**2
+        return full
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest delta (size,) that the parameters' bounds allow."""
+        count, rest = len(self.theta), np.full(self.size - len(self.theta), np.inf)
+        low, high = (edge[:count] - self.theta for edge in self.unknowns.bounds())
+        return np.append(np.minimum(low, 0.0), -rest), np.append(np.maximum(high, 0.0), rest)
+
+    def moved(self, delta: FloatArray) -> tuple[Model, dict[str, float]]:
+        """Return the model and the deviations of its initial states at delta (size,)."""
+        count = len(self.theta)
+        values = self.unknowns.values(self.theta + delta[:count])
+        sizes = memory_sizes(self.model)
+        start = dict(zip(sizes, (np.array(list(sizes.values())) * delta[count:-1]).tolist(),
+                         strict=True))  # fmt: skip
+        return self.model.with_values(values), start
+
+    def predict(self, record: Record, delta: FloatArray) -> FloatArray:
+        """Return the displacement (n,) [m] that the rival predicts at delta."""
+        model, start = self.moved(delta)
+        u = record_inputs(model, record, record.n)
+        x0 = start_state(model, list(u[0]), None, start, 0.0).x
+        t = record.time - record.time[0]
+        steps = run(model, t, u, x0, rtol=RTOL, steps_limit=_STEPS)
+        y: FloatArray = steps.y[:, model.output_names.index(OUTPUT)] + _OFFSET * delta[-1]
+        return y
+
+    def sensitivities(self, record: Record, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the displacement (n,) [m] and its exact derivative by delta (n, size) [m]."""
+        model, start = self.moved(delta)
+        y, by_parameter, by_start = predict_record(
+            model, record, start, self.unknowns.names, stop=record.n, rtol=RTOL
+        )
+        slopes = self.unknowns.slopes(self.theta + delta[: len(self.theta)])
+        sizes = np.array(list(memory_sizes(model).values()))
+        columns = [by_parameter @ slopes, by_start * sizes, np.full((record.n, 1), _OFFSET)]
+        return y + _OFFSET * delta[-1], np.hstack(columns)
+
+
+def memory_sizes(model: Model) -> dict[str, float]:
+    """Return the usual size of every state whose start no voltage tells."""
+    states = {s.name: s for s in model.structure.states}
+    names = memory_names(model.structure)
+    return {n: nominal_value(states[n].nominal, model.values) for n in names}
+
+
+def rival_of_fit(name: str, fit: Fit, colour: Colour, evidence: float = 0.0) -> Rival:
+    """Return a fitted model as a rival; what it was fitted to is what is known of it.
+
+    `colour` is the noise of the fit's samples.
+    """
+    count = len(fit.unknowns.names)
+    white = colour.whiten(fit.jacobian) / colour.level
+    full = white.T @ white + np.diag(1.0 / fit.unknowns.prior**2)
+    inner, cross = full[count:, count:], full[:count, count:]
+    known = full[:count, :count] - cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T
+    return Rival(name, fit.model, fit.unknowns, fit.theta[:count].copy(), known, evidence)
+
+
+def rival_of_model(name: str, model: Model, free: Sequence[str]) -> Rival:
+    """Return a model of which only the order of magnitude of its free parameters is known."""
+    unknowns = unknowns_of(model, free, [], [], _OFFSET)
+    theta = unknowns.coordinates(model.values)
+    return Rival(name, model, unknowns, theta, np.diag(1.0 / unknowns.prior[: len(theta)] ** 2))
+
+
+def noise_of_fit(fit: Fit, experiments: Sequence[Experiment]) -> tuple[SensorNoise, Colour]:
+    """Return the noise that a fit's residuals show: rms and correlation, and as their colour."""
+    colour = colour_of(fit.residuals, [int(e.used.sum()) for e in experiments])
+    first = colour.autoregression[0]
+    correlation = float(first[0]) if first.size else 0.0
+    return SensorNoise(fit.rms, correlation), colour

@@ -1,0 +1,106 @@
+"""The parts that stand around a stack, each a model of its own, and tuned to a given stack."""
+
+from dataclasses import dataclass, replace
+from math import inf, pi
+
+from psa_casadi.components import COMPONENTS
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Model, compose
+
+__all__ = ["PARTS", "PartKind", "compensator_for", "part_model"]
+
+
+@dataclass(frozen=True)
+class PartKind:
+    """A part by name: what it is and the components that it consists of."""
+
+    name: str
+    description: str
+    components: tuple[str, ...]
+
+
+PARTS: dict[str, PartKind] = {
+    kind.name: kind
+    for kind in (
+        PartKind(
+            "flexure_stage",
+            "guided stage that a stack pushes through a contact stiffness",
+            ("flexure",),
+        ),
+        PartKind(
+            "position_controller",
+            "sampled position controller: PI behind a notch, saturation, anti-windup",
+            ("position_controller",),
+        ),
+        PartKind(
+            "hysteresis_compensator",
+            "observer of a stack's hysteresis force that takes it off the command",
+            ("hysteresis_compensator", "linear_force", "bouc_wen"),
+        ),
+        PartKind(
+            "voltage_amplifier",
+            "voltage amplifier of finite bandwidth, output range and current",
+            ("voltage_amplifier",),
+        ),
+        PartKind(
+            "charge_amplifier",
+            "charge amplifier with a leakage corner",
+            ("charge_amplifier",),
+        ),
+    )
+}
+
+#: Effects on the generated force that the observer can run: those of u and of states. (The one of
+#: rate_dependent_hysteresis follows u' at once, which is the compensated command itself: a loop.)
+_OBSERVED = (
+    "field_dependent_gain",
+    "hysteresis_memory",
+    "rate_independent_asymmetry",
+    "saturation_of_strain",
+)
+
+
+def part_model(name: str, **values: float) -> Model:
+    """Return a part by name as a model, with some values replaced (SI units).
+
+    Raises InputError for an unknown name, an unknown parameter or a value out of bounds.
+    """
+    if name not in PARTS:
+        raise InputError(f"There is no part named '{name}'; there are {', '.join(PARTS)}.")
+    kind = PARTS[name]
+    components = [COMPONENTS[n] for n in kind.components]
+    return compose(components, values, name=name, description=kind.description)
+
+
+def compensator_for(
+    stack: Model, *, amplifier_gain: float = 1.0, amplifier_bandwidth: float = inf
+) -> Model:
+    """Return the hysteresis compensator of a stack: its own equation (8) with its own values.
+
+    The command is scaled so that `amplifier_gain` [1] times it is the voltage at the stack's input;
+    the observer's lag is that of the stack's drive and of an amplifier of `amplifier_bandwidth`
+    [Hz]. Effects of the stack on the force that its wafers generate come along; creep and what lies
+    behind the force stay.
+
+    Raises InputError for a model without drive, linear force and Bouc-Wen hysteresis.
+    """
+    needed = ("drive", "linear_force", "bouc_wen")
+    there = {c.name for c in stack.components}
+    missing = [n for n in needed if n not in there]
+    if missing:
+        raise InputError(
+            f"The model '{stack.name}' has no {', '.join(missing)}; a compensator needs a stack"
+            " with them, such as one of `psa stacks`."
+        )
+    kind = PARTS["hysteresis_compensator"]
+    components = [COMPONENTS[n] for n in kind.components]
+    components += [EFFECTS[n] for n in _OBSERVED if n in there]
+    lag = 0.0 if amplifier_bandwidth == inf else 1.0 / (2.0 * pi * amplifier_bandwidth)
+    own = {p.name: stack.values[p.name] for c in components for p in c.parameters
+           if p.name in stack.values}  # fmt: skip
+    own["drive_gain"] = stack.values["G"] * amplifier_gain
+    own["drive_time"] = stack.values["R_s"] * stack.values["C_p"] + lag
+    note = f"Compensates the hysteresis of {stack.name}, with that model's values."
+    model = compose(components, own, name=kind.name, description=kind.description)
+    return model.with_values({}, provenance=replace(stack.provenance, notes=(note,)))

@@ -1,0 +1,248 @@
+"""Designed experiments: within their limits, with right gradients, and better than a sine."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from typer.testing import CliRunner
+
+from psa_casadi import reference
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, read_record
+from psa_casadi.input_design.candidates import KINDS, Kind, draw, rest_of
+from psa_casadi.input_design.criterion import Criterion
+from psa_casadi.input_design.experiment import (
+    informative_experiment,
+    rival_of_effect,
+    separating_experiment,
+    usual_records,
+)
+from psa_casadi.input_design.information import Information, Optimality
+from psa_casadi.input_design.limits import Limits, excess
+from psa_casadi.input_design.rivals import Rival, SensorNoise, rival_of_model
+from psa_casadi.input_design.search import Effort
+from psa_casadi.input_design.separation import Separation, naming_probability
+from psa_casadi.model.compose import Model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.units import FloatArray
+
+STACK = "P-885.51"
+FREE = ("k_L", "A", "delta", "tau", "R_s")
+LIMITS = Limits(0.0, 100.0, 1.0, 200)
+NOISE = SensorNoise(20e-9)
+BRIEF = Effort(draws=2, starts=1, steps=3)
+
+
+def rivals() -> list[Rival]:
+    """A bent sensor and creep, each of a fifth of its ordinary size."""
+    found = []
+    for effect in (EFFECTS[n] for n in ("sensor_nonlinearity", "slow_creep")):
+        model = stack_model(STACK).with_effect(effect)
+        size = 0.2 * model.parameter(effect.gain or "").typical(model.values)
+        found.append(rival_of_effect(model.with_values({effect.gain or "": size}), effect, FREE))
+    return found
+
+
+def planned(kind: Kind, limits: Limits = LIMITS, seed: int = 3) -> Record:
+    wave = draw(kind, limits, limits.steepest(None), np.random.default_rng(seed))
+    time = limits.grid()
+    return Record(kind, time, wave.voltage(wave.start, time))
+
+
+def test_all_that_is_wrong_with_limits_is_said_at_once() -> None:
+    with pytest.raises(InputError) as caught:
+        Limits(5.0, 5.0, -1.0, 3, rate=0.0)
+    assert len(caught.value.problems) == 4
+    with pytest.raises(InputError, match="no whole cycle"):
+        Limits(0.0, 100.0, 1.0, 100, bandwidth=0.5)
+    with pytest.raises(InputError, match="cannot be shown"):
+        Limits(0.0, 100.0, 1.0, 100, bandwidth=80.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(4))
+def test_voltages_keep_every_limit(kind: Kind, seed: int) -> None:
+    capacitance = 1.5e-6
+    limits = Limits(-20.0, 100.0, 2.0, 1000, rate=5e3, current=1.5e-3, bandwidth=10.0)
+    steepest = limits.steepest(capacitance)
+    assert steepest == pytest.approx(1e3)  # the current asks for less than the rate
+    rng = np.random.default_rng(seed)
+    wave, time = draw(kind, limits, steepest, rng), limits.grid()
+    voltage = wave.voltage(wave.start, time)
+    assert excess(Record(kind, time, voltage), limits, capacitance) == ()
+    np.testing.assert_allclose(voltage[time <= rest_of(limits)], limits.low, atol=1e-9)
+    assert np.ptp(voltage) > 0.1 * limits.span
+    assert np.all(wave.slack(wave.start) >= -1e-9)
+    quiet = Limits(-20.0, 100.0, 2.0, 1000, rate=1e2)
+    assert excess(Record(kind, time, voltage), quiet, None) != ()
+    tones = np.abs(np.fft.rfft((voltage - voltage.mean()) * np.hanning(len(time)))) ** 2
+    above = np.fft.rfftfreq(len(time), time[1]) > 4.0 * limits.band
+    assert tones[above].sum() < 0.02 * tones.sum()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("which", ["separation", "D", "E", "A"])
+def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: str) -> None:
+    """Against differences of the value itself, each of which fits and simulates again."""
+    criterion: Criterion
+    if which == "separation":
+        noise = NOISE.on_grid(LIMITS, LIMITS.samples)
+        criterion = Separation(tuple(rivals()), noise, evaluations=60)
+    else:
+        optimality: Optimality = "D" if which == "D" else "E" if which == "E" else "A"
+        colour = SensorNoise(20e-9, 0.4).on_grid(LIMITS, LIMITS.samples)
+        criterion = Information(rivals()[1], ("k_L", "A"), optimality, colour)
+    wave = draw(kind, LIMITS, np.inf, np.random.default_rng(5))
+    time, step = LIMITS.grid(), 3e-3
+    rng = np.random.default_rng(1)
+    way = rng.standard_normal(len(wave.start)) / np.sqrt(len(wave.start))
+    if kind == "steps":  # an edge that moves over a sample makes a kink: change the levels only
+        way[len(way) // 2 :] = 0.0
+    p = np.clip(wave.start, wave.lower + 0.02, wave.upper - 0.02)
+
+    def at(share: float) -> Record:
+        return Record(kind, time, wave.voltage(p + share * way, time))
+
+    frozen = criterion.at(at(0.0)).frozen
+    told = (frozen(at(step)) - frozen(at(-step))) / (2.0 * step)
+    seen = (criterion.at(at(step)).value - criterion.at(at(-step)).value) / (2.0 * step)
+    assert told == pytest.approx(seen, rel=0.15, abs=0.02)
+
+
+def test_standard_errors_are_those_of_the_papers_equations_in_plain_numpy() -> None:
+    """Differences of the independent reference give the same covariance as exact sensitivities."""
+    names, limits = ("k_L", "A", "delta"), Limits(0.0, 100.0, 1.0, 60)
+    model, record = stack_model(STACK), planned("triangles", limits)
+    rival = rival_of_model("base", model, names)
+    criterion = Information(rival, names, "D", NOISE.on_grid(limits, limits.samples))
+    told = criterion.standard_errors(record)
+    columns = [_slope(model, record, n, 1e-3 * abs(model.values[n])) for n in names]
+    columns += [_slope(model, record, "f_H", 1e-3 * model.values["h_ref"]), np.ones(record.n)]
+    jacobian = np.column_stack(columns) / NOISE.rms
+    size = np.linalg.norm(jacobian, axis=0)
+    covariance = np.linalg.inv((jacobian / size).T @ (jacobian / size))
+    seen = np.sqrt(np.diag(covariance)) / size
+    np.testing.assert_allclose([told[n] for n in names], seen[: len(names)], rtol=0.02)
+
+
+def _slope(model: Model, record: Record, name: str, step: float) -> FloatArray:
+    def at(change: float) -> FloatArray:
+        values = {**model.values}
+        force = 0.0
+        if name == "f_H":
+            force = change
+        else:
+            values[name] += change
+        y = force / values["k_P"]
+        start = {"f_H": force, "f_out": force, "y": y, "x": y + force / values["k_B"]}
+        signal = reference.from_samples(record.time, record.voltage)
+        return reference.simulate(
+            values, signal, record.time, initial=start, breakpoints=record.time.tolist(), rtol=1e-8
+        ).displacement
+
+    return (at(step) - at(-step)) / (2.0 * step)
+
+
+def test_the_distance_is_what_an_independent_optimiser_leaves() -> None:
+    one, other = rivals()
+    record, noise = planned("steps"), NOISE.on_grid(LIMITS, LIMITS.samples)
+    found = Separation((one, other), noise).distances(record)
+    target = one.predict(record, np.zeros(one.size))
+    root = np.linalg.cholesky(other.information + 1e-12 * np.eye(other.size)).T
+
+    def rest(delta: FloatArray) -> FloatArray:
+        gap = (target - other.predict(record, delta)) / NOISE.rms
+        return np.concatenate([gap, root @ delta])
+
+    best = least_squares(rest, np.zeros(other.size), diff_step=[1e-4], x_scale="jac", max_nfev=60)
+    assert found[one.name, other.name] == pytest.approx(2.0 * best.cost, rel=0.05)
+
+
+def test_what_is_known_of_a_rival_holds_it_back() -> None:
+    """The better the data at hand know a rival, the less it can follow the other."""
+    one, other = rivals()
+    record, noise = planned("steps"), NOISE.on_grid(LIMITS, LIMITS.samples)
+    sure = Rival(other.name, other.model, other.unknowns, other.theta, 1e6 * other.known)
+    loose = Separation((one, other), noise).distance(one, other, record)
+    tight = Separation((one, sure), noise).distance(one, sure, record)
+    assert tight > 1.05 * loose
+
+
+def test_naming_is_as_sure_as_the_evidence_says() -> None:
+    one, other = rivals()
+    pair = (one.name, other.name)
+    small, large = ({pair: t} for t in (4.0, 60.0))
+    assert naming_probability(one, [other], small, 0.0) < 0.05
+    assert naming_probability(one, [other], large, 0.0) > 0.99
+    # evidence over the base raises what a diagnosis asks for
+    assert naming_probability(one, [other], large, 4e4) < 0.01
+
+
+def test_coloured_noise_tells_less_of_slow_voltages() -> None:
+    rival = rival_of_model("base", stack_model(STACK), FREE)
+    record = planned("triangles")
+    errors = []
+    for correlation in (0.0, 0.8):
+        noise = SensorNoise(20e-9, correlation).on_grid(LIMITS, LIMITS.samples)
+        errors.append(Information(rival, FREE, "D", noise).standard_errors(record)["k_L"])
+    assert 2.0 < errors[1] / errors[0] < 4.0  # sqrt((1 + r)/(1 - r)) = 3 for constant signals
+
+
+def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> None:
+    limits = Limits(0.0, 80.0, 1.0, 200, rate=2e3)
+    told = separating_experiment(rivals(), NOISE, limits, effort=BRIEF)
+    assert told.record.n == limits.samples
+    assert excess(told.record, limits, None) == ()
+    assert told.factor("sine") > 1.0
+    assert told.factor("triangle") > 1.0
+    rival = rival_of_model("base", stack_model(STACK), FREE)
+    sharp = informative_experiment(rival, NOISE, limits, optimality="A", effort=BRIEF)
+    assert excess(sharp.record, limits, None) == ()
+    assert min(sharp.factor.values()) > 1.1
+    for name in FREE:
+        before, after = (np.diff(i[name])[0] for i in (sharp.before, sharp.intervals))
+        assert 0.0 < after < before
+
+
+def test_the_usual_voltages_slow_down_where_the_rate_asks() -> None:
+    limits = Limits(0.0, 100.0, 1.0, 200, rate=500.0)
+    for record in usual_records(limits, 500.0).values():
+        assert excess(record, limits, None) == ()
+        assert np.ptp(record.voltage) > 0.9 * limits.span
+
+
+def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None:
+    output, page = tmp_path / "voltage.csv", tmp_path / "page.html"
+    arguments = [
+        "design", "experiment", "--stack", STACK, "--duration", "0.5", "--samples", "100",
+        "--high", "60", "--current", "0.01", "--family", "triangles", "--starts", "1",
+        "--separate", "sensor_nonlinearity", "slow_creep", "-o", str(output), "--report", str(page),
+    ]  # fmt: skip
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 0, found.output
+    assert "sensor nonlinearity" in found.output
+    record = read_record(output, need_displacement=False)
+    limits = Limits(0.0, 60.0, 0.5, 100, current=0.01)
+    assert record.n == 100
+    assert excess(record, limits, stack_model(STACK).values["C_p"]) == ()
+    assert "The voltage to play" in page.read_text(encoding="utf-8")
+
+
+def test_the_command_tells_all_mistakes_at_once(tmp_path: Path) -> None:
+    arguments = [
+        "design", "experiment", "--separate", "creeping", "--noise", "-1", "--starts", "0",
+        "-o", str(tmp_path / "no" / "where.csv"),
+    ]  # fmt: skip
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 2
+    for part in ("creeping", "--noise", "--starts", "does not exist", "No model is given"):
+        assert part in found.output
+
+
+def test_a_parameter_that_is_not_free_is_named() -> None:
+    rival = rival_of_model("base", stack_model(STACK), FREE)
+    with pytest.raises(InputError, match="stiffnes"):
+        Information(rival, ("stiffnes",), "D", NOISE.on_grid(LIMITS, 200))

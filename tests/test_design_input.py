@@ -1,0 +1,137 @@
+"""Designed inputs against the independent reference, the limits, the FMU, and a linear bound."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.bench.creeping_reference import creeping_displacement
+from psa_casadi.bench.design_tracking import LIMITS, scan, scanner, wrong_values
+from psa_casadi.bench.linear_bound import bang_bang_bound
+from psa_casadi.cli.app import app
+from psa_casadi.input_design.amplifier_limits import AmplifierLimits
+from psa_casadi.input_design.inversion import correct, invert
+from psa_casadi.input_design.minimum_time import quickest_move
+from psa_casadi.input_design.targets import Target, raster_scan, read_target
+from psa_casadi.input_design.tracking import TrackedInput, track
+from psa_casadi.input_design.verification import error_of, uncompensated
+
+
+@cache
+def a_scan() -> Target:
+    return scan(scanner(), 250)
+
+
+@cache
+def a_design() -> TrackedInput:
+    return track(scanner(), a_scan())
+
+
+def on_reference(voltage: np.ndarray) -> float:
+    shown = creeping_displacement(scanner().values, a_scan().time, voltage)
+    return error_of(a_scan(), shown).rms_percent
+
+
+def test_a_designed_scan_follows_its_path_on_the_independent_reference() -> None:
+    plain = on_reference(uncompensated(scanner(), a_scan()).voltage)
+    assert 5.0 < plain < 20.0
+    assert on_reference(a_design().voltage) < 0.1
+    assert on_reference(invert(scanner(), a_scan()).response.voltage) < 0.02 * plain
+
+
+def test_the_simulator_says_what_the_reference_says() -> None:
+    shown = creeping_displacement(scanner().values, a_scan().time, a_design().voltage)
+    assert shown == pytest.approx(a_design().response.displacement, abs=1e-4 * a_scan().span)
+
+
+def test_trials_make_up_for_parameters_that_are_off() -> None:
+    values = wrong_values(scanner(), np.random.default_rng(3))
+    voltage, errors = a_design().voltage, []
+    for _ in range(3):
+        shown = creeping_displacement(values, a_scan().time, voltage)
+        errors.append(error_of(a_scan(), shown).rms_percent)
+        voltage = correct(scanner(), a_scan(), voltage, shown)
+    assert errors[2] < 1.0
+    assert errors[2] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize(
+    "limits", [AmplifierLimits(max_rate=11e3), AmplifierLimits(max_current=0.016)]
+)
+def test_limits_are_kept_and_cost_accuracy(limits: AmplifierLimits) -> None:
+    found = track(scanner(), a_scan(), limits, corrections=0)
+    rate = np.abs(np.diff(found.voltage) / np.diff(a_scan().time))
+    assert rate.max() <= limits.max_rate * (1.0 + 1e-6)
+    assert np.abs(found.response.current).max() <= limits.max_current * (1.0 + 1e-3)
+    assert found.error.rms > 10.0 * a_design().error.rms
+
+
+def test_minimax_lowers_the_largest_error() -> None:
+    found = track(scanner(), a_scan(), minimax=True, corrections=1)
+    assert found.error.largest < 0.98 * a_design().error.largest
+
+
+@pytest.mark.parametrize("payload", [0.5, 0.0])
+def test_a_quickest_move_is_near_the_bound_of_the_linear_part(payload: float) -> None:
+    model = scanner(payload)
+    found = quickest_move(model, 2e-6, 10e-6, LIMITS)
+    bound = bang_bang_bound(model.values, 2e-6, 10e-6, -20.0, 120.0)
+    assert bound < found.move_time < 1.1 * bound
+    assert found.residual < 1e-3
+    assert abs(found.offset) < 1e-3
+    voltage = found.response.voltage
+    assert voltage.min() >= -20.0 - 1e-6
+    assert voltage.max() <= 120.0 + 1e-6
+
+
+def test_a_move_obeys_rate_and_current() -> None:
+    limits = AmplifierLimits(-20.0, 120.0, max_rate=8e5, max_current=0.9)
+    found = quickest_move(scanner(), 2e-6, 10e-6, limits, intervals=60)
+    rate = np.diff(found.response.voltage) / np.diff(found.response.time)
+    assert np.abs(rate).max() <= 8e5 * (1.0 + 1e-6)
+    assert np.abs(found.response.current).max() <= 0.9 * (1.0 + 1e-3)
+    assert found.residual < 1e-3
+
+
+def test_a_raster_scan_is_smooth_and_closed() -> None:
+    path = raster_scan(low=1e-6, high=5e-6, frequency=10.0, lines=2, samples=2001)
+    assert path.displacement[[0, 500, 1000, -1]] * 1e6 == pytest.approx([1.0, 5.0, 1.0, 1.0])
+    speed = np.diff(path.displacement) / path.step
+    assert np.abs(np.diff(speed)).max() < 0.05 * np.abs(speed).max()
+
+
+def test_mistakes_are_told_together(tmp_path: Path) -> None:
+    bad = tmp_path / "path.csv"
+    bad.write_text("time [s],displacement [um]\n0,0\n1,x\n", encoding="utf-8")
+    with pytest.raises(psa.InputError, match="'x'"):
+        read_target(bad)
+    with pytest.raises(psa.InputError, match="not below"):
+        AmplifierLimits(5.0, 1.0)
+    with pytest.raises(psa.InputError, match="both limits"):
+        quickest_move(scanner(), 0.0, 1e-6, AmplifierLimits())
+    with pytest.raises(psa.InputError, match="rests at"):
+        quickest_move(scanner(), 0.0, 50e-6, LIMITS)
+
+
+def test_the_command_writes_voltage_and_page(tmp_path: Path) -> None:
+    psa.save_model(scanner(), tmp_path / "m.json")
+    path, out = a_scan(), tmp_path / "v.csv"
+    psa.write_record(
+        tmp_path / "p.csv",
+        {"time [s]": path.time, "displacement [um]": 1e6 * path.displacement},
+    )
+    arguments = ["design", "input", "--model", str(tmp_path / "m.json"), "-o", str(out)]
+    more = ["--target", str(tmp_path / "p.csv"), "--report", str(tmp_path / "r.html")]
+    found = CliRunner().invoke(app, [*arguments, *more])
+    assert found.exit_code == 0, found.output
+    rows = [line for line in found.output.splitlines() if line.startswith("designed")]
+    simulated, fmu = (float(row.split()[-2]) for row in rows[:2])
+    assert fmu == pytest.approx(simulated, rel=0.02)
+    record = psa.read_record(out)
+    assert on_reference(record.voltage) < 0.1
+    assert "Limits and margins" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    wrong = CliRunner().invoke(app, [*arguments, "--fast", "--minimax"])
+    assert wrong.exit_code == 2

@@ -1,0 +1,168 @@
+"""Every example runs and finds what it says; the command shows, copies and runs them."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.examples import use_in_casadi, van_der_pol
+from psa_casadi.examples.index import examples, run_example
+
+EXAMPLES = [e.name for e in examples().values() if e.kind == "example"]
+
+
+def _van_der_pol(found: Mapping[str, float]) -> None:
+    """The limit cycle's amplitude is 2.0086 at mu = 1 and 2.0217 at mu = 5."""
+    one, five = found.values()
+    assert one == pytest.approx(2.0086, abs=2e-3)
+    assert five == pytest.approx(2.0217, abs=2e-3)
+
+
+def _use_in_fmpy(found: Mapping[str, float]) -> None:
+    stroke, held, sloped, repeated = found.values()
+    assert 14.0 < stroke < 18.0
+    assert sloped < 1e-5
+    assert held > 0.1
+    assert repeated == 0.0
+
+
+def _use_in_casadi(found: Mapping[str, float]) -> None:
+    step, slope, rms, difference = found.values()
+    assert 14.0 < step < 18.0
+    assert slope == pytest.approx(_slope_by_differences(), rel=1e-4)
+    assert rms < 10.0
+    assert difference < 1e-5
+
+
+def _slope_by_differences() -> float:
+    """Return d displacement / d k_L [um per N/V] 2 ms after a step of 100 V, by two runs."""
+    ends = []
+    for share in (-1e-3, 1e-3):
+        plant = psa.stack_model("P-885.51").plant()
+        plant = plant.with_values({"k_L": (1.0 + share) * plant.values["k_L"]})
+        u = np.tile([100.0, 0.0], (21, 1))
+        run = psa.run(plant, np.linspace(0.0, 2e-3, 21), u, np.zeros(7), rtol=1e-10)
+        ends.append(run.x[-1, plant.state_names.index("x")])
+    return float(1e6 * (ends[1] - ends[0]) / (2e-3 * 7.3))
+
+
+def _co_simulation(found: Mapping[str, float]) -> None:
+    assert found["order, values held"] == pytest.approx(1.0, abs=0.2)
+    assert 1.7 < found["order, with slopes"] < 2.5
+    assert found["error at 1 us, values held [%]"] < 0.1
+    assert found["error at 1 us, with slopes [%]"] < 1e-3
+    assert found["error at 2 us, with slopes [%]"] > found["error at 2 us, values held [%]"]
+
+
+#: What the returned figures must be, beyond that the example runs and leaves its files.
+FIGURES: dict[str, Callable[[Any], None]] = {
+    "van_der_pol": _van_der_pol,
+    "use_in_fmpy": _use_in_fmpy,
+    "use_in_casadi": _use_in_casadi,
+    "co_simulation": _co_simulation,
+}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_example_runs(name: str, tmp_path: Path) -> None:
+    found = run_example(name, tmp_path)
+    left = list(tmp_path.iterdir())
+    assert left
+    for path in left:
+        assert path.is_dir() or path.stat().st_size > 0, path
+        if path.suffix == ".png":
+            assert np.std(matplotlib.image.imread(path)[..., :3]) > 0.01, path
+    if name in FIGURES:
+        FIGURES[name](found)
+
+
+def test_every_example_and_recipe_has_a_title_of_its_own() -> None:
+    found = examples()
+    assert set(FIGURES) <= set(EXAMPLES) <= set(found)
+    titles = [e.title for e in found.values()]
+    assert len(set(titles)) == len(titles)
+    assert all(15 < len(t) < 120 for t in titles), titles
+    for name in EXAMPLES:
+        assert "def main(folder: Path)" in found[name].text, name
+
+
+def test_twelve_lines_make_a_model() -> None:
+    """As the title says: what `model` does and the exports, the documentation left out."""
+    text = examples()["van_der_pol"].text
+    body = text.partition("def model()")[2].partition("\n\n\n")[0].splitlines()[2:]
+    exports = [line for line in text.splitlines() if line.startswith("    psa.export_")]
+    assert "ode_model" in body[1]
+    assert len(body) <= 12
+    assert len(exports) == 3
+
+
+def test_the_imported_fmu_is_not_the_symbolic_model(tmp_path: Path) -> None:
+    """Same values by the FMU of another parameter would be a comparison of a thing with itself."""
+    plant = psa.stack_model("P-885.51").plant()
+    fmu = psa.export_fmu(plant, tmp_path / "stack.fmu")
+    f = use_in_casadi.imported(fmu, tmp_path / "unpacked")
+    assert "FmuFunction" in f.class_name()
+    assert "FmuFunction" not in use_in_casadi.symbolic(plant).class_name()
+
+
+def _run(*words: str) -> Any:
+    return CliRunner().invoke(app, ["examples", *words])
+
+
+def test_the_list_names_all() -> None:
+    shown = _run()
+    assert shown.exit_code == 0
+    for name, example in examples().items():
+        assert name in shown.output
+        assert example.title in shown.output
+    assert _run("--quiet").output.split() == list(examples())
+
+
+def test_a_recipe_is_shown_and_copied_with_its_scripts(tmp_path: Path) -> None:
+    assert _run("simulink").output == examples()["simulink"].text
+    folder = tmp_path / "new" / "folder"
+    assert _run("Simulink.md", "-o", str(folder)).exit_code == 0
+    assert {p.name for p in folder.iterdir()} == {"simulink.md", "run_stack.m"}
+    assert "add_block" in (folder / "run_stack.m").read_text(encoding="utf-8")
+
+
+def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copied = _run("van-der-pol", "-o", str(tmp_path), "--copy-only")
+    assert copied.exit_code == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["van_der_pol.py"]
+
+    def main(folder: Path) -> dict[str, float]:
+        (folder / "left.txt").write_text("left", encoding="utf-8")
+        return {"amplitude [m]": 2.0}
+
+    monkeypatch.setattr(van_der_pol, "main", main)
+    ran = _run("van_der_pol", "-o", str(tmp_path))
+    assert ran.exit_code == 0
+    assert "amplitude [m]: 2\n" in ran.output
+    assert "left.txt" in ran.output
+    assert (tmp_path / "left.txt").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["openmodellica"], "did you mean openmodelica"),
+        (["-o", "x"], "-o needs the name"),
+        (["ci", "--copy-only"], "--copy-only needs a folder"),
+    ],
+)
+def test_mistakes_are_told(words: list[str], sentence: str) -> None:
+    result = _run(*words)
+    assert result.exit_code == 2
+    assert sentence in result.output
+
+
+def test_a_recipe_is_nothing_to_run(tmp_path: Path) -> None:
+    with pytest.raises(psa.InputError, match="no example named 'ci' to run"):
+        run_example("ci", tmp_path)

@@ -1,0 +1,227 @@
+"""The design of prestress mechanisms: closed forms, goals, limits, and the coupled FMUs."""
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.fmu import export_fmu
+from psa_casadi.export.fmu_instance import CO_SIMULATION, Fmu
+from psa_casadi.input_design.mechanism import (
+    Limits,
+    MechanismDesign,
+    Mounting,
+    bandwidth,
+    design_mechanism,
+    mechanical_poles,
+    mechanics_of,
+    mechanism_model,
+    port_model,
+    root_locus,
+    step_response,
+)
+from psa_casadi.model.stacks import stack_model
+
+FloatArray = NDArray[np.float64]
+STACK = "PTBS200"
+#: A mechanism of 60 g, 900 N.s/m, 8 N/um: enough to move every pole of the stack.
+HEAVY = Mounting(0.06, 900.0, 8e6)
+
+
+def assembled(p: Mapping[str, float], m: Mounting, acts_on: str, g: float = 0.0) -> FloatArray:
+    """Return the state matrix of (y, y', x, x') of a mounted stack, from the forces on each mass.
+
+    The mechanism's force m x'' + c x' + k x is taken off the wafers, or off the output mass, whose
+    x'' is then divided by m_B + m. `g` is the share of the reaction on the wafers.
+    """
+    elastic = np.array([p["k_P"], p["c_P"], 0.0, 0.0])
+    pull = np.array([-p["k_B"], -p["c_B"], p["k_B"], p["c_B"]])
+    spring = np.array([0.0, 0.0, m.stiffness, m.damping])
+    mass = p["m_B"] + (m.mass if acts_on == "tip" else 0.0)
+    x_force = (1.0 - g) * elastic - pull - (spring if acts_on == "tip" else 0.0)
+    a_x = x_force / mass
+    held = m.mass * a_x + spring if acts_on == "wafers" else np.zeros(4)
+    a_y = (-elastic + g * pull - held) / p["m_P"]
+    return np.array([[0.0, 1.0, 0.0, 0.0], a_y, [0.0, 0.0, 0.0, 1.0], a_x])
+
+
+@cache
+def designed(**wanted: float) -> MechanismDesign:
+    """Return the design for the stack of these tests, within ordinary limits."""
+    return design_mechanism(stack_model(STACK), limits=Limits(0.1), starts=3, **wanted)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("acts_on", ["wafers", "tip"])
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_closed_loop_poles_are_those_of_the_assembled_masses(acts_on: str, share: float) -> None:
+    model = stack_model(STACK)
+    if share:
+        model = model.with_effect(EFFECTS["reciprocal_coupling"], {"reciprocal_gain": share})
+    found = mechanical_poles(mechanics_of(model, acts_on), HEAVY)
+    expected = np.linalg.eigvals(assembled(model.values, HEAVY, acts_on, share))
+    order = np.lexsort((expected.imag, np.round(np.abs(expected), 3)))
+    mine = np.lexsort((found.imag, np.round(np.abs(found), 3)))
+    assert found[mine] == pytest.approx(expected[order], rel=1e-8)
+
+
+def test_a_mechanism_at_the_tip_leaves_the_wafers_alone() -> None:
+    p = stack_model(STACK).values
+    wafers = np.roots([p["m_P"], p["c_P"], p["k_P"]])
+    poles = mechanical_poles(mechanics_of(stack_model(STACK), "tip"), HEAVY)
+    assert all(np.abs(poles - w).min() < 1e-9 * abs(w) for w in wafers)
+    around_all = mechanical_poles(mechanics_of(stack_model(STACK)), HEAVY)
+    assert min(np.abs(around_all - w).min() / abs(w) for w in wafers) > 0.1
+
+
+def test_step_response_is_the_matrix_exponential_of_the_whole_chain() -> None:
+    p = stack_model(STACK).values
+    A = np.zeros((6, 6))
+    A[0, 0] = -1.0 / (p["R_s"] * p["C_p"])
+    A[1, :2] = np.array([p["k_L"], -1.0]) / p["tau"]
+    A[2:, 2:] = assembled(p, HEAVY, "wafers")
+    A[3, 1] = 1.0 / p["m_P"]
+    B = np.zeros(6)
+    B[0] = p["u_rated"] / (p["R_s"] * p["C_p"])
+    final = -np.linalg.solve(A, B)
+    time = np.linspace(0.0, 1e-3, 41)
+    states = np.array([final - expm(A * t) @ final for t in time])
+    response = step_response(mechanics_of(stack_model(STACK)), HEAVY, time)
+    assert response.displacement == pytest.approx(states[:, 4], abs=1e-8 * final[4])
+    speeds = (A @ states.T).T + B
+    force = HEAVY.mass * speeds[:, 5] + HEAVY.damping * states[:, 5]
+    force += HEAVY.stiffness * states[:, 4]
+    assert response.force == pytest.approx(force, abs=1e-6 * np.abs(force).max())
+
+
+def test_bandwidth_is_where_the_response_has_fallen_by_3_db() -> None:
+    p = stack_model(STACK).values
+    A = assembled(p, HEAVY, "wafers")
+    B, C = np.array([0.0, 1.0 / p["m_P"], 0.0, 0.0]), np.array([0.0, 0.0, 1.0, 0.0])
+
+    def size(f: float) -> float:
+        return float(abs(C @ np.linalg.solve(2j * np.pi * f * np.eye(4) - A, B)))
+
+    found = bandwidth(mechanics_of(stack_model(STACK)), HEAVY)
+    assert size(found) == pytest.approx(size(0.0) / np.sqrt(2.0), rel=1e-6)
+    assert all(size(f) > size(found) for f in np.linspace(0.0, 0.999 * found, 200))
+
+
+def test_wanted_damping_is_reached_within_the_limits() -> None:
+    d = designed(damping=0.7)
+    p = stack_model(STACK).values
+    poles = np.linalg.eigvals(assembled(p, d.mounting, "wafers"))
+    ratio = float((-poles.real / np.abs(poles)).min())
+    assert d.attained
+    assert ratio == pytest.approx(d.reached.damping, rel=1e-6)
+    assert ratio >= 0.7 * (1.0 - 1e-4)
+    static = 1.0 / (1.0 / p["k_P"] + 1.0 / p["k_B"])
+    lost = d.mounting.stiffness / (static + d.mounting.stiffness)
+    assert d.reached.stroke_loss == pytest.approx(lost, rel=1e-9)
+    assert lost <= 0.1 + 1e-9
+    assert d.lag_pole == pytest.approx(-1.0 / p["tau"])
+
+
+def test_no_neighbour_within_the_limits_is_damped_enough_and_wider() -> None:
+    """The design for a damping has the largest bandwidth: random neighbours do not beat it."""
+    d = designed(damping=0.7)
+    m, draw = d.mounting, np.random.default_rng(0)
+    beaten = 0
+    for spread in (0.01, 0.1, 1.0):
+        for _ in range(400):
+            a, b, c = np.exp(spread * draw.normal(size=3))
+            other = Mounting(a * m.mass, b * m.damping, min(c * m.stiffness, m.stiffness))
+            poles = mechanical_poles(d.mechanics, other)
+            damped = float((-poles.real / np.abs(poles)).min()) >= d.reached.damping - 1e-6
+            beaten += damped and bandwidth(d.mechanics, other) > 1.001 * d.reached.bandwidth
+    assert beaten == 0
+
+
+def test_force_limit_holds_and_an_unreachable_goal_is_said() -> None:
+    d = design_mechanism(stack_model(STACK), damping=0.7, limits=Limits(force=300.0), starts=1)
+    time = np.linspace(0.0, 2e-3, 40001)
+    peak = float(np.abs(step_response(d.mechanics, d.mounting, time).force).max())
+    assert peak <= 300.0
+    assert peak > 0.98 * 300.0
+    assert not d.attained
+    assert "force" in d.binding
+    assert 0.03 < d.reached.damping < 0.7
+
+
+def test_bandwidth_and_poles_as_goals() -> None:
+    d = designed(bandwidth=5000.0)
+    assert d.attained
+    assert d.reached.bandwidth >= 5000.0 * (1.0 - 1e-3)
+    assert d.reached.damping > 5.0 * d.free.damping
+    wanted = mechanical_poles(mechanics_of(stack_model(STACK)), HEAVY)
+    again = design_mechanism(stack_model(STACK), poles=tuple(complex(p) for p in wanted), starts=2)
+    assert again.attained
+    assert again.mounting.mass == pytest.approx(HEAVY.mass, rel=1e-3)
+    assert again.mounting.damping == pytest.approx(HEAVY.damping, rel=1e-3)
+    assert again.mounting.stiffness == pytest.approx(HEAVY.stiffness, rel=1e-3)
+
+
+def test_root_locus_runs_from_the_free_stack_to_the_design() -> None:
+    d = designed(damping=0.7)
+    branches = root_locus(d, np.linspace(0.0, 1.0, 400))
+    assert np.sort_complex(branches[0]) == pytest.approx(np.sort_complex(d.free_poles), rel=1e-9)
+    assert np.sort_complex(branches[-1]) == pytest.approx(np.sort_complex(d.poles), rel=1e-9)
+
+
+def test_bad_wishes_are_all_told_at_once() -> None:
+    with pytest.raises(InputError) as caught:
+        design_mechanism(
+            stack_model(STACK), damping=1.5, poles=(1.0 + 2.0j,),
+            limits=Limits(stroke_loss=1.2, force=-1.0, mass=(2.0, 1.0)),
+        )  # fmt: skip
+    text = str(caught.value)
+    for part in ("damping ratio 1.5", "leave one", "conjugate", "1.2", "-1 N", "mass"):
+        assert part in text
+    with pytest.raises(InputError, match="two masses"):
+        design_mechanism(mechanism_model(designed(damping=0.7)), damping=0.7)
+
+
+def coupled(first: Path, second: Path, voltage: float, step: float, end: float) -> FloatArray:
+    """Step stack and mechanism in turn, values held; the voltage jumps at the start. Return x."""
+    motion = ("displacement", "tip_velocity", "tip_acceleration")
+    count = round(end / step)
+    x = np.zeros(count + 1)
+    with Fmu(first) as one, Fmu(second) as two:
+        a = one.start(CO_SIMULATION, tolerance=1e-8)
+        b = two.start(CO_SIMULATION, tolerance=1e-8)
+        with a, b:
+            a.set({"voltage": voltage})
+            for k in range(count):
+                position, speed, acceleration = a.get(motion)
+                b.set({"tip_position": position, "tip_velocity": speed,
+                       "tip_acceleration": acceleration})  # fmt: skip
+                a.set({"prestress_force": float(b.get(["reaction_force"])[0])})
+                a.step(k * step, step)
+                b.step(k * step, step)
+                x[k + 1] = a.get(["displacement"])[0]
+    return x
+
+
+def test_coupled_fmus_do_what_the_closed_form_says(tmp_path: Path) -> None:
+    """Stack FMU and mechanism FMU approach the designed step response, to first order."""
+    linear = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
+    model = stack_model(STACK).with_values(linear)
+    d = design_mechanism(model, damping=0.3, limits=Limits(mass=(0.0, 0.06)), starts=2)
+    assert d.attained
+    fmus = [
+        export_fmu(part, tmp_path / f"{part.name}.fmu")
+        for part in (port_model(model), mechanism_model(d))
+    ]
+    errors = []
+    for step in (2e-7, 1e-7):
+        x = coupled(fmus[0], fmus[1], model.values["u_rated"], step, 2e-4)
+        time = np.linspace(0.0, step * (len(x) - 1), len(x))
+        expected = step_response(d.mechanics, d.mounting, time).displacement
+        errors.append(float(np.abs(x - expected).max() / np.ptp(expected)))
+    assert errors[1] < 2e-3
+    assert 1.7 < errors[0] / errors[1] < 2.4

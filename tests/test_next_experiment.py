@@ -1,0 +1,99 @@
+"""From ambiguous to named: a designed record, played on the hidden plant, tells the cause."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.cli import diagnose as command
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import Record, read_record
+from psa_casadi.input_design import experiment
+from psa_casadi.input_design.designs import Separated
+from psa_casadi.input_design.experiment import resolving_experiment
+from psa_casadi.input_design.limits import excess
+from psa_casadi.report.text import story
+from tests.plants.again import play_again
+from tests.plants.make import make_record
+
+#: A gain that bends with the field, hidden in a triangle, where a bent sensor looks the same.
+HIDDEN, RIVAL, SEED = "field_dependent_gain", "sensor_nonlinearity", 7003
+SAMPLES = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    first: Record
+    ambiguous: Diagnosis
+    design: Separated
+    named: Diagnosis
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
+    folder = tmp_path_factory.mktemp("loop")
+    effects = [EFFECTS[HIDDEN], EFFECTS[RIVAL]]
+    path = folder / "first.csv"
+    truth = make_record(HIDDEN, SEED, path, excitation="triangle", visible=(0.3, 2.0))
+    first = read_record(path).slice(0, SAMPLES)
+    ambiguous = diagnose([first], effects=effects)
+    design = resolving_experiment(ambiguous)
+    played = folder / "next.csv"
+    play_again(truth, SEED, played, (design.record.time, design.record.voltage))
+    named = diagnose([first, read_record(played)], effects=effects)
+    return Loop(first, ambiguous, design, named)
+
+
+def test_the_first_record_leaves_two_causes_open(loop: Loop) -> None:
+    d = loop.ambiguous
+    assert d.verdict == "ambiguous"
+    assert {c.effect for c in d.contenders} == {HIDDEN, RIVAL}
+    assert set(d.next_experiment.separates) == {HIDDEN, RIVAL}
+    known = {c.effect: c.evidence for c in d.candidates}
+    for contender in d.contenders:
+        assert contender.evidence == pytest.approx(known[contender.effect])
+        assert contender.effect in {c.name for c in contender.fit.model.effects}
+
+
+def test_the_designed_record_is_like_the_first_and_tells_more_than_a_sine(loop: Loop) -> None:
+    design, first = loop.design, loop.first
+    assert design.record.n == first.n
+    assert design.record.sample_time == pytest.approx(first.sample_time)
+    assert excess(design.record, design.limits, None) == ()
+    assert design.record.voltage.min() >= first.voltage.min() - 1e-9
+    assert design.record.voltage.max() <= first.voltage.max() + 1e-9
+    assert design.factor("sine") > 2.0
+    assert design.factor("triangle") > 2.0
+    assert min(design.chance.values()) > 0.9
+
+
+def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
+    d = loop.named
+    assert d.verdict in ("cause_named", "partly_explained")
+    assert d.causes[0].effect == HIDDEN
+    assert d.causes[0].cannot_be_told_from == ()
+    with pytest.raises(InputError, match="nothing to tell apart"):
+        resolving_experiment(d)
+
+
+def test_the_command_writes_the_record_and_says_so(
+    loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The design itself is the one above: here only what becomes of it."""
+    monkeypatch.setattr(experiment, "resolving_experiment", lambda d, **_: loop.design)
+    path = command._beside(tmp_path / "diagnosis.json")
+    assert path == tmp_path / "diagnosis_next.csv"
+    d = command._with_next(loop.ambiguous, path, lambda _: None)
+    said = json.loads(d.to_json())["next_experiment"]
+    assert said["voltage_csv"] == str(path)
+    assert set(said["separates"]) == set(said["chance"]) == {HIDDEN, RIVAL}
+    assert str(path) in " ".join(story(d, width=400).split())
+    record = read_record(path, need_displacement=False)
+    np.testing.assert_array_equal(record.voltage, loop.design.record.voltage)
+    assert command._with_next(loop.named, path, lambda _: None) is loop.named
+    assert command._with_next(loop.ambiguous, None, lambda _: None) is loop.ambiguous

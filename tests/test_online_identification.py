@@ -1,0 +1,128 @@
+"""The online identification: stream, NumPy, simulated model, FMU 2 and 3, Modelica agree."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.export.fmu import export_fmu
+from psa_casadi.export.fmu_instance import CO_SIMULATION, Fmu
+from psa_casadi.export.modelica import modelica_text
+from psa_casadi.input_design.linearisation_trial import Drive, driven, off_values
+from psa_casadi.input_design.recursive_least_squares import OnlineIdentification, identifier_for
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.simulation.stepper import run
+from tests.modelica_runs import simulated
+from tests.online_numpy import TRACKED, NumpyIdentification
+
+STACK, PERIOD, NOISE = "P-885.51", 5e-4, 2e-8
+
+
+@cache
+def record() -> Drive:
+    """Return a plain run of 0.4 s on the plant."""
+    model = stack_model(STACK)
+    return driven(model, "none", model, np.arange(0.0, 0.4, PERIOD))
+
+
+def test_recursion_is_recursive_least_squares_on_the_prediction() -> None:
+    """The streaming object does what matrices and finite differences in NumPy do."""
+    values = dict(
+        identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE).values
+    )
+    d = record()
+    online = OnlineIdentification(values)
+    expected, rows = NumpyIdentification(values), []
+    for u, x in zip(d.voltage.tolist(), d.displacement.tolist(), strict=True):
+        force = online.step(u, x)
+        expected.step(u, x)
+        found = online.estimate.parameters
+        mine = [*(found[name] for name in TRACKED), force]
+        rows.append([mine, [*expected.estimates, expected.f]])
+    both = np.array(rows)
+    sizes = np.abs(both[:, 1]).max(axis=0)
+    assert (np.abs(both[:, 0] - both[:, 1]) / sizes).max() < 1e-4
+    assert np.ptp(both[:, 0, 0]) > 0.1  # A has moved
+
+
+def test_standstill_teaches_nothing_and_winds_nothing_up() -> None:
+    model = stack_model(STACK)
+    tuned = identifier_for(model, PERIOD, noise=NOISE, memory=0.05)
+    online, d = OnlineIdentification(tuned.values), record()
+    for u, x in zip(d.voltage.tolist(), d.displacement.tolist(), strict=True):
+        online.step(u, x)
+    before = online.estimate
+    held, draw = d.voltage[-1], np.random.default_rng(1)
+    for error in draw.normal(size=4000):
+        online.step(float(held), float(d.displacement[-1] + 1e-7 * error))
+    after = online.estimate
+    assert after.parameters == before.parameters
+    assert after.uncertainty == before.uncertainty
+
+
+def test_uncertainty_stays_below_its_start_however_poor_the_voltage() -> None:
+    """A voltage that creeps excites one direction only; without a bound P would explode."""
+    values = dict(identifier_for(stack_model(STACK), PERIOD, noise=NOISE, memory=0.01).values)
+    values["standstill_rate"] = 0.0
+    online, draw = OnlineIdentification(values), np.random.default_rng(2)
+    u = np.cumsum(np.full(8000, 2e-3))
+    for voltage, error in zip(u.tolist(), draw.normal(size=u.size).tolist(), strict=True):
+        online.step(voltage, 1.4e-7 * voltage + 1e-8 * error)
+    found = online.estimate
+    assert max(found.uncertainty.values()) <= 1.0 + 1e-12
+    assert min(found.uncertainty.values()) > 0.0
+    assert all(np.isfinite(v) for v in found.parameters.values())
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
+    model = identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
+    d, online = record(), OnlineIdentification(model.values)
+    names = [f"{name}_hat" for name in TRACKED] + ["hysteresis_force"]
+    with (
+        Fmu(export_fmu(model, tmp_path / "online.fmu", fmi=fmi)) as fmu,
+        fmu.start(CO_SIMULATION) as instance,
+    ):
+        for k in range(200):
+            u, x = float(d.voltage[k]), float(d.displacement[k])
+            force = online.step(u, x)
+            instance.set({"voltage": u, "position": x})
+            instance.step(k * PERIOD, PERIOD)
+            found = online.estimate.parameters
+            expected = [*(found[name] for name in TRACKED), force]
+            assert instance.get(names) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_model_simulates_as_the_stream_and_is_kept_in_a_file() -> None:
+    model = identifier_for(off_values(stack_model(STACK), 0.1, 1), PERIOD, noise=NOISE)
+    assert dict(loads(dumps(model)).values) == dict(model.values)
+    d, online = record(), OnlineIdentification(model.values)
+    inputs = np.column_stack([d.voltage, d.displacement])[:120]
+    steps = run(model, d.time[:120], inputs, np.zeros(len(model.state_names)), rtol=1e-6)
+    force = [online.step(u, x) for u, x in inputs.tolist()]
+    at = model.output_names.index("hysteresis_force")
+    assert steps.y[:, at] == pytest.approx(np.array(force), rel=1e-8, abs=1e-9)
+
+
+def test_modelica_block_gives_what_the_stream_gives() -> None:
+    """Another compiler runs the exported block on a drive of its own."""
+    model = identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
+    wave = "60*(1 - cos(62.83185307179586*({})))"
+    harness = f"""
+    model Driven
+      PiezoStack.Signal rls;
+    equation
+      rls.voltage = {wave.format("time")};
+      rls.position = 1.4e-7*{wave.format("time - 1e-3")};
+    end Driven;
+    """
+    found = simulated(modelica_text(model) + harness, "Driven", 0.03)
+    online = OnlineIdentification(model.values)
+    for t in PERIOD * np.arange(61):
+        u, x = (60.0 * (1.0 - np.cos(62.83185307179586 * (t - d))) for d in (0.0, 1e-3))
+        force = online.step(float(u), 1.4e-7 * float(x))
+    assert found["rls.hysteresis_force"][-1] == pytest.approx(force, rel=1e-8)
+    for name, value in online.estimate.parameters.items():
+        assert found[f"rls.{name}_hat"][-1] == pytest.approx(value, rel=1e-7), name

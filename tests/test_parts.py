@@ -1,0 +1,240 @@
+"""The parts around a stack, against formulas, the reference and plain recursions."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from psa_casadi import reference
+from psa_casadi.bench.nonlinearity_plant import Controller, simulate_positioner
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Model
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.parts import PARTS, compensator_for, part_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.model.system import connect
+from psa_casadi.simulation.stepper import run
+
+FloatArray = NDArray[np.float64]
+
+STACK = "P-885.51"
+VALUES = {name: figure.value for name, figure in STACKS[STACK].values.items()}
+
+
+def _driven(model: Model, t: FloatArray, **inputs: FloatArray) -> dict[str, FloatArray]:
+    """Return outputs and states of a run from rest."""
+    u = np.column_stack([np.broadcast_to(inputs.get(n, 0.0), t.shape) for n in model.input_names])
+    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
+    states = dict(zip(model.state_names, steps.x.T, strict=True))
+    return states | dict(zip(model.output_names, steps.y.T, strict=True))
+
+
+def _smooth(t: FloatArray, values: FloatArray) -> Callable[[float], float]:
+    """Return a smooth curve through samples."""
+    spline = CubicSpline(t, values)
+    return lambda time: float(spline(time))
+
+
+def _line_deviation(x: FloatArray, y: FloatArray) -> float:
+    """Return the largest distance from the best line, over the range."""
+    basis = np.column_stack([x, np.ones_like(x)])
+    left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+    return float(np.abs(left).max() / np.ptp(y))
+
+
+def _two_periods(frequency: float) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return times, a sine from 0 to 1 that starts at rest, and which samples are the second."""
+    t = np.linspace(0.0, 2.0 / frequency, 801)
+    return t, 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * t)), t >= 1.0 / frequency
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_goes_through_its_file(name: str) -> None:
+    model = part_model(name)
+    again = loads(dumps(model))
+    assert (again.values, again.name) == (model.values, model.name)
+    assert again.components == model.components
+
+
+def test_a_part_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(InputError, match="voltage_amplifier"):
+        part_model("voltage")
+    with pytest.raises(InputError, match="no parameter 'speed'"):
+        part_model("voltage_amplifier", speed=1.0)
+
+
+def test_the_compensator_knows_the_force_that_the_reference_has() -> None:
+    """Estimated force against f_H of the plain reference, which is driven by the same voltage."""
+    t, wave, _ = _two_periods(20.0)
+    compensator = compensator_for(stack_model(STACK))
+    found = _driven(compensator, t, command=80.0 * wave)
+    plant = reference.simulate(VALUES, _smooth(t, found["compensated_command"]), t, rtol=1e-8)
+    size = np.ptp(plant.states["f_H"])
+    assert np.abs(found["hysteresis_force"] - plant.states["f_H"]).max() < 2e-5 * size
+
+
+def test_the_compensator_makes_the_reference_linear() -> None:
+    """At 0.2 Hz, where lags do not count: below 0.02 % of the range, from more than 3 %."""
+    t, wave, last = _two_periods(0.2)
+    compensator = compensator_for(stack_model(STACK))
+    compensated = _driven(compensator, t, command=80.0 * wave)["compensated_command"]
+    deviations = []
+    for voltage in (80.0 * wave, compensated):
+        plant = reference.simulate(VALUES, _smooth(t, voltage), t, rtol=1e-7)
+        deviations.append(_line_deviation(wave[last], plant.displacement[last]))
+    assert deviations[0] > 0.03
+    assert deviations[1] < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("effect", "gain"),
+    [("hysteresis_memory", 0.05), ("field_dependent_gain", 0.1), ("saturation_of_strain", 0.3)],
+)
+def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gain: float) -> None:
+    """The force behind the lag follows the command; without the effect it does not."""
+    component = EFFECTS[effect]
+    plain = stack_model(STACK).plant()
+    stack = plain.with_effect(component, {str(component.gain): gain})
+    t, wave, last = _two_periods(20.0)
+    errors = []
+    for known in (stack, plain):
+        wires = (("compensator.compensated_command", "stack.voltage"),)
+        model = connect({"compensator": compensator_for(known), "stack": stack}, wires, name="m")
+        found = _driven(model, t, compensator_command=80.0 * wave)
+        lag = stack.values["tau"] + stack.values["R_s"] * stack.values["C_p"]
+        late = 40.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * (t - lag)))
+        ideal = stack.values["k_L"] * late
+        errors.append(np.abs(found["stack_f_out"] - ideal)[last].max() / np.ptp(ideal))
+    assert errors[0] < 1e-3
+    assert errors[1] > 1e-2
+
+
+def test_a_compensator_needs_a_stack() -> None:
+    with pytest.raises(InputError, match="has no drive, linear_force, bouc_wen"):
+        compensator_for(part_model("flexure_stage"))
+
+
+def test_the_voltage_amplifier_has_bandwidth_range_and_slew_rate() -> None:
+    amplifier = part_model("voltage_amplifier", bandwidth=1e3)
+    t = np.linspace(0.0, 2e-3, 401)
+    small = _driven(amplifier, t, command=np.full_like(t, 1e-3))["output_voltage"]
+    np.testing.assert_allclose(small, 1e-2 * (1.0 - np.exp(-2e3 * np.pi * t)), atol=1e-8)
+    beyond = _driven(amplifier, t, command=np.full_like(t, 30.0))["output_voltage"]
+    assert beyond.max() <= 120.0 + 1e-6
+    assert beyond[-1] == pytest.approx(120.0, abs=1e-3)
+    slow = part_model("voltage_amplifier", bandwidth=1e5, current_limit=0.05)
+    found = _driven(slow, t, command=np.full_like(t, 10.0))
+    slew = 0.05 / 1.5e-6
+    assert found["load_current"].max() <= 0.05
+    middle = (found["output_voltage"] > 10.0) & (found["output_voltage"] < 80.0)
+    rate = np.polyfit(t[middle], found["output_voltage"][middle], 1)[0]
+    assert rate == pytest.approx(slew, rel=1e-3)
+
+
+def _charge_drive(**values: float) -> Model:
+    wires = (
+        ("amplifier.output_voltage", "stack.voltage"),
+        ("stack.charge", "amplifier.load_charge"),
+    )
+    parts = {"amplifier": part_model("charge_amplifier", **values),
+             "stack": stack_model(STACK).plant()}  # fmt: skip
+    return connect(parts, wires, name="charge_drive")
+
+
+def test_the_charge_amplifier_sets_voltage_below_its_corner_and_charge_above() -> None:
+    """Gain and phase of v over the command, against the circuit's transfer function."""
+    C_s, C, tau, ratio, bandwidth = 12e-6, 1.5e-6, 0.1, 10.0, 3e3
+    model = _charge_drive(sense_capacitance=C_s, leak_time=tau, gain=ratio)
+    for frequency in (0.2, 1.6, 30.0):
+        t = np.linspace(0.0, 4.0 / frequency + 1.0, 8001)
+        s = 2j * np.pi * frequency
+        wave = 1e-3 * np.sin(2.0 * np.pi * frequency * t)
+        v = _driven(model, t, amplifier_command=wave)["amplifier_output_voltage"]
+        late = t >= t[-1] - 1.0 / frequency
+        basis = np.column_stack([np.sin(abs(s) * t), np.cos(abs(s) * t)])[late]
+        in_phase, quadrature = np.linalg.lstsq(basis, v[late], rcond=None)[0]
+        # q_s = (s q + C_s v / (ratio tau)) / (s + 1/tau), q = C v / (1 + s R_s C)
+        q = C / (1.0 + s * VALUES["R_s"] * C)
+        sensed = (s * q + C_s / (ratio * tau)) / (s + 1.0 / tau)
+        loop = 2.0 * np.pi * bandwidth * (C_s / C) / s
+        expected = loop / (1.0 + loop * sensed / C_s)
+        assert abs(1e3 * (in_phase + 1j * quadrature) - expected) < 2e-3 * abs(expected)
+
+
+def test_a_charge_drive_does_not_linearise_this_model() -> None:
+    """The model's hysteresis is between voltage and force, its capacitance is linear."""
+    t, wave, last = _two_periods(10.0)
+    by_charge = _driven(_charge_drive(), t, amplifier_command=8.0 * wave)["stack_displacement"]
+    by_voltage = _driven(stack_model(STACK).plant(), t, voltage=80.0 * wave)["displacement"]
+    with_charge, with_voltage = (
+        _line_deviation(wave[last], d[last]) for d in (by_charge, by_voltage)
+    )
+    assert with_charge > 0.9 * with_voltage > 0.02
+
+
+def _closed_on(model: Model, reference_m: Callable[[float], float], count: int) -> FloatArray:
+    """Return the commands of a controller whose plant is a fixed gain of 1 um/V, by the model."""
+    names = model.state_names, model.sampled_names
+    T, z = model.values["sample_time"], np.zeros(len(names[1]))
+    commands = []
+    position = 0.0
+    for k in range(count):
+        p = model.parameter_vector()
+        inputs = [reference_m(k * T), 0.0]
+        z = np.array(model.structure.g(k * T, [position], inputs, p, z)).ravel()
+        commands.append(z[names[1].index("held_command")])
+        position = 1e-6 * commands[-1]
+    return np.array(commands)
+
+
+def test_the_controller_is_the_recursion_of_a_textbook() -> None:
+    """Notch, PI, feed-forward, saturation and anti-windup against a plain recursion."""
+    model = part_model(
+        "position_controller", proportional_gain=2e5, integral_gain=4e8, feed_forward=1e5,
+        notch_floor=0.1, notch_width=0.7,
+    )  # fmt: skip
+
+    def wanted(t: float) -> float:
+        return 20e-6 if t < 3e-3 else -15e-6 * math.sin(3e3 * t)
+
+    plain, position, expected = Controller(model.values), 0.0, []
+    for k in range(200):
+        expected.append(plain(wanted(k * 5e-5), position))
+        position = 1e-6 * expected[-1]
+    found = _closed_on(model, wanted, 200)
+    assert found.max() == 12.0
+    assert found.min() == -2.0
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_anti_windup_shortens_the_way_back() -> None:
+    """After 2 ms out of reach the position is back at once; without it, later."""
+    late = {}
+    for share in (0.0, 1.0):
+        model = part_model("position_controller", anti_windup=share, integral_gain=3e8,
+                           proportional_gain=1e5)  # fmt: skip
+        commands = _closed_on(model, lambda t: 50e-6 if t < 2e-3 else 5e-6, 200)
+        late[share] = int(np.flatnonzero(commands[40:] < 11.9)[0])
+    assert late[1.0] <= 1
+    assert late[0.0] > 10
+
+
+def test_the_plain_loop_has_the_reference_s_stack() -> None:
+    """With a stage that does not push back, the benchmark's stack moves as the reference's does."""
+    system = nanopositioner(compensated=False)
+    values = {n: dict(m.values) for n, m in system.parts.items()}
+    values["flexure"] |= {"k_c": 1e-3, "c_c": 0.0}
+    values["amplifier"]["bandwidth"] = 2e3
+    values["controller"] |= {"proportional_gain": 0.0, "integral_gain": 0.0, "feed_forward": 1e6}
+    found = simulate_positioner(
+        values, lambda t: 3e-6 * (1.0 - math.cos(400.0 * math.pi * t)), 0.005, 1e-5
+    )
+    voltage = _smooth(found.time, found.voltage)
+    plant = reference.simulate(VALUES, voltage, found.time, rtol=1e-8)
+    assert np.ptp(plant.displacement) > 5e-6
+    np.testing.assert_allclose(found.tip, plant.displacement, atol=1e-4 * np.ptp(found.tip))
