@@ -8,6 +8,7 @@ own line before a block changes that:
     <!-- run: skip -->        the block is not run (installation, for example)
     <!-- run: needs-data -->  the block runs where the measured records are, in $PSA_CASADI_DATA
     <!-- run: continue -->    the block runs in the directory of the block before it
+    <!-- run: python -->      the block is marked `python` and runs as a program
 """
 
 import os
@@ -23,7 +24,7 @@ from pathlib import Path
 
 from build_scripts.measured_data import ROOT, measured_data_directory, must_be_present
 
-MARKS = ("skip", "needs-data", "continue")
+MARKS = ("skip", "needs-data", "continue", "python")
 LIMIT_S = 900
 
 _FENCE = re.compile(r"^```(?P<language>\w*)\s*$")
@@ -40,7 +41,7 @@ class Block:
 
 
 def find_blocks(text: str) -> tuple[Block, ...]:
-    """Return the console blocks of a Markdown text, also those marked to be skipped.
+    """Return the console blocks and the marked programs of a text, also those to be skipped.
 
     Raises:
         ValueError: a mark is unknown, or a block has no end.
@@ -63,6 +64,9 @@ def find_blocks(text: str) -> tuple[Block, ...]:
                 raise ValueError(f"line {number}: this block has no end; close it with ```.")
             if fence["language"] == "console":
                 blocks.append(Block(number, find_commands(content), frozenset(marks)))
+            elif fence["language"] == "python" and "python" in marks:
+                program = "\n".join(("python - <<'END_OF_PROGRAM'", *content, "END_OF_PROGRAM"))
+                blocks.append(Block(number, (program,), frozenset(marks)))
             marks = set()
         elif line.strip():
             marks = set()
@@ -92,7 +96,7 @@ def run_block(block: Block, directory: Path) -> str | None:
         "PSA_CASADI_DATA": str(measured_data_directory()),
     }
     for command in block.commands:
-        print(f"$ {command}", flush=True)
+        print(f"$ {command.partition(chr(10))[0]}", flush=True)
         started = time.monotonic()
         try:
             code = subprocess.run(

@@ -48,6 +48,16 @@ def test_commands_run_in_an_empty_directory_that_the_next_block_may_share() -> N
     assert len(run_text(TEXT.replace("<!-- run: continue -->", ""))) == 1
 
 
+def test_a_program_runs_where_it_is_marked() -> None:
+    text = "```console\n$ echo 3 > n\n```\n{}```python\nassert int(open('n').read()) == {}\n```\n"
+    marks = "<!-- run: continue -->\n<!-- run: python -->\n"
+    assert run_text(text.format(marks, 3)) == []
+    assert run_text(text.format("", 4)) == []
+    (failure,) = run_text(text.format(marks, 4))
+    assert "line 6" in failure
+    assert "ended with exit code 1" in failure
+
+
 def test_a_command_that_fails_is_named_with_its_line() -> None:
     (failure,) = run_text(TEXT.replace("<!-- run: skip -->", "").replace("$ grep two", "$ true"))
     assert failure == "README.md line 6: 'exit 7' ended with exit code 7."
