@@ -15,12 +15,13 @@ from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, Structure, compose
+from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.codegen import functions_of, generate_c
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import convert
-from psa_casadi.variables import Input, Output, Parameter, State
+from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 from tests.random_models import Point, random_model, random_point
 
 FloatArray = NDArray[np.float64]
@@ -186,11 +187,22 @@ def test_an_effect_composes_where_what_it_needs_is_there(
         compose((*base, effect))
 
 
+def _model_with(component: Component) -> Model:
+    """Return a model that a component is in: a part, else a stack, with what may be added to it."""
+    for part in PARTS.values():
+        if component.name in part.components and component not in BASE:
+            return part_model(part.name)
+    if component in SIMPLIFIED and component not in BASE:
+        return compose(SIMPLIFIED)
+    added = [component] if component not in (*BASE, *ALL) else []
+    model = compose([*BASE, *ALL, *added])
+    assert component in model.components
+    return model
+
+
 @pytest.mark.parametrize("component", [*COMPONENTS.values(), *ALL], ids=lambda c: c.name)
 def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
-    model = compose([component] if component.name == "flexure" else [*BASE, *ALL])
-    if component.name == "single_mass":
-        model = compose(SIMPLIFIED)
+    model = _model_with(component)
     for parameter in component.parameters:
         low, high = parameter.bounds
         assert low <= parameter.value <= high
@@ -198,12 +210,16 @@ def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
         assert parameter.typical(model.values) > 0.0
     sizes = dict(zip(model.state_names, model.state_nominals(), strict=True))
     assert all(0.0 < sizes[s.name] < 1e6 for s in component.states)
+    held = [nominal_value(s.nominal, model.values) for s in component.sampled]
+    assert all(0.0 < size < 1e6 for size in held)
+    shown: list[Input | Output] = [*component.inputs, *component.outputs]
+    assert all(0.0 < nominal_value(v.nominal, model.values) < 1e6 for v in shown)
     variables: list[Parameter | State | Input | Output] = [*component.parameters]
-    variables += [*component.states, *component.inputs, *component.outputs]
+    variables += [*component.states, *component.sampled, *shown]
     for variable in variables:
         assert len(variable.description) > 3
-        shown = variable.display_unit or variable.unit
-        assert convert(1.0, variable.unit, shown) > 0.0
+        unit = variable.display_unit or variable.unit
+        assert convert(1.0, variable.unit, unit) > 0.0
 
 
 @pytest.mark.parametrize("effects", [(), *SETS[: len(ALL)], ALL], ids=name_of)

@@ -89,6 +89,12 @@ CORE = {
         "else if (state->phase == PSA_INSTANTIATED) state->p[v->index] = value;",
         {"parameter changes"},
     ),
+    "indicators that stand still": (
+        "values.c",
+        "state->facing[i] * instance->z[i] +",
+        "0.0 * instance->z[i] +",
+        {"event indicators", "event indicators of the model"},
+    ),
     "checksum not looked at": (
         "snapshot.c",
         "if (found.checksum != expected.checksum)",
@@ -133,6 +139,7 @@ FACE = {
         ("*terminate = fmi3False;", "*terminate = fmi3True;"),
         ("*earlyReturn = early != 0;", "*earlyReturn = fmi3False;"),
     ),
+    "values.c": (("state->facing[i] = -state->facing[i];", "instance->fresh = 0;"),),
     "fmi3_clocks.c": (
         (
             "fmi3Status fmi3ActivateModelPartition(",
@@ -147,11 +154,12 @@ def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
     found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, FACE)))
     assert {
         "adjoint derivatives", "event mode", "life cycle", "intermediate update",
-        "functions present", "no other symbols", "illegal calls",
+        "functions present", "no other symbols", "illegal calls", "event indicators",
     } == set(found), found  # fmt: skip
     assert "fmi3ActivateModelPartition is missing" in found["functions present"]
     assert "fmi3ActivateModelPartitions is exported" in found["no other symbols"]
     assert "does not return early" in found["intermediate update"]
+    assert "stays negative after an event" in found["event indicators"]
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)

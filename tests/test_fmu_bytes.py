@@ -34,7 +34,7 @@ MACOS = ("x86_64-darwin", "aarch64-darwin")
 C_LIBRARY = {
     "bcmp",
     "calloc", "free", "memcmp", "memcpy", "memset", "strcmp", "strlen", "vsnprintf",
-    "cos", "exp", "fabs", "fmax", "fmin", "log", "pow", "sin", "sqrt", "tanh",
+    "cos", "exp", "fabs", "floor", "fmax", "fmin", "log", "nearbyint", "pow", "sin", "sqrt", "tanh",
 }  # fmt: skip
 
 EXPORT = """

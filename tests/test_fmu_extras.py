@@ -19,7 +19,7 @@ from psa_casadi.export.reference_results import (
     FOLDER,
     NOTES,
 )
-from psa_casadi.export.terminals import terminals_and_icons, terminals_of
+from psa_casadi.export.terminals import terminal_entries, terminals_and_icons, terminals_of
 from psa_casadi.export.variable_table import variable_table
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS, stack_model
@@ -79,6 +79,13 @@ def test_a_model_without_known_variables_has_no_terminal() -> None:
 
 
 # Icons
+
+
+@pytest.mark.parametrize(("model", "drawing"), [(stack_model(STACK), "stack"), (flexure, "block")])
+def test_only_a_stack_is_drawn_as_one(model: Model, drawing: str) -> None:
+    assert terminal_entries(model)["terminalsAndIcons/icon.png"] == png(ICONS[drawing])
+    shapes = svg(ICONS[drawing]).partition("\n")[2].strip()
+    assert shapes in documentation(model)
 
 
 @pytest.mark.parametrize("name", ICONS)

@@ -2,6 +2,7 @@ import difflib
 import re
 from pathlib import Path
 
+import casadi as ca
 import pytest
 from typer.testing import CliRunner
 
@@ -12,6 +13,8 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.modelica import class_names, export_modelica, modelica_text
 from psa_casadi.model.compose import compose
+from psa_casadi.model.from_casadi import ode_model
+from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.variables import Input, Output, Parameter, State
 
@@ -163,3 +166,25 @@ def test_the_command_refuses_an_impossible_name(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "x.mo")])
     assert result.exit_code == 2
     assert "'end' cannot name a Modelica package" in result.output
+
+
+def test_a_stack_has_a_stacks_icon_and_everything_else_a_plain_one() -> None:
+    stack, amplifier = (
+        modelica_text(m) for m in (stack_model("P-885.51"), part_model("voltage_amplifier"))
+    )
+    assert "extends Icons.Stack;" in stack
+    assert "Icons.Block" not in stack
+    assert "extends Icons.Block;" in amplifier
+    assert "partial model Block" in amplifier
+    assert "Stack" not in amplifier.replace("PiezoStack", "")
+
+
+@pytest.mark.parametrize(("start", "rests"), [(0.0, True), (2.0, True), (1.0, False)])
+def test_the_text_says_whether_the_states_rest_at_the_start(start: float, rests: bool) -> None:
+    """x' = x (2 - x) rests at 0 and at 2."""
+    x = ca.SX.sym("x")
+    states = [State("x", "1", "a population", 1.0, start=start)]
+    model = ode_model({"x": x, "ode": x * (2.0 - x)}, name="logistic", states=states)
+    text = modelica_text(model)
+    assert ("states start at rest." in text) == rests
+    assert ("states start at their start values" in text) != rests

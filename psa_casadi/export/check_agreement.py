@@ -61,6 +61,8 @@ def has_reference(model: Model) -> bool:
 def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
     """Return the outputs (n, ny) by the reference, or by the simulator for a model with effects.
 
+    Of a model without outputs: its states (n, nx).
+
     At a jump of inputs that are held the outputs are those before it; with sampled states, which
     take their samples after it, those after it.
     """
@@ -93,12 +95,13 @@ def _signal(inputs: Signals, column: int) -> Signal:
 
 
 def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+    quiet = not model.output_names
     grid = np.union1d(times, inputs.times[inputs.times <= times[-1]])
     start = np.array([s.start for s in model.structure.states])
     hold = "zero" if inputs.held else "linear"
     steps = run(model, grid, inputs.at(grid), start, rtol=1e-11, hold=hold)
-    if not inputs.held or model.sampled_names:
-        return steps.y[np.isin(grid, times)]
+    if quiet or not inputs.held or model.sampled_names:
+        return (steps.x if quiet else steps.y)[np.isin(grid, times)]
     p = np.array([[model.values[n]] * len(grid) for n in model.parameter_names])
     before = inputs.at(grid, before=True)
     found = np.array(model.structure.f(grid[None, :], steps.x.T, before.T, p)[1])
@@ -118,8 +121,8 @@ def agreements(fmu: Fmu, model: Model) -> Iterator[Agreement]:
     grids = {step: _grid(step, slow.times[-1]) for step in _SLOW_STEPS}
     times = np.unique(np.concatenate([*grids.values(), slow.times]))
     linear = expected_outputs(model, times, slow)
-    compare = _Comparison(model, _scale(model, linear))
-    names, grid = model.output_names, grids[1e-3]
+    names, grid = model.output_names or model.state_names, grids[1e-3]
+    compare = _Comparison(model, names, _scale(model, names, linear))
     settled = bool(model.sampled_names)
     found = integrate(fmu, grid, slow, names, tolerance=_TOLERANCE)
     yield compare("model exchange", found, linear[np.searchsorted(times, grid)])
@@ -145,6 +148,7 @@ class _Comparison:
     """Says how far outputs (n, ny) are from the truth, in shares of a scale (ny,)."""
 
     model: Model
+    names: tuple[str, ...]
     scale: FloatArray
 
     def __call__(
@@ -153,7 +157,7 @@ class _Comparison:
         error = np.max(np.abs(found - truth), axis=0) / self.scale
         worst = int(np.argmax(error))
         by = "reference" if has_reference(self.model) else "simulator"
-        remark = f"largest in {self.model.output_names[worst]}, against the {by}"
+        remark = f"largest in {self.names[worst]}, against the {by}"
         return Agreement(name, float(error[worst]), limit, remark)
 
 
@@ -162,9 +166,9 @@ def _grid(step: float, end: float) -> FloatArray:
     return np.array([round(step * k, 12) for k in range(count + 1)])
 
 
-def _scale(model: Model, expected: FloatArray) -> FloatArray:
+def _scale(model: Model, names: tuple[str, ...], expected: FloatArray) -> FloatArray:
     ranges = np.ptp(expected, axis=0)
-    nominals = model.output_nominals()
-    strict = np.array(["displacement" in n for n in model.output_names])
+    nominals = model.output_nominals() if model.output_names else model.state_nominals()
+    strict = np.array(["displacement" in n for n in names])
     scale: FloatArray = np.where(strict & (ranges > 0.0), ranges, np.maximum(ranges, nominals))
     return scale

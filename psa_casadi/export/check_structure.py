@@ -42,7 +42,8 @@ def held_values(instance: Instance) -> list[FloatArray]:
     return [instance.get(names)] if names else []
 
 
-def _sampled_starts(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
+def sampled_starts(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
+    """Return values of the sampled states to start from, within their nominals."""
     return {n: float(fmu.nominals[n] * generator.uniform(-1.0, 1.0)) for n in fmu.sampled()}
 
 
@@ -57,7 +58,7 @@ def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
             yield f"'{entry.variable.name}' lists no dependencies"
     unknowns = list(dict.fromkeys(e.variable.name for e in entries))
     found: dict[str, set[str]] = {name: set() for name in unknowns}
-    starts = _sampled_starts(fmu, np.random.default_rng(6))
+    starts = sampled_starts(fmu, np.random.default_rng(6))
     with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
             point = random_point(fmu, generator)
@@ -81,7 +82,7 @@ def directional_error(fmu: Fmu) -> float:
     generator = np.random.default_rng(2)
     unknowns = [u.variable.name for u in (*fmu.description.outputs, *fmu.description.derivatives)]
     unknowns += fmu.indicators()
-    worst, starts = 0.0, _sampled_starts(fmu, np.random.default_rng(6))
+    worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
     with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
             point = random_point(fmu, generator)
@@ -137,7 +138,7 @@ def equation_error(fmu: Fmu, model: Model) -> float:
     """Return the largest relative difference of derivatives and outputs from the model's."""
     generator = np.random.default_rng(3)
     unknowns = [*(f"der({n})" for n in model.state_names), *model.output_names]
-    worst, starts = 0.0, _sampled_starts(fmu, np.random.default_rng(6))
+    worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
     with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
             point = random_point(fmu, generator)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from psa_casadi.export.description_common import force_scale, generation_tool, what_it_is
-from psa_casadi.export.icon import ICONS, svg
+from psa_casadi.export.icon import ICONS, drawing_of, svg
 from psa_casadi.export.reference_results import FOLDER, NOTES
 from psa_casadi.export.variable_table import Variable, variable_table
 from psa_casadi.model.compose import Model
@@ -50,7 +50,7 @@ def documentation(model: Model, *, reference_run: bool = True) -> str:
     """
     table = variable_table(model)
     name = html.escape(model.name)
-    drawing = svg(ICONS["icon"]).partition("\n")[2].strip()
+    drawing = svg(ICONS[drawing_of(model)]).partition("\n")[2].strip()
     scale = force_scale(model)
     parts = [
         f"<h1>{drawing}{name}</h1>",

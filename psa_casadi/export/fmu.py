@@ -11,7 +11,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.documentation import documentation
-from psa_casadi.export.icon import ICONS, png
+from psa_casadi.export.icon import ICONS, drawing_of, png
 from psa_casadi.export.model_description import model_description
 from psa_casadi.export.model_description3 import model_description3
 from psa_casadi.export.platforms import chosen_platforms, compile_library
@@ -84,7 +84,8 @@ def _companions(model: Model, fmi: int) -> dict[str, bytes]:
         entries = {}
     page = documentation(model, reference_run=bool(entries))
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
-    entries |= {"model.png": png(ICONS["icon"])} if fmi == 2 else terminal_entries(model)
+    drawing = png(ICONS[drawing_of(model)])
+    entries |= {"model.png": drawing} if fmi == 2 else terminal_entries(model)
     if all(c in (*COMPONENTS.values(), *EFFECTS.values()) for c in model.components):
         entries[MODEL_ENTRY] = dumps(model).encode("utf-8")
     return entries

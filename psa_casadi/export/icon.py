@@ -5,6 +5,8 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from psa_casadi.model.compose import Model
+
 #: Side of every icon in pixels of the PNG and in units of the SVG.
 SIDE = 128
 
@@ -37,12 +39,25 @@ def _stack() -> tuple[Rectangle, ...]:
     return (*layers, *electrodes, *ends, *leads, *arms)
 
 
-#: What each icon shows, by the base name of its files.
+def _block() -> tuple[Rectangle, ...]:
+    """Return a plain box with a lead on either side."""
+    leads = [Rectangle(4, 60, 16, 8, _LEAD), Rectangle(108, 60, 16, 8, _LEAD)]
+    return (*leads, Rectangle(20, 20, 88, 88, _METAL), Rectangle(28, 28, 72, 72, _CERAMIC))
+
+
+#: What each drawing shows, by its name.
 ICONS: dict[str, tuple[Rectangle, ...]] = {
-    "icon": _stack(),
+    "stack": _stack(),
+    "block": _block(),
     "electrical": (Rectangle(0, 0, SIDE, SIDE, _LEAD), Rectangle(16, 16, 96, 96, _CLEAR)),
     "mechanical": (Rectangle(0, 0, SIDE, SIDE, _METAL),),
 }
+
+
+def drawing_of(model: Model) -> str:
+    """Return the drawing of a model: a stack if it has its voltage and displacement, else a box."""
+    is_stack = "voltage" in model.input_names and "displacement" in model.output_names
+    return "stack" if is_stack else "block"
 
 
 def svg(shapes: Sequence[Rectangle]) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from psa_casadi.component import BALANCES
 from psa_casadi.errors import Problems
+from psa_casadi.export.icon import drawing_of
 from psa_casadi.export.modelica_acausal import acausal_lines, has_ports
 from psa_casadi.export.modelica_annotations import about, documentation, equations_table, icon
 from psa_casadi.export.modelica_class import class_lines
@@ -16,7 +17,7 @@ from psa_casadi.model.compose import Model
 
 _USE = (
     "Signal needs no library. Acausal has pins and flanges of the Modelica Standard Library 4. All"
-    " quantities are in SI units; states start at rest."
+    " quantities are in SI units; "
 )
 _SAMPLING = (
     "The sampled states change at the multiples of their period from time 0 on, as sample(0, T)"
@@ -54,7 +55,7 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
         lines += ["", *(f"  {line}" if line else line for line in "\n".join(part).split("\n"))]
     uses = ', uses(Modelica(version="4.0.0"))' if has_ports(exported) else ""
     sampled = [_SAMPLING] if exported.sampled_names else []
-    text = documentation([*about(exported), _USE, *sampled])
+    text = documentation([*about(exported), _USE + _starts(exported), *sampled])
     return "\n".join([*lines, "", f"  annotation({text}{uses});", f"end {name};", ""])
 
 
@@ -62,6 +63,17 @@ def class_names(model: Model) -> tuple[str, ...]:
     """Return the names of the classes that a package of a model has, its icons left out."""
     acausal = ("Acausal",) if has_ports(model) else ()
     return ("Signal", *acausal, *(f"Examples.{name}" for name in example_names(model)))
+
+
+def _starts(model: Model) -> str:
+    """Say whether the states rest where they start; an input starts at its own value."""
+    s = model.structure
+    groups = [[v.start for v in group] for group in (s.states, s.inputs)]
+    held = [[v.start for v in s.sampled]] if s.sampled else []
+    rates = s.f(0.0, *groups, model.parameter_vector(), *held)[0]
+    if all(float(rate) == 0.0 for rate in rates.elements()):
+        return "states start at rest."
+    return "states start at their start values, from where they move even if the inputs do not."
 
 
 def _parts(model: Model) -> list[list[str]]:
@@ -74,18 +86,19 @@ def _parts(model: Model) -> list[list[str]]:
     parts = [signal]
     if has_ports(model):
         parts.append(acausal_lines(model))
-    return [*parts, example_lines(model), _icons()]
+    return [*parts, example_lines(model), _icons(drawing_of(model))]
 
 
-def _icons() -> list[str]:
-    drawn = [f"  {line}" for line in icon("icon")]
+def _icons(drawing: str) -> list[str]:
+    shown = {"stack": "a stack of wafers", "block": "a plain block"}[drawing]
+    drawn = [f"  {line}" for line in icon(drawing)]
     play = "Polygon(points={{-40, 60}, {60, 0}, {-40, -60}}, fillPattern=FillPattern.Solid)"
     ellipse = "Ellipse(extent={{-100, -100}, {100, 100}})"
     return [
         'package Icons "drawings"',
-        '  partial model Stack "a stack of wafers"',
+        f'  partial model {drawing.capitalize()} "{shown}"',
         *drawn,
-        "  end Stack;",
+        f"  end {drawing.capitalize()};",
         '  partial model Example "an example"',
         f"    annotation(Icon(graphics={{{ellipse}, {play}}}));",
         "  end Example;",

@@ -5,6 +5,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from psa_casadi.export.icon import drawing_of
 from psa_casadi.export.modelica_equations import ModelEquations, Variable, model_equations
 from psa_casadi.export.modelica_sampling import when_lines
 from psa_casadi.export.modelica_words import comment, modifier, number, string, unit_text
@@ -32,13 +33,13 @@ class Ports:
 def class_lines(
     model: Model, name: str, description: str, annotation: str, ports: Ports | None = None
 ) -> list[str]:
-    """Return the lines of a model class; its icon is that of `Icons.Stack`.
+    """Return the lines of a model class; its icon is a stack's or a plain one.
 
     Raises InputError for values that are not finite and for what Modelica cannot write.
     """
     ports = ports or Ports()
     equations = model_equations(model, ports.identifiers)
-    lines = ["  extends Icons.Stack;", *ports.declarations]
+    lines = [f"  extends Icons.{drawing_of(model).capitalize()};", *ports.declarations]
     lines += [*_signals(model, equations, ports), *_components(model, equations, ports)]
     hidden = _protected(model, equations, ports)
     lines += ["protected", *hidden] if hidden else []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 from psa_casadi.export.description_common import xml_text
-from psa_casadi.export.icon import ICONS, png, svg
+from psa_casadi.export.icon import ICONS, drawing_of, png, svg
 from psa_casadi.model.compose import Model
 
 FOLDER = "terminalsAndIcons"
@@ -115,7 +115,8 @@ def _terminal(parent: ET.Element, terminal: Terminal) -> None:
 
 def terminal_entries(model: Model) -> dict[str, bytes]:
     """Return the files of the folder terminalsAndIcons by their place in the archive."""
-    names = ("icon", *dict.fromkeys(t.icon for t in terminals_of(model)))
+    drawings = {"icon": drawing_of(model)} | {t.icon: t.icon for t in terminals_of(model)}
+    shapes = {name: ICONS[drawing] for name, drawing in drawings.items()}
     entries = {f"{FOLDER}/terminalsAndIcons.xml": terminals_and_icons(model).encode("utf-8")}
-    entries |= {f"{FOLDER}/{n}.png": png(ICONS[n]) for n in names}
-    return entries | {f"{FOLDER}/{n}.svg": svg(ICONS[n]).encode("utf-8") for n in names}
+    entries |= {f"{FOLDER}/{n}.png": png(s) for n, s in shapes.items()}
+    return entries | {f"{FOLDER}/{n}.svg": svg(s).encode("utf-8") for n, s in shapes.items()}

@@ -48,6 +48,16 @@ PARTS: dict[str, PartKind] = {
             "charge amplifier with a leakage corner",
             ("charge_amplifier",),
         ),
+        PartKind(
+            "prestress_mechanism",
+            "mass, spring and damper that a stack's tip moves",
+            ("prestress_mechanism",),
+        ),
+        PartKind(
+            "online_identification",
+            "recursive least squares of a stack's hysteresis parameters, sampled",
+            ("online_identification",),
+        ),
     )
 }
 

@@ -1,0 +1,104 @@
+"""Models that have no inputs, parameters or outputs, that rest, or that switch by themselves."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from psa_casadi.component import Component, Equations
+from psa_casadi.export.check import check_fmu
+from psa_casadi.export.fmu import export_fmu
+from psa_casadi.export.fmu_instance import CO_SIMULATION, Fmu
+from psa_casadi.export.modelica import modelica_text
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.from_casadi import ode_model
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import Input, Parameter, State
+from tests.modelica_runs import simulated
+
+_X, _U, _P, _T = (ca.SX.sym(name) for name in "xupt")
+
+
+def _ode(name: str, **ode: ca.SX) -> Model:
+    values = {"p": 2.0} if "p" in ode else {}
+    return ode_model({"x": _X, **ode}, name=name, values=values)
+
+
+@cache
+def _without_outputs() -> Model:
+    tank = Component(
+        name="tank",
+        description="a state that follows an input, shown to nobody",
+        source="a first-order lag",
+        equations=lambda s: Equations(der={"level": s.rate * (s.inflow - s.level)}),
+        parameters=(Parameter("rate", 2.0, "1/s", (0.0, 10.0), "rate of the lag"),),
+        states=(State("level", "m", "level", 1.0),),
+        inputs=(Input("inflow", "m", "what the level follows", 0.0, 1.0),),
+    )
+    return compose([tank], name="tank")
+
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "neither input nor parameter": lambda: _ode("decay", ode=-_X),
+    "no input": lambda: _ode("decay", p=_P, ode=-_P * _X),
+    "at rest, parameter without effect": lambda: _ode("rest", u=_U, p=_P, ode=-_P * _X),
+    "constant rate": lambda: _ode("clock", ode=ca.SX(1.0)),
+    "parameter that acts beyond a threshold": lambda: _ode(
+        "threshold", u=_U, p=_P, ode=_P * ca.fmax(_U - 5.0, 0.0) - _X, zero=_U - 5.0
+    ),
+    "switch by time": lambda: _ode(
+        "late", u=_U, p=_P, t=_T, ode=_P * _U - _X + ca.fmax(_T - 0.5, 0.0), zero=_T - 0.5
+    ),
+    "switch by a state": lambda: _ode(
+        "bump", u=_U, p=_P, ode=_U - _X - _P * ca.fmax(_X - 0.3, 0.0), zero=_X - 0.3
+    ),
+    "no output": _without_outputs,
+}
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("name", MODELS)
+def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) -> None:
+    report = check_fmu(export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
+    assert report.passed, report.failures
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_wired_system_passes_the_check(fmi: int, tmp_path: Path) -> None:
+    """Its switches follow states and held commands, not the inputs."""
+    model = nanopositioner("P-885.51").model()
+    report = check_fmu(export_fmu(model, tmp_path / "m.fmu", fmi=fmi))
+    assert report.passed, report.failures
+
+
+def test_without_outputs_the_states_are_compared(tmp_path: Path) -> None:
+    report = check_fmu(export_fmu(_without_outputs(), tmp_path / "m.fmu"), _without_outputs())
+    assert report.compared
+    assert report.passed, report.failures
+    assert sum(row.remark.startswith("largest in level") for row in report.rows) == 6
+
+
+def test_a_model_without_outputs_runs_everywhere(tmp_path: Path) -> None:
+    """Its state is the lag's exponential in Python, in an FMU and in Modelica."""
+    model, end = _without_outputs(), 1.0
+    assert isinstance(model.structure.y, ca.SX)
+    assert model.structure.y.shape == (0, 1)
+    exact = 1.0 - np.exp(-2.0 * end)
+    t = np.linspace(0.0, end, 11)
+    steps = run(model, t, np.ones((11, 1)), np.zeros(1), rtol=1e-9)
+    assert steps.x[-1, 0] == pytest.approx(exact, rel=1e-7)
+    assert steps.y.shape == (11, 0)
+    with (
+        Fmu(export_fmu(model, tmp_path / "m.fmu")) as fmu,
+        fmu.start(CO_SIMULATION, tolerance=1e-9) as slave,
+    ):
+        slave.set({"inflow": 1.0})
+        slave.step(0.0, end)
+        assert slave.get(["level"])[0] == pytest.approx(exact, rel=1e-7)
+    harness = "model Harness Tank.Signal tank(inflow = 1.0); end Harness;"
+    got = simulated(modelica_text(model, name="Tank") + harness, "Harness", end)
+    assert got["tank.level"][-1] == pytest.approx(1.0 - np.exp(-2.0 * got["time"][-1]), rel=1e-4)
