@@ -1,20 +1,19 @@
 """Designed experiments: within their limits, with right gradients, and better than a sine."""
 
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from typer.testing import CliRunner
 
 from psa_casadi import reference
-from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, read_record
+from psa_casadi.experiment import Record
 from psa_casadi.input_design.candidates import KINDS, Kind, draw, rest_of
 from psa_casadi.input_design.criterion import Criterion
 from psa_casadi.input_design.experiment import (
+    _plays,
     informative_experiment,
     rival_of_effect,
     separating_experiment,
@@ -27,6 +26,7 @@ from psa_casadi.input_design.search import Effort
 from psa_casadi.input_design.separation import Separation, naming_probability
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.report.experiment_part import sentences
 from psa_casadi.units import FloatArray
 
 STACK = "P-885.51"
@@ -193,13 +193,17 @@ def test_coloured_noise_tells_less_of_slow_voltages() -> None:
 
 def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> None:
     limits = Limits(0.0, 80.0, 1.0, 200, rate=2e3)
-    told = separating_experiment(rivals(), NOISE, limits, effort=BRIEF)
+    kinds: tuple[Kind, ...] = ("steps", "multisine")
+    told = separating_experiment(rivals(), NOISE, limits, kinds=kinds, effort=BRIEF)
     assert told.record.n == limits.samples
     assert excess(told.record, limits, None) == ()
     assert told.factor("sine") > 1.0
     assert told.factor("triangle") > 1.0
+    assert "plays" not in " ".join(sentences(told, None))
+    assert "3 plays, each from rest" in " ".join(sentences(replace(told, plays=3), None))
+    assert "look alike" in " ".join(sentences(replace(told, plays=None), None))
     rival = rival_of_model("base", stack_model(STACK), FREE)
-    sharp = informative_experiment(rival, NOISE, limits, optimality="A", effort=BRIEF)
+    sharp = informative_experiment(rival, NOISE, limits, optimality="A", kinds=kinds, effort=BRIEF)
     assert excess(sharp.record, limits, None) == ()
     assert min(sharp.factor.values()) > 1.1
     for name in FREE:
@@ -207,39 +211,25 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
         assert 0.0 < after < before
 
 
+def test_the_more_noise_the_more_plays() -> None:
+    pair, record = tuple(rivals()), planned("triangles")
+    found: list[float] = []
+    for noise in (1e-10, 2e-9, 2e-6):
+        criterion = Separation(pair, SensorNoise(noise).on_grid(LIMITS, LIMITS.samples))
+        distances = criterion.distances(record)
+        chance = {r.name: naming_probability(r, [o], distances, 0.0)
+                  for r, o in (pair, pair[::-1])}  # fmt: skip
+        found.append(_plays(criterion, None, record, chance) or np.inf)
+    assert found[0] == 1
+    assert 1 < found[1] <= 5
+    assert found[-1] == np.inf
+
+
 def test_the_usual_voltages_slow_down_where_the_rate_asks() -> None:
     limits = Limits(0.0, 100.0, 1.0, 200, rate=500.0)
     for record in usual_records(limits, 500.0).values():
         assert excess(record, limits, None) == ()
         assert np.ptp(record.voltage) > 0.9 * limits.span
-
-
-def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None:
-    output, page = tmp_path / "voltage.csv", tmp_path / "page.html"
-    arguments = [
-        "design", "experiment", "--stack", STACK, "--duration", "0.5", "--samples", "100",
-        "--high", "60", "--current", "0.01", "--family", "triangles", "--starts", "1",
-        "--separate", "sensor_nonlinearity", "slow_creep", "-o", str(output), "--report", str(page),
-    ]  # fmt: skip
-    found = CliRunner().invoke(app, arguments)
-    assert found.exit_code == 0, found.output
-    assert "sensor nonlinearity" in found.output
-    record = read_record(output, need_displacement=False)
-    limits = Limits(0.0, 60.0, 0.5, 100, current=0.01)
-    assert record.n == 100
-    assert excess(record, limits, stack_model(STACK).values["C_p"]) == ()
-    assert "The voltage to play" in page.read_text(encoding="utf-8")
-
-
-def test_the_command_tells_all_mistakes_at_once(tmp_path: Path) -> None:
-    arguments = [
-        "design", "experiment", "--separate", "creeping", "--noise", "-1", "--starts", "0",
-        "-o", str(tmp_path / "no" / "where.csv"),
-    ]  # fmt: skip
-    found = CliRunner().invoke(app, arguments)
-    assert found.exit_code == 2
-    for part in ("creeping", "--noise", "--starts", "does not exist", "No model is given"):
-        assert part in found.output
 
 
 def test_a_parameter_that_is_not_free_is_named() -> None:

@@ -60,12 +60,20 @@ def _co_simulation(found: Mapping[str, float]) -> None:
     assert found["error at 2 us, with slopes [%]"] > found["error at 2 us, values held [%]"]
 
 
+def _tracking_on_the_fmu(found: Mapping[str, float]) -> None:
+    difference, largest, error = found.values()
+    assert difference < 1e-6
+    assert 40.0 < largest < 70.0
+    assert error < 0.1
+
+
 #: What the returned figures must be, beyond that the example runs and leaves its files.
 FIGURES: dict[str, Callable[[Any], None]] = {
     "van_der_pol": _van_der_pol,
     "use_in_fmpy": _use_in_fmpy,
     "use_in_casadi": _use_in_casadi,
     "co_simulation": _co_simulation,
+    "tracking_on_the_fmu": _tracking_on_the_fmu,
 }
 
 

@@ -1,7 +1,7 @@
 """From ambiguous to named: a designed record, played on the hidden plant, tells the cause."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,13 @@ from psa_casadi.input_design import experiment
 from psa_casadi.input_design.designs import Separated
 from psa_casadi.input_design.experiment import resolving_experiment
 from psa_casadi.input_design.limits import excess
+from psa_casadi.input_design.search import Effort
 from psa_casadi.report.text import story
 from tests.plants.again import play_again
+from tests.plants.base import simulate_base
+from tests.plants.hide import effect_called
 from tests.plants.make import make_record
+from tests.plants.same_device import in_terms_of
 
 #: A gain that bends with the field, hidden in a triangle, where a bent sensor looks the same.
 HIDDEN, RIVAL, SEED = "field_dependent_gain", "sensor_nonlinearity", 7003
@@ -42,7 +46,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
     truth = make_record(HIDDEN, SEED, path, excitation="triangle", visible=(0.3, 2.0))
     first = read_record(path).slice(0, SAMPLES)
     ambiguous = diagnose([first], effects=effects)
-    design = resolving_experiment(ambiguous)
+    design = resolving_experiment(ambiguous, effort=Effort(draws=3, starts=1, steps=3))
     played = folder / "next.csv"
     play_again(truth, SEED, played, (design.record.time, design.record.voltage))
     named = diagnose([first, read_record(played)], effects=effects)
@@ -97,3 +101,28 @@ def test_the_command_writes_the_record_and_says_so(
     np.testing.assert_array_equal(record.voltage, loop.design.record.voltage)
     assert command._with_next(loop.named, path, lambda _: None) is loop.named
     assert command._with_next(loop.ambiguous, None, lambda _: None) is loop.ambiguous
+
+
+@pytest.mark.parametrize("name", ["offset_drift", "self_heating"])
+def test_a_device_stays_the_same_on_a_shorter_record(name: str, tmp_path: Path) -> None:
+    """What it adds depends on the voltage until then, not on how long the record will last."""
+    truth = make_record(name, 5, tmp_path / "record.csv", excitation="triangle")
+    times, command = truth.times[:1500], truth.voltage[:1500]
+    run = simulate_base(truth.stack, times, command)
+    added = (truth.displacement - truth.base_displacement)[:1500]
+    seen = []
+    for told in (in_terms_of(truth, times, command), truth):
+        found = effect_called(name).contribution(run, told.parameters, told.gain)
+        seen.append(float(np.max(np.abs(found - added)) / np.ptp(added)))
+    assert seen[0] < 1e-3
+    assert seen[1] > 0.01
+
+
+def test_a_source_that_clips_does_so_at_the_same_voltage(tmp_path: Path) -> None:
+    drawn = make_record("offset_drift", 5, tmp_path / "record.csv", excitation="triangle")
+    truth = replace(drawn, effect="voltage_saturation", gain=0.1)
+    ends = (1.0 - truth.gain) * truth.voltage.max()
+    for share in (0.99 * ends, 1.01 * ends):
+        command = truth.voltage * share / truth.voltage.max()
+        again = in_terms_of(truth, truth.times, command)
+        assert (1.0 - again.gain) * command.max() == pytest.approx(min(ends, share))

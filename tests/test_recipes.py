@@ -16,34 +16,17 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from fmpy import read_model_description
 from scipy.integrate import solve_ivp
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.examples.index import Example, Script, examples
-from psa_casadi.export.platforms import chosen_platforms
 from tests.modelica_runs import load
 from tests.modelica_stub import STUB
 from tests.oms_stand_in import OMSimulator
+from tests.recipe_commands import run_command
 from tests.script_calls import calls_of
 from tests.tool_interfaces import BLOCK_PARAMETERS, DYMOLA, OPENMODELICA, bound
 
 RECIPES = [e.name for e in examples().values() if e.kind == "recipe"]
-
-
-def _psa(command: str) -> None:
-    """Run a command of `psa` in the current folder, for the platform of this machine only.
-
-    What binaries of other platforms do is shown by tests/test_fmu_platforms.py.
-    """
-    words = shlex.split(command)
-    assert words[0] == "psa"
-    if "--platforms" in words:
-        at = words.index("--platforms") + 1
-        assert chosen_platforms(words[at].split(","))
-        words[at] = "host"
-    result = CliRunner().invoke(app, words[1:])
-    assert result.exit_code == 0, f"{command}: {result.output}"
 
 
 def _shell(recipe: Example) -> list[str]:
@@ -57,7 +40,7 @@ def made(request: pytest.FixtureRequest, made_files: Path, monkeypatch: pytest.M
     folder.mkdir(exist_ok=True)
     monkeypatch.chdir(folder)
     for command in _shell(examples()[request.param]):
-        _psa(command)
+        run_command(command)
     return folder
 
 
@@ -240,7 +223,7 @@ def test_the_workflow_is_yaml_and_its_commands_run(
     commands = [c for step in job["steps"] for c in step.get("run", "").splitlines()]
     assert commands[0].startswith("python -m pip install ")
     for command in commands[1:]:
-        _psa(command)
+        run_command(command)
     kept = {p.name for p in tmp_path.glob(job["steps"][-1]["with"]["path"])}
     assert kept == {"stack.fmu", "stack3.fmu"}
 

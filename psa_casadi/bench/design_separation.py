@@ -26,7 +26,7 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import split
 from psa_casadi.identification.search import CORE, fit_base
 from psa_casadi.identification.starting import starting_model
-from psa_casadi.input_design.designs import Separated
+from psa_casadi.input_design.designs import ASKED, PLAYS, Separated
 from psa_casadi.input_design.experiment import (
     informative_experiment,
     resolving_experiment,
@@ -52,7 +52,8 @@ class Resolved:
     """One ambiguous pair: what is hidden, its rival, and what was named after each further record.
 
     `named` holds for each voltage played "right", "wrong" or "open"; `growth` the predicted least
-    ln of the Bayes factor; `chance` the predicted probability to name the hidden effect.
+    ln of the Bayes factor; `chance` the predicted probability to name the hidden effect; `plays`
+    how often the record must be played for 90 % of it, None if that is never reached.
     """
 
     seed: int
@@ -63,6 +64,7 @@ class Resolved:
     named: dict[str, str]
     growth: dict[str, float]
     chance: float
+    plays: int | None
     seconds: float
 
 
@@ -139,7 +141,7 @@ def _names(model: Any) -> set[str]:
 
 
 def played(truth: Any, record: Record, seed: int) -> Record:
-    """Return what the device measures when a planned voltage is played to it."""
+    """Return what the same device measures when a planned voltage is played to it."""
     again = import_module("tests.plants.again")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{record.name}.csv"
@@ -159,8 +161,9 @@ def _resolved(
 ) -> Resolved:
     growth = {"designed": min(p.designed for p in s.pairs)}
     growth |= {n: min(p.usual[n] for p in s.pairs) for n in _PLAYED[1:]}
-    chance = s.chance[effect]
-    return Resolved(seed, effect, rival, voltage, s.kind, named, growth, chance, s.seconds)
+    return Resolved(
+        seed, effect, rival, voltage, s.kind, named, growth, s.chance[effect], s.plays, s.seconds
+    )
 
 
 def _summary(found: Sequence[Resolved]) -> TitledTable:
@@ -170,13 +173,18 @@ def _summary(found: Sequence[Resolved]) -> TitledTable:
         growth = float(np.median([r.growth[name] for r in found])) if found else float("nan")
         asked = f"{round(0.9 * len(found))} of {len(found)} right" if name == "designed" else ""
         rows.append((name, asked, *(str(c) for c in counts.values()), f"{growth:.3g}"))
+    alike = [r for r in found if r.plays is None]
+    open_ = sum(r.named["designed"] == "open" for r in alike)
     head = ("further record", "asked", "right name", "wrong name", "open", "predicted ln B, median")
     return TitledTable(
         "Ambiguous pairs on independent plants, after one further record",
         Table(head, tuple(rows)),
         "All further records have the length, the sampling and the voltage range of the first. The"
         " predicted ln B is the growth of the logarithm of the Bayes factor for the less favourable"
-        " of the two truths.",
+        " of the two truths. Of "
+        f"{len(alike)} pairs it was said beforehand that no record found, nor"
+        f" {PLAYS[-1]} of them, would tell with {100.0 * ASKED:.0f} %; {open_} of them stayed open"
+        " with the designed one.",
     )
 
 
@@ -185,12 +193,14 @@ def _by_pair(found: Sequence[Resolved]) -> TitledTable:
         (
             str(r.seed), r.effect, r.rival, r.voltage, r.kind,
             *(f"{r.named[n]} ({r.growth[n]:.3g})" for n in _PLAYED),
-            f"{100.0 * r.chance:.0f} %", f"{r.seconds:.0f} s",
+            f"{100.0 * r.chance:.0f} %", "never" if r.plays is None else f"{r.plays}",
+            f"{r.seconds:.0f} s",
         )
         for r in found
     ]  # fmt: skip
     head = ("seed", "hidden", "rival", "first record", "family", "designed (ln B)",
-            "sine (ln B)", "triangle (ln B)", "predicted chance", "to design")  # fmt: skip
+            "sine (ln B)", "triangle (ln B)", "predicted chance", "plays for 90 %",
+            "to design")  # fmt: skip
     return TitledTable("Every pair", Table(head, tuple(rows)))
 
 

@@ -75,15 +75,15 @@ def experiment(
         Optimality, typer.Option(help="Volume, worst direction or mean square of the intervals.")
     ] = Optimality.D,
     family: Annotated[Family, typer.Option(help="Family of voltages.")] = Family.ANY,
-    low: Annotated[float | None, typer.Option(help="Lowest voltage [V].")] = None,
-    high: Annotated[float | None, typer.Option(help="Highest voltage [V].")] = None,
-    duration: Annotated[float | None, typer.Option(help="Length of the record [s].")] = None,
+    low: Annotated[float | None, typer.Option(help="Lowest voltage \\[V].")] = None,
+    high: Annotated[float | None, typer.Option(help="Highest voltage \\[V].")] = None,
+    duration: Annotated[float | None, typer.Option(help="Length of the record \\[s].")] = None,
     samples: Annotated[int | None, typer.Option(help="Number of samples.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Largest rate [V/s].")] = None,
-    current: Annotated[float | None, typer.Option(help="Largest current [A].")] = None,
-    bandwidth: Annotated[float | None, typer.Option(help="Bandwidth [Hz].")] = None,
+    rate: Annotated[float | None, typer.Option(help="Largest rate \\[V/s].")] = None,
+    current: Annotated[float | None, typer.Option(help="Largest current \\[A].")] = None,
+    bandwidth: Annotated[float | None, typer.Option(help="Bandwidth \\[Hz].")] = None,
     noise: Annotated[
-        float | None, typer.Option(help="Noise of the sensor, rms [nm]; 0.1 % of the stroke.")
+        float | None, typer.Option(help="Noise of the sensor, rms \\[nm]; 0.1 % of the stroke.")
     ] = None,
     correlation: Annotated[
         float, typer.Option(help="Correlation of the noise in neighbouring samples.")
@@ -103,15 +103,11 @@ def experiment(
     """
     from psa_casadi.cli import design_given
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.input_design.candidates import KINDS
-    from psa_casadi.input_design.designs import Informative, Separated
-    from psa_casadi.input_design.experiment import informative_experiment, separating_experiment
     from psa_casadi.input_design.search import Effort
 
     given = Given()
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
-    names = [*(separate or []), *(more or [])]
-    effects = design_given.effects(given, names, parameter or [])
+    effects = design_given.effects(given, [*(separate or []), *(more or [])], parameter or [])
     chosen = given.model_or_stack(model, stack)
     records = given.records(record, columns=columns) if record else []
     design_given.check_noise(given, noise, correlation, starts)
@@ -123,23 +119,16 @@ def experiment(
     given.check()
     if chosen is None or limits is None:
         return
-    kinds = KINDS if family is Family.ANY else tuple(k for k in KINDS if k == family.value)
-    effort = Effort(starts=starts, seed=seed)
     level = design_given.noise(chosen, limits, noise, correlation)
+    plan = design_given.Plan(limits, level, family.value, Effort(starts=starts, seed=seed))
+    design: Informative | Separated
     with working("designing an experiment", quiet) as progress:
-        design: Informative | Separated
         if effects:
-            base, rivals, fitted = design_given.rivals(chosen, effects, records, progress)
-            design = separating_experiment(
-                rivals, fitted or level, limits,
-                base=base, kinds=kinds, effort=effort, progress=progress,
-            )  # fmt: skip
+            design, rivals = design_given.separating(chosen, effects, records, plan, progress)
         else:
-            rivals = [design_given.whole(chosen, parameter or [])]
-            design = informative_experiment(
-                rivals[0], level, limits, names=parameter or (), optimality=optimality.value,
-                kinds=kinds, effort=effort, progress=progress,
-            )  # fmt: skip
+            design, rivals = design_given.informative(
+                chosen, parameter or [], optimality.value, plan, progress
+            )
         _write(design, chosen, rivals, output, report)
     _tell(design, chosen, quiet)
     tell_written(output, report, quiet=quiet)

@@ -1,5 +1,6 @@
-"""What `psa design experiment` is given, turned into limits, noise and rivals."""
+"""What `psa design experiment` is given, turned into limits, noise and rivals, and the design."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -8,12 +9,33 @@ if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
     from psa_casadi.experiment.record import Record
+    from psa_casadi.input_design.candidates import Kind
+    from psa_casadi.input_design.designs import Informative, Separated
+    from psa_casadi.input_design.information import Optimality
     from psa_casadi.input_design.limits import Limits
     from psa_casadi.input_design.rivals import Rival, SensorNoise
+    from psa_casadi.input_design.search import Effort
     from psa_casadi.model.compose import Model
 
 #: Noise of the sensor over the stroke where none is given, and samples of a record.
 _NOISE_SHARE, _SAMPLES = 1e-3, 1000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a design keeps to: limits, noise, family of voltages ("any" for all), effort."""
+
+    limits: "Limits"
+    noise: "SensorNoise"
+    family: str
+    effort: "Effort"
+
+    @property
+    def kinds(self) -> "tuple[Kind, ...]":
+        """The families to search."""
+        from psa_casadi.input_design.candidates import KINDS
+
+        return KINDS if self.family == "any" else tuple(k for k in KINDS if k == self.family)
 
 
 def effects(
@@ -76,6 +98,42 @@ def noise(
     ramp = limits.low + limits.span * time / time[-1]
     reached = simulate(model, time, ramp).outputs["displacement"]
     return SensorNoise(_NOISE_SHARE * float(reached.max() - reached.min()), correlation)
+
+
+def separating(
+    model: "Model",
+    effects: "Sequence[Component]",
+    records: "Sequence[Record]",
+    plan: Plan,
+    progress: "Callable[[str], None]",
+) -> "tuple[Separated, list[Rival]]":
+    """Return the record that tells effects apart, and the rivals it was designed for."""
+    from psa_casadi.input_design.experiment import separating_experiment
+
+    base, found, fitted = rivals(model, effects, records, progress)
+    design = separating_experiment(
+        found, fitted or plan.noise, plan.limits,
+        base=base, kinds=plan.kinds, effort=plan.effort, progress=progress,
+    )  # fmt: skip
+    return design, found
+
+
+def informative(
+    model: "Model",
+    parameters: "Sequence[str]",
+    optimality: "Optimality",
+    plan: Plan,
+    progress: "Callable[[str], None]",
+) -> "tuple[Informative, list[Rival]]":
+    """Return the record that sharpens parameters, and the model with what is free in it."""
+    from psa_casadi.input_design.experiment import informative_experiment
+
+    rival = whole(model, parameters)
+    design = informative_experiment(
+        rival, plan.noise, plan.limits, names=parameters, optimality=optimality,
+        kinds=plan.kinds, effort=plan.effort, progress=progress,
+    )  # fmt: skip
+    return design, [rival]
 
 
 def rivals(

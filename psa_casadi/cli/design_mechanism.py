@@ -2,11 +2,14 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from psa_casadi.cli.screen import Quiet, StackOption, show, show_table, tell_written, working
+
+if TYPE_CHECKING:
+    from psa_casadi.input_design.mechanism import MechanismDesign
 
 
 class ActsOn(StrEnum):
@@ -28,7 +31,7 @@ def mechanism(
     ] = None,
     poles: Annotated[
         str | None,
-        typer.Option(help="One or two pairs of poles [rad/s]: -4e4+4e4j,-4e4-4e4j"),
+        typer.Option(help="One or two pairs of poles \\[rad/s]: -4e4+4e4j,-4e4-4e4j"),
     ] = None,
     max_stroke_loss: Annotated[
         str, typer.Option(help="Share of the stroke that the stiffness may take.")
@@ -37,8 +40,8 @@ def mechanism(
         float | None,
         typer.Option(help="Largest force in the mechanism in a step of rated voltage [N]."),
     ] = None,
-    min_mass: Annotated[float, typer.Option(help="Least mass [kg].")] = 0.0,
-    max_mass: Annotated[float, typer.Option(help="Largest mass [kg].")] = 1.0,
+    min_mass: Annotated[float, typer.Option(help="Least mass \\[kg].")] = 0.0,
+    max_mass: Annotated[float, typer.Option(help="Largest mass \\[kg].")] = 1.0,
     max_damping: Annotated[float, typer.Option(help="Largest damping [N.s/m].")] = 1e5,
     acts_on: Annotated[
         ActsOn,
@@ -63,23 +66,21 @@ def mechanism(
         mechanism_model,
         port_model,
     )
+    from psa_casadi.input_design.mechanism_goals import check_goals
     from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.mechanism_page import (
-        mechanism_sentences,
-        mechanism_table,
-        pole_table,
-        write_mechanism_page,
-    )
+    from psa_casadi.report.mechanism_page import write_mechanism_page
 
     given = Given()
     given.outputs({"--output": output, "--port": port, "--report": report}, [model])
     chosen = given.model_or_stack(model, stack)
     wanted = given.attempt(lambda: _poles(poles))
     loss = given.attempt(lambda: _share(max_stroke_loss))
+    limits = Limits(loss or 0.0, max_force, (min_mass, max_mass), (0.0, max_damping))
+    if wanted is not None:
+        given.attempt(lambda: check_goals(damping, bandwidth, wanted, limits, starts))
     given.check()
-    if chosen is None or wanted is None or loss is None:
+    if chosen is None or wanted is None:
         return
-    limits = Limits(loss, max_force, (min_mass, max_mass), (0.0, max_damping))
     with working("designing", quiet) as progress:
         progress(f"{starts} starts")
         design = design_mechanism(
@@ -91,13 +92,18 @@ def mechanism(
         save_model(port_model(chosen), port)
     if report is not None:
         write_mechanism_page(design, report, chosen.name)
+    _tell(design, quiet)
+    tell_written(output, port, report, quiet=quiet)
+
+
+def _tell(design: "MechanismDesign", quiet: bool) -> None:
+    from psa_casadi.report.mechanism_page import mechanism_sentences, mechanism_table, pole_table
+
     for sentence in mechanism_sentences(design):
         show(sentence, quiet)
-    show("", quiet)
-    show_table(mechanism_table(design), quiet)
-    show("", quiet)
-    show_table(pole_table(design), quiet)
-    tell_written(output, port, report, quiet=quiet)
+    for table in (mechanism_table(design), pole_table(design)):
+        show("", quiet)
+        show_table(table, quiet)
 
 
 def _poles(text: str | None) -> tuple[complex, ...]:

@@ -71,7 +71,7 @@ def _draw(path: Path, found: TrackedInput, plain: Response) -> None:
     for axes in (above, middle, below):
         axes.grid(color="#dddddd", linewidth=0.8)
         axes.margins(x=0.01)
-        axes.legend(loc="upper right", framealpha=0.9)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)
     rms = np.round(found.error.rms_percent, 3)
     figure.suptitle(f"Raster scan at 1/20 of the resonance: {rms:g} % of the range rms")
     figure.savefig(path, dpi=110)

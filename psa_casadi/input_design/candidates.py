@@ -145,6 +145,8 @@ def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator
     levels = rng.uniform(0.0, 1.0, count)
     if kind == "triangles":
         levels = np.where(np.arange(count) % 2 == 0, 0.5 + 0.5 * levels, 0.5 * levels)
+        if rng.integers(2):  # loops in the lower half of the range, then in the upper one
+            levels = 0.5 * levels + np.where(2 * np.arange(count) < count, 0.0, 0.5)
     if np.isfinite(per_second):
         durations = _durations(shares, limits)
         usable = durations if kind == "triangles" else np.minimum(durations, ramp)

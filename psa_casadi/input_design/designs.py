@@ -7,6 +7,9 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.input_design.information import Optimality
 from psa_casadi.input_design.limits import Limits
 
+#: How often a record may be played until it tells, and the probability that is asked for.
+PLAYS, ASKED = (1, 2, 3, 5), 0.9
+
 
 @dataclass(frozen=True)
 class Pair:
@@ -30,6 +33,8 @@ class Separated:
     where no designed one was better); `chance` is for each
     effect the probability that a diagnosis of the data at hand with the record names it alone if it
     is the cause, as the rivals' fits predict it; `usual_chance` the same with sine and triangle.
+    `plays` is how often the record must be played, each time from rest, until every chance is at
+    least 90 %; None where `PLAYS[-1]` times are not enough.
     """
 
     record: Record
@@ -38,6 +43,7 @@ class Separated:
     pairs: tuple[Pair, ...]
     chance: Mapping[str, float]
     usual_chance: Mapping[str, Mapping[str, float]]
+    plays: int | None
     evaluations: int
     seconds: float
 

@@ -2,6 +2,7 @@
 
 import time as clock
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from psa_casadi.experiment.excitation import sine, triangle
 from psa_casadi.experiment.record import Record
 from psa_casadi.identification.search import FIXED
 from psa_casadi.input_design.candidates import KINDS, Kind, rest_of
-from psa_casadi.input_design.designs import Informative, Pair, Separated
+from psa_casadi.input_design.designs import ASKED, PLAYS, Informative, Pair, Separated
 from psa_casadi.input_design.information import Information, Optimality
 from psa_casadi.input_design.limits import Limits, limits_of
 from psa_casadi.input_design.rivals import (
@@ -23,7 +24,7 @@ from psa_casadi.input_design.rivals import (
     rival_of_model,
 )
 from psa_casadi.input_design.search import BRIEF, GRID, Best, Effort, Progress, coarse, search
-from psa_casadi.input_design.separation import Separation, naming_probability
+from psa_casadi.input_design.separation import Separation, naming_probability, overall
 from psa_casadi.model.compose import Model
 
 #: Periods of the usual sine and triangle that a design is compared with.
@@ -77,22 +78,20 @@ def separating_experiment(
     progress("comparing with a sine and a triangle")
     samples = min(limits.samples, _FINE)
     criterion = Separation(tuple(rivals), noise.on_grid(limits, samples))
-    records = {"designed": best.record, **usual}
-    found = {n: criterion.distances(coarse(r, samples)) for n, r in records.items()}
-    chances = {
-        n: _chances(criterion, found[n], base, coarse(r, samples)) for n, r in records.items()
-    }
-    pairs = tuple(
-        Pair(a, b, 0.5 * t, {n: 0.5 * found[n][a, b] for n in records if n != "designed"})
-        for (a, b), t in found["designed"].items()
-    )
+    records = {n: coarse(r, samples) for n, r in {"designed": best.record, **usual}.items()}
+    found = {n: criterion.distances(r) for n, r in records.items()}
+    chosen = max(found, key=lambda n: overall(found[n].values()))
+    if chosen != "designed":
+        records["designed"], found["designed"] = records[chosen], found[chosen]
+    chances = {n: _chances(criterion, found[n], base, r) for n, r in records.items()}
     return Separated(
-        record=best.record,
-        kind=best.kind,
+        record=usual.get(chosen, best.record),
+        kind=chosen if chosen in usual else best.kind,
         limits=limits,
-        pairs=pairs,
+        pairs=_pairs(found),
         chance=chances["designed"],
         usual_chance={n: c for n, c in chances.items() if n != "designed"},
+        plays=_plays(criterion, base, records["designed"], chances["designed"]),
         evaluations=best.evaluations,
         seconds=clock.perf_counter() - begin,
     )
@@ -184,6 +183,31 @@ def rival_of_effect(model: Model, effect: Component, free: Sequence[str]) -> Riv
         extended = extended.with_values({gain.name: float(np.clip(size, *gain.bounds))})
     own = [p.name for p in effect.parameters if p.name not in FIXED]
     return rival_of_model(effect.name, extended, [*free, *(n for n in own if n not in free)])
+
+
+def _pairs(found: Mapping[str, Mapping[tuple[str, str], float]]) -> tuple[Pair, ...]:
+    """Return the growth of ln B, T/2, of every pair with the designed and the usual voltages."""
+    return tuple(
+        Pair(a, b, 0.5 * t, {n: 0.5 * f[a, b] for n, f in found.items() if n != "designed"})
+        for (a, b), t in found["designed"].items()
+    )
+
+
+def _plays(
+    criterion: Separation, base: Rival | None, record: Record, chance: Mapping[str, float]
+) -> int | None:
+    """Return how often a record must be played until it tells; None if `PLAYS[-1]` do not.
+
+    k records of the same voltage are one whose noise has 1/k of the variance.
+    """
+    for plays in PLAYS:
+        if plays > 1:
+            colour = replace(criterion.noise, level=criterion.noise.level / np.sqrt(plays))
+            often = replace(criterion, noise=colour)
+            chance = _chances(often, often.distances(record), base, record)
+        if min(chance.values()) >= ASKED:
+            return plays
+    return None
 
 
 def _chances(

@@ -8,7 +8,8 @@ inverse of the Bouc-Wen element along the path finds u with u + f_H(u)/k_L = u_e
     s = sgn(u') = sgn(u_e'),   v = (u + R_s C_p u') / G
 
 What neither inverse knows (creep's past, further effects) shows in a run of the full simulator; its
-error goes back through the same inverse, so long as it falls. Limits are not regarded.
+error goes back through the same inverse, so long as it falls. Limits, where there are any, cut the
+voltage of every trial; the error of samples that stand at a limit does not go back.
 """
 
 from dataclasses import dataclass
@@ -18,8 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
+from psa_casadi.errors import InputError
+from psa_casadi.input_design.amplifier_limits import AmplifierLimits
 from psa_casadi.input_design.dynamics import demand_stack, rest_at
 from psa_casadi.input_design.linear_part import LinearPart, linear_part, zero_phase_inverse
+from psa_casadi.input_design.saturation import held
 from psa_casadi.input_design.targets import Target
 from psa_casadi.input_design.verification import Response, TrackingError, error_of, respond
 from psa_casadi.model.compose import Model
@@ -29,6 +33,7 @@ FloatArray = npt.NDArray[np.float64]
 _PARTS = 4  # sub-intervals of a sample for the hysteresis inverse
 _LEAST_SLOPE = 0.05  # of k_L; a stack whose force falls with rising voltage has no inverse
 _WORTH = 0.8  # a trial that leaves more of the error than this is the last
+_MOST_STROKES = 5.0  # range of a path over the stroke, above which its unit is wrong
 _MOST_SAMPLES = 4  # uniform samples for each sample of a path that is not uniform
 
 
@@ -42,35 +47,76 @@ class InvertedInput:
     trials: tuple[TrackingError, ...]
 
 
-def invert(model: Model, target: Target, *, trials: int = 8) -> InvertedInput:
+def invert(
+    model: Model, target: Target, limits: AmplifierLimits | None = None, *, trials: int = 8
+) -> InvertedInput:
     """Return the voltage for a path, and the error that the full simulator states.
 
     `trials` bounds the runs of the simulator whose error is fed back. The path is sampled evenly
-    inside; the voltage is given at the path's own instants.
+    inside; the voltage is given at the path's own instants. It keeps within `limits` (a current to
+    about 1 %).
 
-    Raises InputError for a model that is no stack, and for a path that it cannot hold at its start.
+    Raises InputError for a model that is no stack, for a path that it cannot hold at its start, and
+    for one that is many times the stroke.
     """
     demand_stack(model)
     part, even = linear_part(model), _evenly(target)
+    _demand_reach(model, part, target)
+    bounds = limits or AmplifierLimits()
     rest, _ = rest_at(model, float(target.displacement[0]))
-    wanted = zero_phase_inverse(part, even.displacement, even.step)
-    history: list[TrackingError] = []
-    best: tuple[FloatArray, Response] | None = None
-    for _ in range(max(trials, 1)):
-        voltage = _voltage(model, even, wanted, rest)
-        found = respond(model, even.time, voltage)
-        history.append(error_of(even, found.displacement))
-        if best is None or history[-1].rms < min(e.rms for e in history[:-1]):
-            best = voltage, found
-        if len(history) > 1 and history[-1].rms > _WORTH * history[-2].rms:
-            break
-        wanted = wanted + _correction(part, even, found.displacement)
-    final = respond(model, target.time, np.interp(target.time, even.time, best[0]))  # type: ignore[index]
-    return InvertedInput(target, final, error_of(target, final.displacement), tuple(history))
+    learner = _Learner(model, part, even, rest, trials)
+    best = learner.learn(zero_phase_inverse(part, even.displacement, even.step), AmplifierLimits())
+    if bounds != AmplifierLimits():
+        best = learner.learn(best.wanted, bounds)
+    voltage = np.interp(target.time, even.time, best.voltage)
+    final = respond(model, target.time, voltage)
+    errors = tuple(t.error for t in learner.made)
+    return InvertedInput(target, final, error_of(target, final.displacement), errors)
 
 
-def _correction(part: LinearPart, even: Target, reached: FloatArray) -> FloatArray:
-    return zero_phase_inverse(part, even.displacement - reached, even.step)
+def _demand_reach(model: Model, part: LinearPart, target: Target) -> None:
+    rated = model.values.get("u_rated", np.inf)
+    stroke = rated * float(abs(part.response(np.zeros(1))[0]))
+    if target.span > _MOST_STROKES * stroke:
+        raise InputError(
+            f"The path's range is {1e6 * target.span:.4g} um, the stack's stroke at its rated"
+            f" {rated:.4g} V about {1e6 * stroke:.3g} um; the path is likely in another unit:"
+            " correct it."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """What was wanted of the linear part [V], the voltage played [V], and the error it left."""
+
+    wanted: FloatArray
+    voltage: FloatArray
+    error: TrackingError
+
+
+class _Learner:
+    """Trials on the simulator whose errors go back through the inverse, so long as they fall."""
+
+    def __init__(
+        self, model: Model, part: LinearPart, even: Target, rest: float, trials: int
+    ) -> None:
+        self._model, self._part, self._even, self._rest = model, part, even, rest
+        self._most, self.made = trials, list[_Trial]()
+
+    def learn(self, wanted: FloatArray, limits: AmplifierLimits) -> _Trial:
+        """Return the best of the trials from a first one on."""
+        first, felt, even = len(self.made), list[float](), self._even
+        for _ in range(max(self._most, 1)):
+            free = _voltage(self._model, even, wanted, self._rest)
+            voltage = held(self._model, limits, even.time, free)
+            shown = respond(self._model, even.time, voltage).displacement
+            self.made.append(_Trial(wanted, voltage, error_of(even, shown)))
+            left = np.where(voltage == free, even.displacement - shown, 0.0)
+            felt.append(float(np.linalg.norm(left)))
+            if len(felt) > 1 and felt[-1] > _WORTH * felt[-2]:
+                break
+            wanted = wanted + zero_phase_inverse(self._part, left, even.step)
+        return min(self.made[first:], key=lambda t: t.error.rms)
 
 
 def correct(model: Model, target: Target, voltage: FloatArray, measured: FloatArray) -> FloatArray:

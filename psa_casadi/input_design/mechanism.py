@@ -119,24 +119,16 @@ def design_mechanism(
             f"None of {len(found)} searches for a mechanism ended well; the limits exclude each"
             " other, or the goals are far from what the stack can do: widen the limits."
         )
-    design = _measured(mechanics, best.mounting)
     agreeing = sum(c.converged and c.cost < best.cost + _SAME for c in found)
+    mounting, free = best.mounting, Mounting(0.0, 0.0, 0.0)
+    reached = _measured(mechanics, mounting)
     return MechanismDesign(
-        mechanics=mechanics,
-        mounting=best.mounting,
-        acts_on=acts_on,
-        goals=goal_texts(damping, bandwidth, poles),
-        limits=limits,
-        poles=mechanical_poles(mechanics, best.mounting),
-        free_poles=mechanical_poles(mechanics, Mounting(0.0, 0.0, 0.0)),
-        lag_pole=-1.0 / mechanics.lag,
-        reached=design,
-        free=_measured(mechanics, Mounting(0.0, 0.0, 0.0)),
-        attained=_attained(mechanics, best.mounting, design, damping, bandwidth, poles),
-        binding=_binding(best.mounting, design, limits),
-        agreeing=agreeing,
-        starts=len(found),
-    )
+        mechanics, mounting, acts_on, goal_texts(damping, bandwidth, poles), limits,
+        poles=mechanical_poles(mechanics, mounting), free_poles=mechanical_poles(mechanics, free),
+        lag_pole=-1.0 / mechanics.lag, reached=reached, free=_measured(mechanics, free),
+        attained=_attained(mechanics, mounting, reached, damping, bandwidth, poles),
+        binding=_binding(mounting, reached, limits), agreeing=agreeing, starts=len(found),
+    )  # fmt: skip
 
 
 def mechanism_model(design: MechanismDesign, name: str = "mechanism") -> Model:

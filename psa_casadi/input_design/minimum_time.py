@@ -75,12 +75,31 @@ def quickest_move(
     started = clocks.perf_counter()
     rest, _ = move_ends(model, begin, end, limits)
     linear = linear_move(model, rest, end, limits, intervals)
-    offsets = linear.no_offsets()
-    length, voltage = linear.shortest(offsets)
-    linear_time, plays = length, list[_Play]()
+    length, voltage = linear.shortest(linear.no_offsets())
+    linear_time = length
+    plays = _plays(model, linear, length, voltage, progress)
+    best = min(plays[_FREE:], key=lambda p: p.distance)
+    if not best.distance < 1e-2:
+        raise PsaError(
+            "No quickest move was found: the trials on the simulator do not settle. Effects that"
+            " outweigh the linear part are the likely cause; use a path (--target) instead."
+        )
+    return QuickMove(
+        begin, end, limits, best.length, best.length / intervals, linear_time, best.response,
+        best.swing / abs(end - begin), (best.position - end) / abs(end - begin), len(plays),
+        clocks.perf_counter() - started,
+    )  # fmt: skip
+
+
+def _plays(
+    model: Model, linear: LinearMove, length: float, voltage: FloatArray,
+    progress: Callable[[str], None],
+) -> "list[_Play]":  # fmt: skip
+    """Play and correct: first with the length open, then, a little longer, with it kept."""
+    plays: list[_Play] = []
     for count in range(_FREE + _FIXED):
         progress(f"solution {count + 1} of at most {_FREE + _FIXED}")
-        plays.append(_play(model, linear, length, voltage, end))
+        plays.append(_play(model, linear, length, voltage, linear.end))
         if count >= _FREE and plays[-1].distance < _GOOD:
             break
         offsets = linear.offsets(length, voltage, plays[-1].arrival, plays[-1].memory)
@@ -94,17 +113,7 @@ def quickest_move(
             length *= _MARGIN
         else:
             voltage = near
-    best = min(plays[_FREE:], key=lambda p: p.distance)
-    if not best.distance < 1e-2:
-        raise PsaError(
-            "No quickest move was found: the trials on the simulator do not settle. Effects that"
-            " outweigh the linear part are the likely cause; use a path (--target) instead."
-        )
-    return QuickMove(
-        begin, end, limits, best.length, best.length / intervals, linear_time, best.response,
-        best.swing / abs(end - begin), (best.position - end) / abs(end - begin), len(plays),
-        clocks.perf_counter() - started,
-    )  # fmt: skip
+    return plays
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,10 @@ _BARRIER, _BARRIER_LIMITED = 1e-6, 1e-2
 _FEASIBLE = 1e-6
 
 
+class NoSolutionError(PsaError):
+    """IPOPT ended without a voltage that obeys the equations and the limits."""
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """What is asked: instants (n,) [s], range of the path [m], voltage at rest and its scale [V].
@@ -95,7 +99,7 @@ class Program:
     def solve(self, path: FloatArray, voltage: FloatArray, inner: FloatArray) -> Solution:
         """Solve for a path (2, N) [m] at the nodes from a first guess of voltage and states.
 
-        Raises PsaError if IPOPT finds no solution.
+        Raises NoSolutionError if IPOPT finds none.
         """
         q = self.problem
         guess = [inner.T.ravel(), voltage[2:] / q.scale, np.full(int(q.minimax), 1e-2)]
@@ -110,7 +114,7 @@ class Program:
         stats = self._solver.stats()
         off = np.maximum(np.array(found["g"]).ravel() - self._high, 0.0)
         if not stats["success"] and not np.max(off) < _FEASIBLE:
-            raise PsaError(
+            raise NoSolutionError(
                 f"IPOPT found no voltage ({stats['return_status']}). Limits that leave the path no"
                 " room, or a path far beyond the stack's bandwidth, are the likely cause; widen"
                 " the limits or slow the path down."

@@ -36,7 +36,7 @@ class Effort:
 
 
 #: A search that takes a few seconds: enough where any good voltage tells.
-BRIEF = Effort(draws=4, starts=1, steps=5)
+BRIEF = Effort(draws=6, starts=1, steps=5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +71,8 @@ def search(
     coordinates, evaluated side by side. Raises SimulationError where no waveform can be simulated.
     """
     effort = effort or Effort()
-    rng = np.random.default_rng(effort.seed)
     problem = _Problem(criterion, limits)
-    rate = min(limits.samples, GRID) / limits.duration
-    limits = replace(limits, bandwidth=min(limits.band, rate / _CYCLE))
-    pool = [draw(kind, limits, steepest, rng) for kind in kinds for _ in range(effort.draws)]
+    pool = _drawn(limits, steepest, kinds, effort)
     progress(f"comparing {len(pool)} voltages")
     values = problem.compare(pool)
     order = np.argsort(values)[::-1]
@@ -90,15 +87,28 @@ def search(
         p, value = problem.improve(pool[k], effort.steps)
         if value > best:
             best, found = value, (pool[k], p)
-    wave, p = found
-    time = limits.grid()
-    record = Record("designed", time, np.clip(wave.voltage(p, time), limits.low, limits.high))
-    kind: str = wave.kind
+    record, kind = _in_full(*found, limits), str(found[0].kind)
     for other in usual:
         value = problem.value(other)
         if value > best:
             best, record, kind = value, other, other.name
     return Best(record, kind, best, float(values[order[0]]), problem.evaluations)
+
+
+def _drawn(
+    limits: Limits, steepest: float, kinds: Sequence[Kind], effort: Effort
+) -> list[Waveform]:
+    """Draw waveforms of every family, no faster than the grid of the comparison can show."""
+    rng = np.random.default_rng(effort.seed)
+    rate = min(limits.samples, GRID) / limits.duration
+    limits = replace(limits, bandwidth=min(limits.band, rate / _CYCLE))
+    return [draw(kind, limits, steepest, rng) for kind in kinds for _ in range(effort.draws)]
+
+
+def _in_full(wave: Waveform, p: FloatArray, limits: Limits) -> Record:
+    """Return the record of a waveform on all of its samples."""
+    time = limits.grid()
+    return Record("designed", time, np.clip(wave.voltage(p, time), limits.low, limits.high))
 
 
 def coarse(record: Record, samples: int) -> Record:

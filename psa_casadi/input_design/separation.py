@@ -10,7 +10,7 @@ T(a, b). Sources: Atkinson and Fedorov, Biometrika 62 (1975), 57 (T-optimality);
 T/2 is the Kullback-Leibler distance (Lopez-Fidalgo, Tommasi and Trandafir 2007).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +26,9 @@ from psa_casadi.input_design.rivals import Rival
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
-#: Evaluations of a re-fit while voltages are compared, and of the final one; when it has settled.
-QUICK, FINAL, _SETTLED = 10, 40, 1e-4
+#: Evaluations of a re-fit at most, while voltages are compared and in the end; when it has settled.
+#: A re-fit that is cut off too soon shows a distance that is not there, which a search would find.
+QUICK, FINAL, _SETTLED = 30, 40, 1e-4
 _LEAST = 1e-6
 
 
@@ -60,7 +61,7 @@ class Separation:
         found = self._refits(record, self.evaluations)
         inverse = {pair: 1.0 / max(r.distance, _LEAST) for pair, r in found.items()}
         total = sum(inverse.values())
-        value = float(np.log(len(inverse) / total))
+        value = overall([r.distance for r in found.values()])
 
         def frozen(other: Record) -> float:
             plain = [r.predict(other, np.zeros(r.size)) for r in self.rivals]
@@ -122,6 +123,11 @@ class Separation:
     def _white(self, signal: FloatArray) -> FloatArray:
         white: FloatArray = self.noise.whiten(signal) / self.noise.level
         return white
+
+
+def overall(distances: Collection[float]) -> float:
+    """Return the logarithm of the harmonic mean of distances: the least one counts most."""
+    return float(np.log(len(distances) / sum(1.0 / max(t, _LEAST) for t in distances)))
 
 
 def naming_probability(

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
 
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.input_design.amplifier_limits import AmplifierLimits
 from psa_casadi.input_design.collocation import (
     interval_of,
@@ -29,9 +29,15 @@ from psa_casadi.input_design.dynamics import (
     smooth_form,
 )
 from psa_casadi.input_design.inversion import InvertedInput, invert
-from psa_casadi.input_design.program import Problem, Program, Solution
+from psa_casadi.input_design.program import NoSolutionError, Problem, Program, Solution
 from psa_casadi.input_design.targets import Target
-from psa_casadi.input_design.verification import Response, TrackingError, error_of, respond
+from psa_casadi.input_design.verification import (
+    Response,
+    TrackingError,
+    broken,
+    error_of,
+    respond,
+)
 from psa_casadi.model.compose import Model
 
 FloatArray = npt.NDArray[np.float64]
@@ -40,6 +46,8 @@ FloatArray = npt.NDArray[np.float64]
 WIDTH = 0.02
 #: Solutions after the first, each with the discretisation's error taken off the path.
 CORRECTIONS = 2
+#: A solution that IPOPT did not finish must leave less than this share of the inversion's error.
+_WORTH = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +55,10 @@ class TrackedInput:
     """A designed voltage and what became of it.
 
     `response` and `error` are the full simulator's; `predicted` (n,) [m] is what the program itself
-    expected at the path's instants. `width` [V/s] is the rounding of the smooth form, `inverse` the
-    fast answer that the program began with, `iterations` IPOPT's, `seconds` the time it all took.
+    expected at the path's instants. Without `by_program` the answer is the inversion cut by the
+    limits, because the program found none, or none that is better. `width` [V/s] is the rounding of
+    the smooth form, `inverse` the inversion without limits, `iterations` IPOPT's, `seconds` the
+    time it all took.
     """
 
     target: Target
@@ -57,10 +67,11 @@ class TrackedInput:
     response: Response
     error: TrackingError
     predicted: FloatArray
+    by_program: bool
+    converged: bool
     width: float
     inverse: InvertedInput
     iterations: int
-    converged: bool
     seconds: float
 
     @property
@@ -87,14 +98,15 @@ def track(
     error, is returned.
 
     Raises InputError for a model that is no stack, limits that contradict each other or the path's
-    start, and PsaError if IPOPT finds no solution.
+    start, and PsaError if no voltage within the limits is found.
     """
     begun = clocks.perf_counter()
     bounds = limits or AmplifierLimits()
     rest, start = _rest(model, target, bounds)
     progress("inversion")
     inverse = invert(model, target)
-    guess = np.clip(inverse.response.voltage, bounds.min_voltage, bounds.max_voltage)
+    cut = inverse if bounds == AmplifierLimits() else invert(model, target, bounds)
+    guess = cut.response.voltage.copy()
     guess[:2] = rest
     width = rounding(target, inverse.response.voltage)
     smooth = smooth_form(model, width)
@@ -104,21 +116,41 @@ def track(
         start / interval.nominal, bounds, minimax, symbolic=equations is None,
     )  # fmt: skip
     solutions = _solve(model, smooth, target, problem, guess, corrections, progress)
-    _, best = min(solutions, key=lambda s: s[0])
-    response = respond(model, target.time, best.voltage)
+    designed = _chosen(model, target, bounds, minimax, solutions, cut)
     return TrackedInput(
-        target=target,
-        limits=bounds,
-        minimax=minimax,
-        response=response,
-        error=error_of(target, response.displacement),
-        predicted=np.concatenate([target.displacement[:1], best.displacement[1]]),
-        width=width,
-        inverse=inverse,
-        iterations=sum(s.iterations for _, s in solutions),
-        converged=best.converged,
-        seconds=clocks.perf_counter() - begun,
-    )
+        target, bounds, minimax, *designed, width, inverse,
+        sum(s.iterations for _, s in solutions), clocks.perf_counter() - begun,
+    )  # fmt: skip
+
+
+def _chosen(
+    model: Model, target: Target, limits: AmplifierLimits, minimax: bool,
+    solutions: list[tuple[float, Solution]], cut: InvertedInput,
+) -> tuple[Response, TrackingError, FloatArray, bool, bool]:  # fmt: skip
+    """Return the best answer: response, error, what was predicted, by the program, converged.
+
+    The inversion cut by the limits is the answer where no solution is better; it predicts what the
+    simulator shows. Raises PsaError if there is no solution and a limit that cuts break.
+    """
+    if solutions:
+        _, best = min(solutions, key=lambda s: s[0])
+        response = respond(model, target.time, best.voltage)
+        error = error_of(target, response.displacement)
+        share = 1.0 if best.converged else _WORTH
+        better = (
+            error.largest <= share * cut.error.largest
+            if minimax
+            else error.rms <= share * cut.error.rms
+        )
+        if better or broken(cut.response, limits):
+            predicted = np.concatenate([target.displacement[:1], best.displacement[1]])
+            return response, error, predicted, True, best.converged
+    elif broken(cut.response, limits):
+        raise PsaError(
+            "No voltage within the limits was found that comes near the path; widen the limits or"
+            " slow the path down."
+        )
+    return cut.response, cut.error, cut.response.displacement, False, False
 
 
 def rounding(target: Target, voltage: FloatArray) -> float:
@@ -143,7 +175,10 @@ def _solve(
     model: Model, smooth: Model, target: Target, problem: Problem, guess: FloatArray,
     corrections: int, progress: Callable[[str], None],
 ) -> list[tuple[float, Solution]]:  # fmt: skip
-    """Return every solution with its error by the full simulator [m], rms or largest."""
+    """Return every solution with its error by the full simulator [m], rms or largest.
+
+    There are fewer, or none, where IPOPT finds no further one.
+    """
     nodes = nodes_of(target.time)
     path = np.asarray(PchipInterpolator(target.time, target.displacement)(nodes))
     start = problem.start * problem.interval.nominal
@@ -152,7 +187,10 @@ def _solve(
     solutions: list[tuple[float, Solution]] = []
     for count in range(corrections + 1):
         progress(f"solution {count + 1} of {corrections + 1}")
-        found = program.solve(shown, guess, inner)
+        try:
+            found = program.solve(shown, guess, inner)
+        except NoSolutionError:
+            break
         reached = simulated_displacement(model, nodes, target.time, found.voltage, start)
         solutions.append((_size(reached - path, problem.minimax), found))
         guess, inner = found.voltage, found.inner

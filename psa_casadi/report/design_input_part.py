@@ -6,8 +6,11 @@ import numpy as np
 import plotly.graph_objects as go
 
 from psa_casadi.input_design.amplifier_limits import AmplifierLimits
+from psa_casadi.input_design.inversion import InvertedInput
 from psa_casadi.input_design.minimum_time import QuickMove
+from psa_casadi.input_design.targets import Target
 from psa_casadi.input_design.tracking import TrackedInput
+from psa_casadi.input_design.trial import CorrectedInput
 from psa_casadi.input_design.verification import Response, TrackingError, usage
 from psa_casadi.report.document import Picture
 from psa_casadi.report.phrases import number
@@ -16,6 +19,8 @@ from psa_casadi.report.tables import Table
 from psa_casadi.report.theme import INK, Plot, styled
 
 _HEIGHT, _MOST_POINTS = 360, 4000
+#: Time shown of a move and its hold at first, over the move's; the rest is behind the zoom.
+_SHOWN = 2.5
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,10 @@ def tracking_pictures(found: TrackedInput, uncompensated: FloatArray) -> list[Pi
     ]
     errors: list[Curve] = [
         ("simulated", share * (found.response.displacement - wanted), EXTENDED_COLOUR, 1.4),
-        ("predicted by the program", share * (found.predicted - wanted), BASE_COLOUR, 1.2),
     ]
+    if found.by_program:
+        predicted = share * (found.predicted - wanted)
+        errors.append(("predicted by the program", predicted, BASE_COLOUR, 1.2))
     return [
         Picture("Path and response", curves(t, paths, "displacement [µm]", [])),
         Picture("Error of the designed input", curves(t, errors, "error [% of range]", [])),
@@ -68,9 +75,32 @@ def tracking_pictures(found: TrackedInput, uncompensated: FloatArray) -> list[Pi
     ]
 
 
-def voltage_picture(response: Response, limits: AmplifierLimits) -> Picture:
-    """Return the voltage over time with its limits."""
-    shown: list[Curve] = [("voltage", response.voltage, EXTENDED_COLOUR, 1.6)]
+def inversion_pictures(found: InvertedInput, limits: AmplifierLimits) -> list[Picture]:
+    """Return path and response of an inverted input, and the voltage with its limits."""
+    shown = _path_and("inverted, simulated", found.target, found.response.displacement)
+    plot = curves(found.target.time, shown, "displacement [µm]", [])
+    return [Picture("Path and response", plot), voltage_picture(found.response, limits)]
+
+
+def trial_pictures(found: CorrectedInput) -> list[Picture]:
+    """Return path and measured trial, and the voltages played and corrected."""
+    shown = _path_and("trial, measured", found.target, found.measured)
+    plot = curves(found.target.time, shown, "displacement [µm]", [])
+    played: Curve = ("played in the trial", found.played, BASE_COLOUR, 1.4)
+    voltage = voltage_picture(found.response, found.limits, played)
+    return [Picture("Path and trial", plot), voltage]
+
+
+def _path_and(name: str, target: Target, displacement: FloatArray) -> list[Curve]:
+    return [
+        ("path", 1e6 * target.displacement, MEASURED_COLOUR, 3.0),
+        (name, 1e6 * displacement, EXTENDED_COLOUR, 1.4),
+    ]
+
+
+def voltage_picture(response: Response, limits: AmplifierLimits, *others: Curve) -> Picture:
+    """Return the voltage over time with its limits, and other voltages beside it."""
+    shown: list[Curve] = [*others, ("designed", response.voltage, EXTENDED_COLOUR, 1.6)]
     bounds = [limits.min_voltage, limits.max_voltage]
     return Picture("Voltage", curves(response.time, shown, "voltage [V]", bounds))
 
@@ -82,10 +112,13 @@ def move_pictures(found: QuickMove) -> list[Picture]:
     ]
     plot = curves(found.response.time, shown, "displacement [µm]", [1e6 * found.end])
     note = "Dashed: the position to reach. The voltage holds its last value behind the move."
-    return [
+    pictures = [
         Picture("Move and hold", plot, note),
         voltage_picture(found.response, found.limits),
     ]
+    for picture in pictures:
+        picture.plot.update_xaxes(range=[0.0, _SHOWN * 1e3 * found.move_time])
+    return pictures
 
 
 def error_table(rows: list[tuple[str, TrackingError]]) -> Titled:
@@ -101,6 +134,9 @@ def limits_table(response: Response, limits: AmplifierLimits) -> Titled:
         used = high if name == "voltage" else max(abs(low), abs(high))
         given = number(limit) if np.isfinite(limit) else "none"
         margin = number(limit - used) if np.isfinite(limit) else ""
+        if name == "voltage" and np.isfinite(limits.min_voltage):
+            given = f"{number(limits.min_voltage)} to {given if margin else 'any'}"
+            margin = number(min(limit - high, low - limits.min_voltage))
         rows.append((f"{name} [{unit}]", number(low), number(high), given, margin))
     head = ("quantity", "least", "largest", "limit", "margin")
     return Titled("Limits and margins", Table(head, tuple(rows)))

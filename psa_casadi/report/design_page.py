@@ -40,7 +40,7 @@ def write_design_page(
     """Write the page of a design, whole or not at all.
 
     The first sentence of `summary` is the result, the others follow as a list; then come the
-    figures (each a section, plots as `psa_casadi.report.theme.styled` makes them) and the tables
+    figures (plots as `psa_casadi.report.theme.styled` makes them) and the tables
     with their notes. `badges` are short marks under the title, such as "2,000 samples".
 
     Raises InputError when `path` cannot be written to.
@@ -50,8 +50,9 @@ def write_design_page(
         page.paragraph(summary[0], "verdict")
     if summary[1:]:
         page.bullets(summary[1:])
+    if figures:
+        page.section("Figures")
     for picture in figures:
-        page.section(picture.caption)
         page.picture(picture)
     for titled in tables:
         page.section(titled.title)

@@ -3,13 +3,14 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 import plotly.graph_objects as go
 
 from psa_casadi.experiment import write_record
 from psa_casadi.experiment.record import Record
-from psa_casadi.input_design.designs import Informative, Separated
+from psa_casadi.input_design.designs import ASKED, PLAYS, Informative, Separated
 from psa_casadi.input_design.rivals import Rival
 from psa_casadi.model.compose import Model
 from psa_casadi.report.design_page import write_design_page
@@ -77,7 +78,26 @@ def write_experiment_page(
 def sentences(design: Separated | Informative, capacitance: float | None) -> tuple[str, ...]:
     """Return what the design promises, and what it asks of the amplifier."""
     said = chance_sentence(design) if isinstance(design, Separated) else narrower_sentence(design)
-    return said, voltage_sentence(design, capacitance)
+    voltage = voltage_sentence(design, capacitance)
+    return (said, again_sentence(design), voltage) if _unsure(design) else (said, voltage)
+
+
+def _unsure(design: Separated | Informative) -> TypeGuard[Separated]:
+    return isinstance(design, Separated) and design.plays != 1
+
+
+def again_sentence(design: Separated) -> str:
+    """Say what would tell where one play of the record is not sure to."""
+    if design.plays is None:
+        return (
+            f"No record that was found is predicted to tell with {percent(ASKED)}, nor are"
+            f" {PLAYS[-1]} of them: within these limits the effects look alike. Widen the range of"
+            " voltages or the band, make the record longer, or lower the noise of the sensor."
+        )
+    return (
+        f"One play is not sure to tell; {design.plays} plays, each from rest and recorded on its"
+        f" own, are predicted to name the cause with {percent(ASKED)} or more."
+    )
 
 
 def design_tables(design: Separated | Informative, model: Model) -> tuple[Shown, ...]:

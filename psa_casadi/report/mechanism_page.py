@@ -155,7 +155,7 @@ def step_plot(d: MechanismDesign) -> Plot:
             x=1e3 * time, y=x, mode="lines", name=name, line={"color": colour, "width": 1.8}
         )
     plot.update_xaxes(title_text="time [ms]")
-    plot.update_yaxes(title_text="displacement [um]")
+    plot.update_yaxes(title_text="displacement [µm]")
     return styled(plot, 400)
 
 

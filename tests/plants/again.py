@@ -9,6 +9,7 @@ from tests.plants.excitations import draw_excitation
 from tests.plants.hide import effect_called
 from tests.plants.make import Truth, write_csv
 from tests.plants.noise import disturb
+from tests.plants.same_device import in_terms_of
 from tests.plants.stack import FloatArray
 
 
@@ -20,12 +21,14 @@ def play_again(
 ) -> FloatArray:
     """Write a further record of a device and return its displacement without noise, (N,) [m].
 
-    `truth` is the device: its stack, its effects with their gains, the kind of its noise. `played`
+    `truth` is the device: its stack, its effects with their gains (`in_terms_of` the new record),
+    the kind of its noise. `played`
     are uniform times (N,) [s] and commands (N,) [V], beginning at 0 V; else a voltage of the class
     of the first record is drawn. The seed decides what is drawn, and the noise.
     """
     rng = np.random.default_rng([seed, 2])
     times, command = played or draw_excitation(rng, truth.excitation, truth.stack.u_rated)
+    truth = in_terms_of(truth, times, command)
     run = simulate_base(truth.stack, times, command)
     clean, temperature = run.displacement, None
     parts = [] if truth.effect is None else [(truth.effect, truth.parameters, truth.gain)]

@@ -1,0 +1,70 @@
+"""`psa design experiment` at the command line: what it writes, from what it is given."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment import read_record, write_record
+from psa_casadi.input_design.experiment import usual_records
+from psa_casadi.input_design.limits import Limits, excess
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.simulation.simulate import simulate
+
+STACK = "P-885.51"
+
+
+def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None:
+    output, page = tmp_path / "voltage.csv", tmp_path / "page.html"
+    arguments = [
+        "design", "experiment", "--stack", STACK, "--duration", "0.5", "--samples", "60",
+        "--high", "60", "--current", "0.01", "--family", "triangles", "--starts", "1",
+        "--separate", "sensor_nonlinearity", "slow_creep", "-o", str(output), "--report", str(page),
+    ]  # fmt: skip
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 0, found.output
+    assert "sensor nonlinearity" in found.output
+    record = read_record(output, need_displacement=False)
+    limits = Limits(0.0, 60.0, 0.5, 60, current=0.01)
+    assert record.n == 60
+    assert excess(record, limits, stack_model(STACK).values["C_p"]) == ()
+    assert "The voltage to play" in page.read_text(encoding="utf-8")
+
+
+def test_the_command_fits_the_rivals_to_the_records_at_hand(tmp_path: Path) -> None:
+    effect = EFFECTS["sensor_nonlinearity"]
+    model = stack_model(STACK).with_effect(effect)
+    gain = effect.gain or ""
+    model = model.with_values({gain: 0.3 * model.parameter(gain).typical(model.values)})
+    plan = usual_records(Limits(0.0, 70.0, 0.8, 80), np.inf)["triangle"]
+    read = simulate(model, plan.time, plan.voltage).outputs["displacement"]
+    read = read + 5e-9 * np.random.default_rng(2).standard_normal(plan.n)
+    measured, output = tmp_path / "measured.csv", tmp_path / "voltage.csv"
+    write_record(
+        measured,
+        {"time [s]": plan.time, "voltage [V]": plan.voltage, "displacement [um]": 1e6 * read},
+    )
+    arguments = [
+        "design", "experiment", "--stack", STACK, "--record", str(measured), "--family", "steps",
+        "--starts", "1", "--separate", "sensor_nonlinearity", "slow_creep", "-o", str(output),
+    ]  # fmt: skip
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 0, found.output
+    record = read_record(output, need_displacement=False)
+    assert (record.n, record.time[-1]) == (plan.n, pytest.approx(plan.time[-1]))
+    assert plan.voltage.min() - 1e-9 <= record.voltage.min()
+    assert record.voltage.max() <= plan.voltage.max() + 1e-9
+
+
+def test_the_command_tells_all_mistakes_at_once(tmp_path: Path) -> None:
+    arguments = [
+        "design", "experiment", "--separate", "creeping", "--noise", "-1", "--starts", "0",
+        "-o", str(tmp_path / "no" / "where.csv"),
+    ]  # fmt: skip
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 2
+    for part in ("creeping", "--noise", "--starts", "does not exist", "No model is given"):
+        assert part in found.output
