@@ -17,10 +17,10 @@ def psa(*arguments: str) -> Result:
 
 
 def test_the_archive_and_its_picture_are_written(tmp_path: Path) -> None:
+    """Of the default stack, where none is named."""
     archive, picture = tmp_path / "stage.ssp", tmp_path / "wiring.png"
     found = psa(
-        "export", "ssp", "--stack", "P-885.51", "--no-compensator", "-o", str(archive),
-        "--picture", str(picture),
+        "export", "ssp", "--no-compensator", "-o", str(archive), "--picture", str(picture),
     )  # fmt: skip
     assert found.exit_code == 0, found.output
     parts = [c.name for c in read_ssd(str(archive)).system.elements]
@@ -36,7 +36,7 @@ def test_the_archive_and_its_picture_are_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentences"),
     [
-        (("-o", "stage.ssp"), ("No model is given",)),
+        (("--model", "m.json", "--stack", "demo", "-o", "stage.ssp"), ("both given",)),
         (
             ("--stack", "P-1", "-o", "absent/stage.ssp", "--picture", "wiring.gif"),
             ("P-1", "absent does not exist", "is .svg or .png"),

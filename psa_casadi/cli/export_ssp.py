@@ -5,16 +5,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, StackOption, show, tell_written, working
+from psa_casadi.cli.screen import Quiet, show, tell_written, working
 
 if TYPE_CHECKING:
     from psa_casadi.export.ssp_structure import WiredParts
+
+#: The stack of a system for which no model is given.
+DEFAULT_STACK = "P-885.51"
 
 
 def ssp(
     output: Annotated[Path, typer.Option("-o", "--output", help="SSP archive to write.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json of the stack.")] = None,
-    stack: StackOption = None,
+    stack: Annotated[
+        str | None,
+        typer.Option(
+            "--stack",
+            help="Named stack in place of a model; `psa stacks` lists them.",
+            show_default=DEFAULT_STACK,
+        ),
+    ] = None,
     no_compensator: Annotated[
         bool, typer.Option("--no-compensator", help="Leave the hysteresis compensator out.")
     ] = False,
@@ -38,7 +48,7 @@ def ssp(
         given.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     given.attempt(lambda: chosen_platforms(wanted))
-    chosen = given.model_or_stack(model, stack)
+    chosen = given.model_or_stack(model, stack or (DEFAULT_STACK if model is None else None))
     system = None
     if chosen is not None:
         system = given.attempt(lambda: nanopositioner(chosen, compensated=not no_compensator))
