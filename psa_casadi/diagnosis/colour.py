@@ -7,6 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
+from psa_casadi.experiment.repeats import autoregression_of
+
 FloatArray = npt.NDArray[np.float64]
 
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
@@ -79,6 +81,18 @@ def colour_of(
     colour = Colour(each, 1.0, tuple(lengths))
     level = float(np.sqrt(np.mean(colour.whiten(remainder) ** 2)))
     return Colour(each, max(level, 1e-15), tuple(lengths))
+
+
+def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
+    """Return the colour of the residual itself, whatever it holds, one autoregression per record.
+
+    A missing effect counts as colour then: a negative control, not a way to know the noise.
+    """
+    ends = np.cumsum(lengths)
+    parts = np.split(residual, ends[:-1])
+    colour = Colour(tuple(autoregression_of(part) for part in parts), 1.0, tuple(lengths))
+    level = float(np.sqrt(np.mean(colour.whiten(residual) ** 2)))
+    return Colour(colour.autoregression, max(level, 1e-15), colour.lengths)
 
 
 def _at_rest(a: FloatArray) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.colour import colour_of
+from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.evidence import bic_probabilities, estimated, probabilities
 from psa_casadi.diagnosis.extension import (
@@ -99,7 +99,7 @@ def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
     lengths = [int(e.used.sum()) for e in task.experiments]
     known = [known_colour(e.record) for e in task.experiments]
     if task.method.whiten_from == "residual":
-        return screen(fit, trials, lengths, colour=colour_of(fit.residuals, lengths))
+        return screen(fit, trials, lengths, colour=residual_colour(fit.residuals, lengths))
     return screen(fit, trials, lengths, known)
 
 

@@ -13,10 +13,10 @@ class Method:
     """The parts of the method that a diagnosis can go without, to show what each is good for.
 
     `whiten_from`: the noise's colour is that of what neither the base nor any candidate explains
-    ("remainder"), or that of the residual itself. `finite_steps`: effects whose derivative vanishes
-    at their null are screened by a step. `imitators`: effects that could look like the best one are
-    fitted too. `weights`: probabilities come from the evidence, tempered as measured, or from the
-    Bayesian information criterion.
+    ("remainder"), or an autoregression of the residual itself. `finite_steps`: effects whose
+    derivative vanishes at their null are screened by a step. `imitators`: effects that could look
+    like the best one are fitted too. `weights`: probabilities come from the evidence, tempered as
+    measured, or from the Bayesian information criterion.
     """
 
     whiten_from: Literal["remainder", "residual"] = "remainder"

@@ -140,7 +140,7 @@ def _pooled(
     lost = sum(p for _, p in pieces) * (1.0 + r) / (1.0 - r)
     covariance *= used / max(used - lost, 0.5 * used)
     samples = used // uses
-    return float(np.sqrt(covariance[0])), covariance, _autoregression(covariance, samples), samples
+    return float(np.sqrt(covariance[0])), covariance, autoregression(covariance, samples), samples
 
 
 def _products(d: FloatArray, lags: int) -> FloatArray:
@@ -152,7 +152,13 @@ def _products(d: FloatArray, lags: int) -> FloatArray:
     return result
 
 
-def _autoregression(covariance: FloatArray, samples: int) -> FloatArray:
+def autoregression_of(signal: FloatArray) -> FloatArray:
+    """Return the autoregression (p,) of a signal (n,), of at most eighth order."""
+    covariance = _products(signal - np.mean(signal), _ORDER + 1) / signal.size
+    return autoregression(covariance, signal.size) if covariance[0] > 0 else np.zeros(0)
+
+
+def autoregression(covariance: FloatArray, samples: int) -> FloatArray:
     """Return the coefficients of the order that Schwarz' criterion chooses (Levinson, Durbin)."""
     a, best = np.zeros(0), np.zeros(0)
     variance = float(covariance[0])
