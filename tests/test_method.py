@@ -62,7 +62,7 @@ def test_the_residual_alone_takes_what_is_missing_for_the_colour_of_noise(
 def test_bic_weights_are_those_of_the_criterion(
     fitted: tuple[Fit, tuple[Experiment, ...]],
 ) -> None:
-    """Two fits of one model that differ by a hundredth of the residual: exp(-BIC/2) in closed form."""
+    """Two fits whose residuals differ by a hundredth: exp(-BIC/2) in closed form."""
     found, experiments = fitted
     task = Task(experiments, (), Method())
     colour = examine(found, tuple(found.predicted(experiments)), task).screening.colour
