@@ -34,13 +34,13 @@ def control_table(
     rows = [("the method", *_figures(kept)), ("shuffled labels", *_figures(_shuffled(kept)))]
     for name, method in CONTROLS.items():
         rows.append((name, *_figures(diagnose_all([f.case for f in kept], method))))
-    head = ("method", "right alone", "right in the set", "wrong alone", "stated, right")
+    head = ("method", "right alone", "right in the set", "wrong, as if settled", "stated, right")
     return TitledTable(
         "Negative controls",
         Table(head, tuple(rows)),
-        f"{len(kept)} cases, those of the study's first seed. Wrong alone counts foreign causes"
-        " too; stated, right: the mean confidence of the named cases with a known cause, and how"
-        " often the name is right.",
+        f"{len(kept)} cases, those of the study's first seed. Wrong, as if settled: `cause_named`"
+        " without the cause, foreign ones too. Stated, right: the mean confidence of the named"
+        " cases with a known cause, and how often the name is right.",
     )
 
 
@@ -52,7 +52,7 @@ def _figures(found: Sequence[Found]) -> tuple[str, ...]:
     return (
         _of(sum(f.named == (f.case.effect,) == f.within for f in known), known),
         _of(sum(f.case.effect in f.within for f in known), known),
-        _of(sum(f.alone not in (None, f.case.effect) for f in found), found),
+        _of(sum(f.verdict == "cause_named" and f.case.effect not in f.named for f in found), found),
         f"{100 * mean:.0f} %, {100 * right:.0f} %",
     )
 
