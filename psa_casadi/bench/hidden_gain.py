@@ -26,7 +26,7 @@ from psa_casadi.simulation.simulate import simulate_record
 FloatArray = npt.NDArray[np.float64]
 
 #: Further records that are held out, and those whose mean error counts as the truth.
-HELD_OUT, TRUTH = 6, 12
+HELD_OUT, TRUTH = 12, 36
 
 
 @dataclass(frozen=True)

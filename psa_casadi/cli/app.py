@@ -77,7 +77,7 @@ export.command(epilog="Example: psa export ssp --stack P-885.51 -o stage.ssp")(g
 app.add_typer(design, name="design")
 design.command(
     epilog="Example: psa design experiment --stack P-885.51 --duration 2"
-    " --separate sensor_delay drive_lag -o voltage.csv"
+    " --separate field_dependent_gain rate_independent_asymmetry -o voltage.csv"
 )(guarded(experiment))
 design.command(epilog="Example: psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json")(
     guarded(mechanism)
