@@ -1,7 +1,7 @@
 """The noise of the records: its level and its colour, as an autoregression for each record."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -78,9 +78,7 @@ def colour_of(
     correlation = float(np.clip(top / bottom, 0.0, _LARGEST)) if bottom > 0 else 0.0
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
     each = tuple(shared if own is None else own for own in given)
-    colour = Colour(each, 1.0, tuple(lengths))
-    level = float(np.sqrt(np.mean(colour.whiten(remainder) ** 2)))
-    return Colour(each, max(level, 1e-15), tuple(lengths))
+    return _with_level(each, remainder, lengths)
 
 
 def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
@@ -90,9 +88,16 @@ def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
     """
     ends = np.cumsum(lengths)
     parts = np.split(residual, ends[:-1])
-    colour = Colour(tuple(autoregression_of(part) for part in parts), 1.0, tuple(lengths))
-    level = float(np.sqrt(np.mean(colour.whiten(residual) ** 2)))
-    return Colour(colour.autoregression, max(level, 1e-15), colour.lengths)
+    return _with_level(tuple(autoregression_of(part) for part in parts), residual, lengths)
+
+
+def _with_level(
+    autoregression: tuple[FloatArray, ...], signal: FloatArray, lengths: Sequence[int]
+) -> Colour:
+    """Return the colour whose level is that of the whitened signal."""
+    colour = Colour(autoregression, 1.0, tuple(lengths))
+    level = float(np.sqrt(np.mean(colour.whiten(signal) ** 2)))
+    return replace(colour, level=max(level, 1e-15))
 
 
 def _at_rest(a: FloatArray) -> float:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.runs import runs_of
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -124,8 +125,7 @@ def _runs(record: Record, lag: int) -> list[Repetition]:
         same &= _same(record.load_force, lag)
     later = record.time[lag:] - record.time[:-lag]
     same &= np.abs(later - np.median(later)) <= 0.25 * record.sample_time
-    edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(np.int8)))
-    starts, stops = edges[::2], edges[1::2]
+    starts, stops = runs_of(same)
     longest = np.sort(np.argsort(starts - stops, kind="stable")[:RUNS])
     found = []
     for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):

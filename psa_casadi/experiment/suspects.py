@@ -13,6 +13,7 @@ from scipy.ndimage import maximum_filter1d
 
 from psa_casadi.experiment.quantum import quantum_of
 from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.runs import runs_of
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -161,7 +162,7 @@ def _outliers(
     allowed = np.maximum(LIMIT * scale, SMALLEST * float(np.ptp(y)))
     allowed = np.maximum(allowed, _explained(record)[valid])
     found = np.abs(away) > allowed
-    for start, stop in _runs(found):
+    for start, stop in zip(*(ends.tolist() for ends in runs_of(found)), strict=True):
         sign = np.sign(away[start])
         around = -sign * np.r_[away[max(0, start - SPIKE) : start], away[stop : stop + SPIKE]]
         swings = around.size > 0 and float(np.max(around)) > 0.4 * abs(away[start])
@@ -224,11 +225,6 @@ def _sudden(signal: FloatArray) -> FloatArray:
     bend[1:-1] = np.abs(np.diff(signal, 2))
     around = _scale(bend) / 1.4826
     return np.where(bend > np.maximum(6.0 * around, 1e-6 * np.ptp(signal)), bend, 0.0)
-
-
-def _runs(found: BoolArray) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _samples(count: int) -> str:

@@ -10,7 +10,7 @@ Psi = Phi^-1 E (d phi/d C) E^T Phi^-1 and E the choice of coordinates. Source: F
 Optimal Design for Nonlinear Response Models, 2013, chapters 2 and 10.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -102,8 +102,3 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     scaled = matrix * scale[:, None] * scale[None, :] + 1e-12 * np.eye(len(matrix))
     inverse: FloatArray = np.linalg.inv(scaled) * scale[:, None] * scale[None, :]
     return inverse
-
-
-def usual_names(rival: Rival, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Return the wanted parameters, or all free ones where none is named."""
-    return tuple(wanted) or rival.unknowns.names

@@ -5,6 +5,7 @@ from math import inf
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.experiment.runs import runs_of
 from psa_casadi.input_design.amplifier_limits import AmplifierLimits
 from psa_casadi.input_design.verification import Response
 from psa_casadi.model.compose import Model
@@ -72,15 +73,12 @@ def binding(response: Response, limits: AmplifierLimits) -> tuple[str, ...]:
 
 def _runs(stands: BoolArray) -> list[tuple[int, int]]:
     """Return first and last sample of every run of True; short gaps do not end one."""
-    edges = np.diff(np.concatenate([[0], stands.astype(int), [0]]))
     spans: list[tuple[int, int]] = []
-    for first, last in zip(
-        np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1, strict=True
-    ):
+    for first, stop in zip(*(ends.tolist() for ends in runs_of(stands)), strict=True):
         if spans and first - spans[-1][1] <= _GAP:
-            spans[-1] = (spans[-1][0], int(last))
+            spans[-1] = (spans[-1][0], stop - 1)
         else:
-            spans.append((int(first), int(last)))
+            spans.append((first, stop - 1))
     return spans
 
 
