@@ -13,7 +13,6 @@ and an error grows from point to point where the spectral radius of M is above 1
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag, expm
@@ -81,12 +80,9 @@ def linear(wiring: WiredParts) -> Linear:
 
 def _matrices(model: Model) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     s = model.structure
-    blocks = [ca.jacobian(of, by) for of in (s.xdot, s.y) for by in (s.x, s.u)]
-    sampled = [s.z] if s.sampled else []
-    at = ca.Function("at_rest", [s.time, s.x, s.u, s.p, *sampled], blocks)
     rest = [[v.start for v in group] for group in (s.states, s.inputs)]
     held = [[v.start for v in s.sampled]] if s.sampled else []
-    found = at(0.0, *rest, model.parameter_vector(), *held)
+    found = s.slopes(0.0, *rest, model.parameter_vector(), *held)
     a, b, c, d = (np.array(m, dtype=float).reshape(m.shape) for m in found)
     size = model.state_nominals()
     return a / size[:, None] * size, b / size[:, None], c * size, d

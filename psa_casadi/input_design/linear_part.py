@@ -1,13 +1,11 @@
 """The linear part of a stack, and its zero-phase inverse."""
 
 from dataclasses import dataclass
-from functools import cache
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.model.compose import Model, Structure
+from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import start_state
 
 FloatArray = npt.NDArray[np.float64]
@@ -50,17 +48,9 @@ def slopes_at_rest(model: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return d xdot / d x (nx, nx), d xdot / d voltage (nx,), d displacement / d x (nx,)."""
     starts = [i.start for i in model.structure.inputs]
     x = start_state(model, starts).x
-    a, b, c = _jacobians(model.structure)(0.0, x, starts, model.parameter_vector())
-    column = model.input_names.index("voltage")
-    return np.array(a), np.array(b)[:, column], np.array(c).ravel()
-
-
-@cache
-def _jacobians(structure: Structure) -> ca.Function:
-    s = structure
-    row = [o.name for o in s.outputs].index("displacement")
-    slopes = [ca.jacobian(s.xdot, s.x), ca.jacobian(s.xdot, s.u), ca.jacobian(s.y[row], s.x)]
-    return ca.Function("linear", [s.time, s.x, s.u, s.p], slopes)
+    a, b, c, _ = model.structure.slopes(0.0, x, starts, model.parameter_vector())
+    row, column = model.output_names.index("displacement"), model.input_names.index("voltage")
+    return np.array(a), np.array(b)[:, column], np.array(c)[row]
 
 
 def zero_phase_inverse(part: LinearPart, wanted: FloatArray, step: float) -> FloatArray:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
@@ -75,13 +74,12 @@ def plant_response(plant: Model, position: str | None, period: float, lag: float
 def _linearised(plant: Model, position: str | None) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, B, C at the start, the states scaled by their usual sizes."""
     s = plant.structure
-    shown = s.y[plant.output_names.index(position) if position else 0]
-    slopes = [ca.jacobian(s.xdot, s.x), ca.jacobian(s.xdot, s.u), ca.jacobian(shown, s.x)]
-    at = ca.Function("slopes", [s.time, s.x, s.u, s.p], slopes)
+    row = plant.output_names.index(position) if position else 0
     start = [v.start for v in s.states], [v.start for v in s.inputs]
-    A, B, C = (np.array(m, dtype=float) for m in at(0.0, *start, plant.parameter_vector()))
+    found = s.slopes(0.0, *start, plant.parameter_vector())
+    A, B, C, _ = (np.array(m, dtype=float) for m in found)
     size = plant.state_nominals()
-    return A * size / size[:, None], B / size[:, None], C * size
+    return A * size / size[:, None], B / size[:, None], C[[row]] * size
 
 
 def _behind(

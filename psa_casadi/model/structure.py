@@ -68,6 +68,15 @@ class Structure:
         return ca.Function("f", self.arguments, [self.xdot, self.y], names, ["xdot", "y"])
 
     @cached_property
+    def slopes(self) -> ca.Function:
+        """Casadi function of the same arguments `-> (A, B, C, D)`: xdot and y by x and u.
+
+        Shapes (nx, nx), (nx, nu), (ny, nx), (ny, nu).
+        """
+        blocks = [ca.jacobian(of, by) for of in (self.xdot, self.y) for by in (self.x, self.u)]
+        return ca.Function("slopes", self.arguments, blocks)
+
+    @cached_property
     def g(self) -> ca.Function:
         """Casadi function `(time, x, u, p, z) -> z_next`: the sampled states after an instant."""
         return ca.Function(
