@@ -114,6 +114,7 @@ def _ours(record: Record, sigma: float) -> tuple[_Trace, int]:
     objective = fitting.objective
 
     def traced(*arguments: object) -> Callable[[FloatArray], object]:
+        # whatever the fit passes is passed on
         evaluate = objective(*arguments)  # type: ignore[arg-type]
 
         def wrapped(theta: FloatArray) -> object:
@@ -124,6 +125,7 @@ def _ours(record: Record, sigma: float) -> tuple[_Trace, int]:
 
         return wrapped
 
+    # the fit's own objective is replaced by one that also keeps a trace
     fitting.objective = traced  # type: ignore[assignment]
     try:
         found = fit(_stack(), [whole(record)], FREE, sigma=[sigma], start=_wrong())

@@ -58,6 +58,7 @@ class Given:
         found: list[Record] = []
         for path in (*paths, *held_out):
             fitted = path in paths
+            # the loop's values are bound as defaults, whose types a lambda cannot state
             record = self.attempt(
                 lambda p=path, f=fitted: read_record(  # type: ignore[misc]
                     p, need_excitation=f, columns=wanted

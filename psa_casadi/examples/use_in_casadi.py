@@ -73,7 +73,8 @@ def step_of(f: ca.Function, model: psa.Model, voltage: float, name: str) -> tupl
     x = model.state_names.index("x")
     final = size[x] * whole(x0=np.zeros(len(size)), p=k)["xf"][x]
     both = ca.Function("both", [k], [final, ca.jacobian(final, k)])
-    return tuple(float(v) for v in both(values[at]))  # type: ignore[return-value]
+    reached, slope = both(values[at])
+    return float(reached), float(slope)
 
 
 def optimal_voltage(f: ca.Function, model: psa.Model) -> tuple[FloatArray, FloatArray]:

@@ -82,6 +82,7 @@ class Model:
         """Return the model with some values replaced, each checked against its bounds."""
         merged = {**self.values, **{k: float(v) for k, v in values.items()}}
         _check_values(self.structure, merged)
+        # `changes` are fields of the model by name, which a type checker cannot match
         return replace(self, values=merged, **changes)  # type: ignore[arg-type]
 
     def with_components(self, components: Iterable[Component]) -> "Model":
