@@ -40,7 +40,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.tables import Table
 
 #: Ambiguous pairs that are resolved, and the seeds from which they are drawn.
-PAIRS, QUICK_PAIRS, FIRST = 20, 2, 7000
+PAIRS, QUICK_PAIRS, FIRST = 20, 2, 8400
 #: Samples of a first record, of a class of voltage that users have, and the size of its effect.
 SAMPLES, CLASSES, RHO = 2000, ("sine", "triangle"), (0.3, 2.0)
 _PLAYED = ("designed", "sine", "triangle")

@@ -1,12 +1,13 @@
-"""The backward step: a cause that a later one made needless is dropped."""
+"""The backward step: causes that later ones made needless are dropped, or change their names."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.evidence import evidence
-from psa_casadi.diagnosis.extension import extend, polish
-from psa_casadi.diagnosis.rounds import Round, examine
+from psa_casadi.diagnosis.evidence import estimated, evidence
+from psa_casadi.diagnosis.extension import extend, extend_within, polish
+from psa_casadi.diagnosis.rivals_beside import beside, weigh_again
+from psa_casadi.diagnosis.rounds import Round, examine, settle_on
 from psa_casadi.diagnosis.selection import starts_of
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.errors import PsaError
@@ -15,22 +16,30 @@ from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.refitting import refit
 
 
-def without_needless(rounds: list[Round], task: Task) -> list[Round]:
-    """Return the rounds without causes for which, beside the later ones, there is no evidence.
+def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
+    """Return the rounds with every cause but the last judged again beside the later ones.
 
-    Every cause but the last is taken out in turn, the rest fitted again. Where one is dropped the
-    rounds are built anew from the causes that stay.
+    Each is taken out in turn and the rest fitted again. Where there is no evidence for it then, it
+    is dropped; else what was nearly as likely in its step is fitted in its place, which gives the
+    step's probabilities, and takes its place where there is more evidence for it. The rounds are
+    then built anew.
     """
-    causes = [r.chosen.effect for r in rounds if r.chosen is not None]
-    last = rounds[-1]
-    for cause in causes[:-1]:
-        task.progress(f"without {cause.name}")
-        less = _without(last.fit, cause, task.experiments)
-        if less is not None and evidence(less, last.fit, last.screening.colour) < 0.0:
-            kept = [c for c in causes if c is not cause]
-            rebuilt = _rebuilt(rounds[0], kept, task)
+    for k in range(sum(r.chosen is not None for r in rounds) - 1):
+        causes = [r.chosen.effect for r in rounds if r.chosen is not None]
+        last = rounds[-1]
+        task.progress(f"without {causes[k].name}")
+        less = _without(last.fit, causes[k], task.experiments)
+        if less is None:
+            continue
+        if evidence(less, last.fit, last.screening.colour) < 0.0:
+            rebuilt = _rebuilt(rounds[0], [*causes[:k], *causes[k + 1 :]], less, task)
             if rebuilt is not None:
-                return without_needless(rebuilt, task)
+                return reconsidered(rebuilt, task)
+        found, better = beside(rounds[k], last, less, task)
+        if better is not None:
+            causes[k] = better.effect
+            rounds = _rebuilt(rounds[0], causes, better.fit, task) or rounds
+        weigh_again(rounds[k], found)
     return rounds
 
 
@@ -44,18 +53,29 @@ def _without(final: Fit, cause: Component, experiments: Sequence[Experiment]) ->
         return None
 
 
-def _rebuilt(first: Round, causes: Sequence[Component], task: Task) -> list[Round] | None:
-    """Return rounds with the causes in their order; None where one of them cannot be fitted."""
-    rounds = [replace(first, extensions=list(first.extensions), chosen=None)]
+def _rebuilt(
+    first: Round, causes: Sequence[Component], reached: Fit, task: Task
+) -> list[Round] | None:
+    """Return rounds with the causes in their order; None where one of them cannot be fitted.
+
+    Every cause is fitted from its directions and from the values in the fit that all of them
+    `reached` together: the first may be what keeps a base that was bent to another cause.
+    """
+    guess = estimated(first.fit, first.screening)
+    rounds = [replace(first, extensions=list(first.extensions), chosen=None, evidence=guess)]
     for cause in causes:
         current = rounds[-1]
         colour = current.screening.colour
         scores = starts_of(current.screening, cause.name)
-        found = extend(current.fit, task.experiments, scores, colour) if scores else None
-        if found is None:
+        found = [
+            extend(current.fit, task.experiments, scores, colour) if scores else None,
+            extend_within(current.fit, task.experiments, reached, reached, cause, colour),
+        ]
+        fitted = [f for f in found if f is not None]
+        if not fitted:
             return None
-        current.chosen = polish(current.fit, found, task.experiments, colour)
-        current.evidence = {**current.evidence, cause.name: current.chosen.evidence}
-        fit, predicted = current.chosen.fit, current.chosen.predicted
-        rounds.append(examine(fit, predicted, task, current.trials))
+        best = min(fitted, key=lambda f: f.fit.cost)
+        chosen = polish(current.fit, best, task.experiments, colour)
+        settle_on(current, chosen, task, rounds[0].chosen if len(rounds) > 1 else None)
+        rounds.append(examine(chosen.fit, chosen.predicted, task, current.trials))
     return rounds

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.backward import without_needless
+from psa_casadi.diagnosis.backward import reconsidered
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.retries import (
@@ -105,7 +105,7 @@ def _search(base: Fit, task: Task) -> list[Round]:
             other = _forward(resonant, task)
             if other[-1].fit.rms < rounds[-1].fit.rms:
                 rounds = other
-    return _settle(without_needless(rounds, task), task)
+    return _settle(reconsidered(rounds, task), task)
 
 
 def _open(rounds: Sequence[Round]) -> bool:

@@ -1,6 +1,7 @@
 """Fits with one more effect: from its trial directions, from another effect's fit, afresh."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,19 +11,21 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.evidence import evidence
+from psa_casadi.diagnosis.quick_fits import QUICK, QUICK_RTOL, continued, fit_from, quick_fit
 from psa_casadi.diagnosis.screening import Copy, Score, Screening
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
+from psa_casadi.identification.fit import FIT_RTOL, Fit
 from psa_casadi.identification.search import FIXED
 from psa_casadi.identification.starting import ordinary_values
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Evaluations of quick fits: from directions, beside another effect, and afresh.
-_QUICK, _COPY, _AFRESH = 8, 12, 25
-#: Tolerance of the stepper in quick fits, then of stepper and fit, and evaluations, to the end.
-_QUICK_RTOL = 1e-4
+#: Evaluations of quick fits beside another effect, and of those afresh that go on: the best so
+#: many; there the gain begins at so many ordinary sizes.
+_COPY, _AFRESH = 12, 17
+_CONTINUED, _ORDINARY = 2, 2.5
+#: Tolerance of stepper and fit, and evaluations, to the end.
 _POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
 
 
@@ -43,15 +46,12 @@ class Extension:
     final: bool = False
 
 
-_Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
-
-
 def extend(
     before: Fit, experiments: Sequence[Experiment], scores: Sequence[Score], colour: Colour
 ) -> Extension | None:
     """Fit quickly with one more effect from its best directions; None if every fit fails."""
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
-    quick = _quick(before, experiments, scores[0].direction.effect, starts, {})
+    quick = quick_fit(before, experiments, scores[0].direction.effect, starts, {})
     return (
         None
         if quick is None
@@ -75,36 +75,68 @@ def extend_like(
     base = {n: values[n] for n in before.unknowns.names}
     usable = copy.gain > 0 or not direction.one_sided
     start = (direction.values, copy.gain if usable else direction.unit_gain, direction.memory)
-    quick = _quick(before, experiments, effect, [start], base, _COPY)
+    quick = quick_fit(before, experiments, effect, [start], base, _COPY)
     if quick is None:
         return None
     return _extension(before, quick, effect, experiments, screening.colour)
 
 
+def extend_within(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    reached: Fit,
+    own: Fit,
+    effect: Component,
+    colour: Colour,
+) -> Extension | None:
+    """Fit an effect with its values from one fit that has it, and the others' from another one.
+
+    Values that `reached` does not have stay those of `before`.
+    """
+    other, values = reached.model.values, own.model.values
+    start = (
+        {p.name: values[p.name] for p in effect.parameters if p.name != effect.gain},
+        values[effect.gain or ""],
+        tuple({**s, **r} for s, r in zip(own.starts(), reached.starts(), strict=True)),
+    )
+    base = {n: other[n] for n in before.unknowns.names if n in other}
+    quick = quick_fit(before, experiments, effect, [start], base, _COPY)
+    return None if quick is None else _extension(before, quick, effect, experiments, colour)
+
+
 def extend_afresh(
     before: Fit, experiments: Sequence[Experiment], first: Extension, colour: Colour
 ) -> Extension:
-    """Fit an effect again from an ordinary base and both signs of its gain; return the better.
+    """Fit an effect again from an ordinary base and gains of both signs; return the better.
 
     A base fit without the effect has bent its loop and its lags to imitate it, and may hold the
-    search there.
+    search there. Where the gain acts by thresholds or lags, it starts at their steps as well.
     """
     effect = first.effect
     gain = next(p for p in effect.parameters if p.name == effect.gain)
-    size = 2.5 * gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
+    size = gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
+    sizes = [_ORDINARY, *(s for s in effect.finite_step if s > _ORDINARY)]
+    if gain.bounds[0] < 0:
+        sizes.append(-_ORDINARY)
     values = {
-        n: first.fit.model.values[n] if isinstance(grid, str) else _declared(effect, n)
+        n: first.fit.model.values[n]
+        if isinstance(grid, str) or n in FIXED
+        else _declared(effect, n)
         for n, grid in effect.probe.items()
     }
-    memory = tuple(before.starts())
-    starts = [
-        (values, sign * size, memory) for sign in (1.0, -1.0) if sign > 0 or gain.bounds[0] < 0
-    ]
     ordinary = ordinary_values(before.model, [e.record for e in experiments])
-    quick = _quick(before, experiments, effect, starts, ordinary, _AFRESH)
-    if quick is None or quick.cost >= first.fit.cost:
+    fits: list[Fit] = []
+    for s in sizes:
+        start = (values, s * size, tuple(before.starts()))
+        found = fit_from(before, experiments, effect, start, ordinary, QUICK)
+        fits += [found] if found is not None else []
+    for quick in sorted(fits, key=lambda f: f.cost)[:_CONTINUED]:
+        with suppress(PsaError):
+            fits.append(continued(quick, experiments, QUICK_RTOL, 1e-3, _AFRESH))
+    final = min(fits, key=lambda f: f.cost, default=None)
+    if final is None or final.cost >= first.fit.cost:
         return first
-    return _extension(before, quick, effect, experiments, colour)
+    return _extension(before, final, effect, experiments, colour)
 
 
 def polish(
@@ -114,16 +146,7 @@ def polish(
     current = extension.fit
     for rtol, tolerance, evaluations in _POLISHING:
         try:
-            current = fit(
-                current.model,
-                experiments,
-                current.unknowns.names,
-                sigma=before.sigma,
-                start_states=current.starts(),
-                evaluations=evaluations,
-                tolerance=tolerance,
-                rtol=rtol,
-            )
+            current = continued(current, experiments, rtol, tolerance, evaluations)
         except PsaError:
             return extension
     return _extension(before, current, extension.effect, experiments, colour, final=True)
@@ -152,56 +175,3 @@ def _extension(
         removed=before.rms**2 - found.rms**2,
         final=final,
     )
-
-
-def _quick(
-    before: Fit,
-    experiments: Sequence[Experiment],
-    effect: Component,
-    starts: Sequence[_Start],
-    reset: dict[str, float],
-    evaluations: int = _QUICK,
-) -> Fit | None:
-    """A few iterations from every start; the best of them.
-
-    Where none comes below the fit without the effect, some more from there, with the gain at 0: the
-    loop may be such that no other start of the gain fits to it.
-    """
-    fits = [_fit_from(before, experiments, effect, start, reset, evaluations) for start in starts]
-    found = [f for f in fits if f is not None]
-    if not any(f.cost < before.cost for f in found):
-        states = tuple(before.starts())
-        nested = (starts[0][0], 0.0, states)
-        last = _fit_from(before, experiments, effect, nested, {}, 3 * _QUICK)
-        found += [last] if last is not None else []
-    return min(found, key=lambda f: f.cost) if found else None
-
-
-def _fit_from(
-    before: Fit,
-    experiments: Sequence[Experiment],
-    effect: Component,
-    start: _Start,
-    reset: dict[str, float],
-    evaluations: int,
-) -> Fit | None:
-    values, gain, memory = start
-    names = list(before.unknowns.names)
-    names += [p.name for p in effect.parameters if p.name not in FIXED and p.name not in names]
-    low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
-    for share in (1.0, 0.3):
-        value = float(np.clip(share * gain, 0.9 * low, 0.9 * high))
-        try:
-            return fit(
-                before.model.with_effect(effect, {**values, **reset, effect.gain or "": value}),
-                experiments,
-                names,
-                sigma=before.sigma,
-                start_states=memory,
-                evaluations=evaluations,
-                tolerance=1e-3,
-                rtol=_QUICK_RTOL,
-            )
-        except PsaError:
-            continue
-    return None

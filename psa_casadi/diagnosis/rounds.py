@@ -33,8 +33,9 @@ SETTLED = 1.05
 #: How many extensions are fitted to the end, if their evidence is this share of the best one's or
 #: this close to it.
 FINALISTS, RUNNER_UP, NEAR = 3, 0.8, 30.0
-#: How many extensions are fitted afresh: the best one and those that lost themselves.
-AFRESH = 2
+#: How many extensions are fitted afresh, of a first and of a further cause: the best one and, while
+#: none removes this share of the excess power, the next ones.
+AFRESH, AFRESH_FURTHER, MOST = 4, 2, 0.9
 #: How many effects that could stand in the best one's place are fitted besides, at most.
 IMITATORS = 3
 
@@ -43,8 +44,9 @@ IMITATORS = 3
 class Round:
     """One step of the search: the model so far, its screening and test, the extensions tried.
 
-    `evidence` is ln B of every effect over the model so far, of a full fit where there was one;
-    `probability` that of being the cause, given that one effect of the table is.
+    `evidence` is ln B of every effect over the model so far, of a full fit where there was one, or
+    over all other causes where later ones were found; `probability` that of being the cause, given
+    that one effect of the table is.
     """
 
     fit: Fit
@@ -115,21 +117,57 @@ def search_cause(current: Round, number: int, task: Task, first: Extension | Non
         if extension is not None:
             current.extensions.append(extension)
     _sort(current)
-    floor = high_frequency_noise(current.fit.residuals)
-    lost = [k for k, e in enumerate(current.extensions) if k == 0 or e.evidence < 0][:AFRESH]
-    for k in lost if current.extensions and current.extensions[0].fit.rms > SETTLED * floor else ():
-        task.progress(f"cause {number}: {current.extensions[k].effect.name} afresh")
-        again = extend_afresh(current.fit, experiments, current.extensions[k], colour)
-        current.extensions[k] = again
-    _sort(current)
+    _afresh(current, number, task)
     _polish(current, number, task)
     if current.extensions and task.method.imitators:
         _imitators(current, number, task)
         _polish(current, number, task)
-    before = held_out_rms(experiments, current.predicted)
-    ranked = choose(current.extensions, experiments, current.fit, before, floor, colour, first)
+    ranked = _ranked(current, task, first)
     _weigh(current, ranked, task)
     current.chosen = ranked[0] if ranked else None
+
+
+def _afresh(current: Round, number: int, task: Task) -> None:
+    """Fit extensions afresh, the best first, until one of them explains nearly everything."""
+    floor = high_frequency_noise(current.fit.residuals)
+    excess = current.fit.rms**2 - floor**2
+    count = AFRESH if number == 1 else AFRESH_FURTHER
+    for k, extension in enumerate(current.extensions[:count]):
+        best = max(current.extensions, key=lambda e: e.removed)
+        if best.fit.rms < SETTLED * floor or (k > 0 and best.removed > MOST * excess):
+            break
+        task.progress(f"cause {number}: {extension.effect.name} afresh")
+        current.extensions[k] = extend_afresh(
+            current.fit, task.experiments, extension, current.screening.colour
+        )
+    _sort(current)
+
+
+def settle_on(
+    current: Round, extension: Extension, task: Task, first: Extension | None = None
+) -> None:
+    """Take an extension, found in another way, as a step's cause, and weigh the others against it.
+
+    What could look like it is fitted as after a search. `first` is the first cause where this is a
+    further one.
+    """
+    others = [e for e in current.extensions if e.effect is not extension.effect]
+    current.extensions = [*others, extension]
+    _sort(current)
+    if task.method.imitators and current.extensions[0] is extension:
+        _imitators(current, 1 if first is None else 2, task)
+        _polish(current, 1 if first is None else 2, task)
+    own = next(e for e in current.extensions if e.effect is extension.effect)
+    ranked = _ranked(current, task, first)
+    _weigh(current, ranked if own in ranked else [own, *ranked], task)
+    current.chosen = own
+
+
+def _ranked(current: Round, task: Task, first: Extension | None) -> list[Extension]:
+    floor = high_frequency_noise(current.fit.residuals)
+    before = held_out_rms(task.experiments, current.predicted)
+    colour = current.screening.colour
+    return choose(current.extensions, task.experiments, current.fit, before, floor, colour, first)
 
 
 def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:
