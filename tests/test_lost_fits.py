@@ -1,0 +1,104 @@
+"""Fits that lose themselves: an effect far from its ordinary size, a cause chosen too early."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.diagnosis.backward import reconsidered
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.extension import extend, polish
+from psa_casadi.diagnosis.rounds import Round, examine, settle_on
+from psa_casadi.diagnosis.selection import starts_of
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment.reading import read_record
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import split
+from psa_casadi.identification.search import fit_base
+from psa_casadi.identification.starting import starting_model
+from tests.plants.again import play_again
+from tests.plants.make import make_record
+
+
+def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
+    """Of 7 ms, seventy times the ordinary lag, in a triangle and steps together."""
+    path = tmp_path / "triangle.csv"
+    truth = make_record("drive_lag", 11, path, excitation="triangle", visible=(1.0, 2.0))
+    time = np.arange(1500) * 1e-3
+    steps = np.where((time // 0.15) % 2 == 1, 0.8, 0.2) * truth.stack.u_rated
+    steps[:20] = 0.0
+    play_again(truth, 11, tmp_path / "steps.csv", (time, steps))
+    records = [read_record(path).slice(0, 1500), read_record(tmp_path / "steps.csv")]
+    found = diagnose(records, effects=[EFFECTS["drive_lag"], EFFECTS["backlash"]])
+    assert [c.effect for c in found.causes] == ["drive_lag"]
+    assert found.verdict == "cause_named"
+    lag = found.causes[0].parameters["drive_lag_time"].value
+    assert lag == pytest.approx(2.0 * truth.parameters["zeta"] * truth.gain, rel=0.02)
+    assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
+
+
+def _begun(record: Record, names: tuple[str, ...]) -> tuple[list[Round], Task]:
+    """Rounds that take the effects in this order, right or wrong."""
+    table = tuple(EFFECTS[n] for n in names)
+    experiments = (split(record),)
+    base = fit_base(starting_model([record], None), experiments)
+    task = Task(experiments, table)
+    rounds = [examine(base, tuple(base.predicted(experiments)), task)]
+    return rounds, task
+
+
+def _forced(rounds: list[Round], task: Task, name: str) -> None:
+    current = rounds[-1]
+    colour = current.screening.colour
+    found = extend(current.fit, task.experiments, starts_of(current.screening, name), colour)
+    assert found is not None
+    first = rounds[0].chosen if len(rounds) > 1 else None
+    settle_on(current, polish(current.fit, found, task.experiments, colour), task, first)
+    assert current.chosen is not None
+    rounds.append(examine(current.chosen.fit, current.chosen.predicted, task, current.trials))
+
+
+def _causes(rounds: list[Round]) -> list[str]:
+    return [r.chosen.effect.name for r in rounds if r.chosen is not None]
+
+
+def test_a_needless_first_cause_leaves_the_second_as_good(tmp_path: Path) -> None:
+    """What stays has the fit that both together reached, and the probabilities of its own."""
+    make_record("charge_leakage", 5, tmp_path / "a.csv", visible=(1.0, 2.0))
+    record = read_record(tmp_path / "a.csv").slice(0, 2500)
+    rounds, task = _begun(record, ("slow_creep", "charge_leakage"))
+    for name in ("slow_creep", "charge_leakage"):
+        _forced(rounds, task, name)
+    both = rounds[-1].fit.rms
+    left = reconsidered([replace(r) for r in rounds], task)
+    assert _causes(left) == ["charge_leakage"]
+    assert left[-1].fit.rms < 1.01 * both
+    assert left[0].probability["charge_leakage"] > 0.9
+
+
+def test_a_wrong_first_cause_gives_way_beside_the_second(tmp_path: Path) -> None:
+    """A spring that hardens, taken for a sensor that bends while a mode still rang."""
+    make_record(
+        "load_stiffness", 31003, tmp_path / "a.csv", visible=(1.0, 3.0),
+        second="structural_mode", second_visible=(1.0, 3.0),
+    )  # fmt: skip
+    record = read_record(tmp_path / "a.csv").slice(0, 3000)
+    rounds, task = _begun(record, ("preload_loss", "load_stiffness", "structural_mode"))
+    for name in ("preload_loss", "structural_mode"):
+        _forced(rounds, task, name)
+    _also(rounds[0], task, "load_stiffness")
+    again = reconsidered(rounds, task)
+    assert _causes(again) == ["load_stiffness", "structural_mode"]
+    assert again[-1].fit.rms < 0.9 * rounds[-1].fit.rms
+    assert again[0].probability["load_stiffness"] > 0.9
+
+
+def _also(step: Round, task: Task, name: str) -> None:
+    """Fit a further effect in a step, as a search would have."""
+    colour = step.screening.colour
+    found = extend(step.fit, task.experiments, starts_of(step.screening, name), colour)
+    assert found is not None
+    step.extensions.append(polish(step.fit, found, task.experiments, colour))
+    step.evidence = {**step.evidence, name: step.extensions[-1].evidence}
