@@ -109,6 +109,8 @@ def test_gain_is_the_reduction_of_the_held_out_rms() -> None:
     gain = gain_of([experiment], [base], [truth])
     assert gain.holdout_rms_reduction_percent == pytest.approx(90, abs=1.5)
     assert gain.interval[0] < gain.holdout_rms_reduction_percent < gain.interval[1]
+    assert gain.held_out_records == 0
+    assert gain_of([experiment] * 4, [base] * 4, [truth] * 4).held_out_records == 4
 
 
 @pytest.fixture(scope="module")

@@ -54,6 +54,7 @@ def test_the_page_tells_the_story_in_its_order(tmp_path: Path) -> None:
     for label in ("base model, held-out rms", "extended model, held-out rms", "noise, rms"):
         assert f"<dt>{label}</dt>" in top
     assert re.search(r"falls by</dt><dd>83\s%<small>95\s% interval 79 to 86\s%", top)
+    assert "speaks for these voltages only" in page.text
     for sentence in diagnosis("cause_named").misfit[0].sentences:
         assert sentence in page.text.replace("\u00a0", " ")
     assert diagnosis("cause_named").noise[0].sentence in page.text.replace("\u00a0", " ")

@@ -12,7 +12,8 @@ from psa_casadi.identification.prediction import measured
 
 FloatArray = npt.NDArray[np.float64]
 
-_BLOCKS = 8
+#: Held-out records from which on they give the gain's interval; else so many blocks of them do.
+_FEWEST, _BLOCKS = 4, 8
 
 
 def held_out_residuals(
@@ -66,7 +67,8 @@ def gain_of(
     before = held_out_residuals(experiments, base)
     after = held_out_residuals(experiments, extended)
     pairs = [(b, a) for b, a in zip(before, after, strict=True) if len(b)]
-    if len(pairs) < 4:
+    records = len(pairs) if len(pairs) >= _FEWEST else 0
+    if not records:
         pairs = [
             (b, a)
             for whole_b, whole_a in pairs
@@ -83,7 +85,7 @@ def gain_of(
         spread = float(np.sqrt((k - 1) * np.var(without)))
         half = float(stats.t.ppf(0.975, k - 1)) * spread
     low, high = (100.0 * (1.0 - float(np.exp(centre + side * half))) for side in (1.0, -1.0))
-    return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high))
+    return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), records)
 
 
 def _log_ratio(sums: FloatArray) -> float:

@@ -68,10 +68,15 @@ class Errors:
 
 @dataclass(frozen=True)
 class Gain:
-    """Reduction of the held-out rms by the extended model [%], with a 95 % interval."""
+    """Reduction of the held-out rms by the extended model [%], with a 95 % interval.
+
+    `held_out_records` is the number of records that the interval is taken over, 0 where it is
+    blocks of fewer ones: then it speaks for their voltages only.
+    """
 
     holdout_rms_reduction_percent: float
     interval: tuple[float, float]
+    held_out_records: int = 0
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from psa_casadi.report.cause_part import add_causes, add_evidence
 from psa_casadi.report.document import Document, Picture
 from psa_casadi.report.misfit_part import add_misfit, add_remainder
 from psa_casadi.report.phrases import (
+    OWN_VOLTAGES,
     VERDICTS,
     added,
     gain_sentence,
@@ -98,6 +99,8 @@ def _gain(page: Document, d: Diagnosis) -> None:
     page.section("What is gained")
     sentence = gain_sentence(d) if added(d) else "nothing was added to the base model"
     page.paragraph(f"{sentence[0].upper()}{sentence[1:]}.")
+    if added(d) and not d.gain.held_out_records:
+        page.paragraph(OWN_VOLTAGES)
     scale = series_of(d)[0].residual_scale
     page.table(error_table(d, scale.unit, scale.factor))
 

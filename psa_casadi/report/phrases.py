@@ -124,6 +124,13 @@ def added(d: Diagnosis) -> bool:
     return bool(d.causes)
 
 
+#: What an interval of the gain from blocks of few records says.
+OWN_VOLTAGES = (
+    "The interval is taken over blocks of the held-out samples and speaks for these voltages only;"
+    " for other voltages hold out four records or more (--holdout)."
+)
+
+
 def gain_sentence(d: Diagnosis) -> str:
     """Say how far the held-out error falls."""
     gain = d.gain.holdout_rms_reduction_percent
