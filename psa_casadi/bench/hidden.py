@@ -152,14 +152,27 @@ def _said(f: Found) -> str:
 
 def _reliability(found: Sequence[Found]) -> TitledTable:
     """Compare the confidence of the first cause with how often it is right."""
-    stated = [f for f in found if f.named and f.case.kind in ("known", "weak", "left out")]
+    inside = [f for f in found if f.named and f.case.kind in ("known", "weak")]
+    every = [f for f in found if f.named and f.case.kind in ("known", "weak", "left out")]
     rows = []
     for low, high in itertools.pairwise(_BINS):
-        own = [f for f in stated if low < f.confidence <= high]
-        if own:
-            mean = np.mean([f.confidence for f in own])
-            right = np.mean([f.named[0] == f.case.effect for f in own])
-            cells = (f"{100 * mean:.0f} %", f"{100 * right:.0f} %", f"{len(own)}")
+        cells = [c for group in (inside, every) for c in _right(group, low, high)]
+        if cells[-1] != "0":
             rows.append((f"{100 * low:.0f} to {100 * high:.0f} %", *cells))
-    head = ("stated confidence", "mean", "right", "cases")
-    return TitledTable("Confidence against frequency", Table(head, tuple(rows)))
+    head = ("stated confidence", "mean", "right", "cases", "mean", "right", "cases")
+    return TitledTable(
+        "Confidence against frequency",
+        Table(head, tuple(rows)),
+        "First where the hidden effect is in the table, which the probability takes for granted,"
+        " then with the cases whose own entry was left out.",
+    )
+
+
+def _right(found: Sequence[Found], low: float, high: float) -> tuple[str, str, str]:
+    """Return mean confidence, share of right first causes and number of cases in one class."""
+    own = [f for f in found if low < f.confidence <= high]
+    if not own:
+        return ("", "", "0")
+    mean = 100.0 * float(np.mean([f.confidence for f in own]))
+    right = 100.0 * float(np.mean([f.named[0] == f.case.effect for f in own]))
+    return (f"{mean:.0f} %", f"{right:.0f} %", f"{len(own)}")

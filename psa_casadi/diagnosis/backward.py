@@ -24,6 +24,7 @@ def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
     step's probabilities, and takes its place where there is more evidence for it. The rounds are
     then built anew.
     """
+    weights: list[tuple[int, dict[str, float]]] = []
     for k in range(sum(r.chosen is not None for r in rounds) - 1):
         causes = [r.chosen.effect for r in rounds if r.chosen is not None]
         last = rounds[-1]
@@ -39,6 +40,8 @@ def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
         if better is not None:
             causes[k] = better.effect
             rounds = _rebuilt(rounds[0], causes, better.fit, task) or rounds
+        weights.append((k, found))
+    for k, found in weights:
         weigh_again(rounds[k], found)
     return rounds
 
