@@ -41,7 +41,7 @@ def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
             causes[k] = better.effect
             rounds = _rebuilt(rounds[0], causes, better.fit, task) or rounds
         weights.append((k, found))
-    for k, found in weights:
+    for k, found in weights if task.method.weights == "evidence" else ():
         weigh_again(rounds[k], found)
     return rounds
 
