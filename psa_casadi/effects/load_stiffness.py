@@ -21,7 +21,7 @@ def _equations(s: Symbols) -> Equations:
 LOAD_STIFFNESS = Component(
     name="load_stiffness",
     description="an elastic load that grows stiffer with displacement",
-    source="Duffing's hardening spring and the next odd power; flexures that stretch as they bend: Howell 2001",
+    source="Duffing's hardening spring; flexures that stretch as they bend: Howell 2001",
     gain="load_hardening",
     equation_text=(
         "f_load gains -load_hardening k_s x q^2 (1 + load_quintic q^2),  q = x/x_s,"
