@@ -20,6 +20,8 @@ from psa_casadi.report.tables import Table
 SEEDS, QUICK_SEEDS, FIRST = 5, 1, 81239
 #: A hidden effect counts from this share of the smallest rho that was asked for.
 REACHED = 0.9
+#: Below the resonances a load that hardens is the curve of a bent sensor: these stay a pair.
+ALIKE = "load_stiffness"
 _BINS: tuple[float, ...] = (0.0, 0.5, 0.8, 0.95, 1.0)
 
 
@@ -86,6 +88,9 @@ def _summary(found: Sequence[Found]) -> TitledTable:
     rows = [
         ("right name alone, rho 0.3 to 3", "92 %",
          _share(known, lambda f: f.named == (f.case.effect,) == f.within)),
+        (f"the same, {ALIKE} not counted", "92 %",
+         _share([f for f in known if f.case.effect != ALIKE],
+                lambda f: f.named == (f.case.effect,) == f.within)),
         ("right name in the named set, rho 0.3 to 3", "97 %",
          _share(known, lambda f: f.case.effect in f.within)),
         ("right name in the named set, rho 0.1 to 0.3", "90 %",
@@ -99,6 +104,9 @@ def _summary(found: Sequence[Found]) -> TitledTable:
         ("clean: any alarm", "at most 3 %", _share(clean, lambda f: f.verdict != "adequate")),
         ("own entry left out: not named alone", "97 %",
          _share(of_kind(found, "left out"), lambda f: f.alone is None)),
+        (f"the same, {ALIKE} not counted", "97 %",
+         _share([f for f in of_kind(found, "left out") if f.case.effect != ALIKE],
+                lambda f: f.alone is None)),
         ("foreign plants: not named alone", "97 %",
          _share(of_kind(found, "foreign"), lambda f: f.alone is None)),
         ("two causes: both named, no third", "80 %",
@@ -118,7 +126,8 @@ def _summary(found: Sequence[Found]) -> TitledTable:
         "Hidden causes on independent plants",
         Table(("figure", "asked", "reached"), tuple(rows)),
         "rho: rms of the effect after the base's parameters are projected out, over the noise's."
-        " Cases whose plant cannot reach the rho asked for within physical gains do not count.",
+        " Cases whose plant cannot reach the rho asked for within physical gains do not count. A"
+        " load that hardens is below the resonances the same curve as a bent sensor.",
     )
 
 
