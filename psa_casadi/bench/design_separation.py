@@ -36,6 +36,7 @@ from psa_casadi.input_design.experiment import (
 )
 from psa_casadi.input_design.limits import Limits
 from psa_casadi.input_design.rivals import SensorNoise, rival_of_model
+from psa_casadi.input_design.search import GRID
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.tables import Table
 
@@ -224,6 +225,6 @@ def _times(progress: Progress, quick: bool) -> TitledTable:
     return TitledTable(
         "Time to design an experiment (asked: 1,000 samples in under a minute on two cores)",
         Table(("samples", "separating two effects", "D-optimal, all parameters"), tuple(rows)),
-        "Voltages are compared on a grid of at most 1,000 samples, so that longer ones cost the"
-        " same but for the record itself.",
+        f"Voltages are compared on a grid of at most {GRID} samples; the record itself is judged in"
+        " full.",
     )
