@@ -40,7 +40,7 @@ def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
 
 
 def _begun(record: Record, names: tuple[str, ...]) -> tuple[list[Round], Task]:
-    """Rounds that take the effects in this order, right or wrong."""
+    """A first round, with the base fitted and these effects screened, and its task."""
     table = tuple(EFFECTS[n] for n in names)
     experiments = (split(record),)
     base = fit_base(starting_model([record], None), experiments)
@@ -79,7 +79,7 @@ def test_a_needless_first_cause_leaves_the_second_as_good(tmp_path: Path) -> Non
 
 
 def test_a_wrong_first_cause_gives_way_beside_the_second(tmp_path: Path) -> None:
-    """A spring that hardens, taken for a sensor that bends while a mode still rang."""
+    """A spring that hardens, taken for a lost preload while a mode still rang."""
     make_record(
         "load_stiffness", 31003, tmp_path / "a.csv", visible=(1.0, 3.0),
         second="structural_mode", second_visible=(1.0, 3.0),

@@ -87,10 +87,10 @@ def _summary(found: Sequence[Found]) -> TitledTable:
     seconds = np.array([f.seconds for f in found])
     rows = [
         ("right name alone, rho 0.3 to 3", "92 %",
-         _share(known, lambda f: f.named == (f.case.effect,) == f.within)),
+         _share(known, lambda f: f.right_alone)),
         (f"the same, {ALIKE} not counted", "92 %",
          _share([f for f in known if f.case.effect != ALIKE],
-                lambda f: f.named == (f.case.effect,) == f.within)),
+                lambda f: f.right_alone)),
         ("right name in the named set, rho 0.3 to 3", "97 %",
          _share(known, lambda f: f.case.effect in f.within)),
         ("right name in the named set, rho 0.1 to 0.3", "90 %",
@@ -151,7 +151,7 @@ def _by_effect(found: Sequence[Found]) -> TitledTable:
 def _said(f: Found) -> str:
     if not f.named:
         return "-" if f.verdict == "adequate" else "?"
-    if f.named == (f.case.effect,) == f.within:
+    if f.right_alone:
         return "+" if f.verdict == "cause_named" else "(+)"
     if f.case.effect in f.within:
         return f"(+{len(f.within)})"

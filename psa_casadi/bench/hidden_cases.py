@@ -73,6 +73,11 @@ class Found:
         one = self.verdict == "cause_named" and len(self.named) == 1
         return self.named[0] if one else None
 
+    @property
+    def right_alone(self) -> bool:
+        """Whether the hidden effect is the one name, with no other as likely."""
+        return self.named == (self.case.effect,) == self.within
+
 
 def plants() -> tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]:
     """Return the maker of records, and the names of known and of foreign effects."""

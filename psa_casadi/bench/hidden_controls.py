@@ -50,7 +50,7 @@ def _figures(found: Sequence[Found]) -> tuple[str, ...]:
     mean = np.mean([f.confidence for f in stated] or [np.nan])
     right = np.mean([float(f.named[0] == f.case.effect) for f in stated] or [np.nan])
     return (
-        _of(sum(f.named == (f.case.effect,) == f.within for f in known), known),
+        _of(sum(f.right_alone for f in known), known),
         _of(sum(f.case.effect in f.within for f in known), known),
         _of(sum(f.verdict == "cause_named" and f.case.effect not in f.named for f in found), found),
         f"{100 * mean:.0f} %, {100 * right:.0f} %",

@@ -32,11 +32,12 @@ def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
         less = _without(last.fit, causes[k], task.experiments)
         if less is None:
             continue
-        if evidence(less, last.fit, last.screening.colour) < 0.0:
+        own = evidence(less, last.fit, last.screening.colour)
+        if own < 0.0:
             rebuilt = _rebuilt(rounds[0], [*causes[:k], *causes[k + 1 :]], less, task)
             if rebuilt is not None:
                 return reconsidered(rebuilt, task)
-        found, better = beside(rounds[k], last, less, task)
+        found, better = beside(rounds[k], last, less, own, task)
         if better is not None:
             causes[k] = better.effect
             rounds = _rebuilt(rounds[0], causes, better.fit, task) or rounds

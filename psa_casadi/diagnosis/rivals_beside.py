@@ -6,7 +6,7 @@ between those that are nearly as likely. Beside the second cause they show.
 
 from collections.abc import Mapping
 
-from psa_casadi.diagnosis.evidence import evidence, probabilities
+from psa_casadi.diagnosis.evidence import probabilities
 from psa_casadi.diagnosis.extension import Extension, extend_within, polish
 from psa_casadi.diagnosis.rounds import NEAR, RUNNER_UP, Round
 from psa_casadi.diagnosis.selection import MARGIN, out_of_character
@@ -19,27 +19,27 @@ RIVALS, _CLOSE = 3, 0.05
 
 
 def beside(
-    step: Round, last: Round, less: Fit, task: Task
+    step: Round, last: Round, less: Fit, own: float, task: Task
 ) -> tuple[dict[str, float], Extension | None]:
     """Return the evidence of a step's cause and of its rivals beside all others, and a better one.
 
     `last` holds all causes, `less` is its fit without the one of the `step`: the evidence is that
-    over `less`.
+    over `less`, `own` the cause's.
     """
     if step.chosen is None:
         return {}, None
-    own = step.chosen.effect.name
-    found = {own: evidence(less, last.fit, last.screening.colour)}
+    name = step.chosen.effect.name
+    found = {name: own}
     best: Extension | None = None
     for rival in _rivals(step, last):
-        task.progress(f"{rival.effect.name} in the place of {own}")
-        fitted = _in_place(rival, last, less, found[own], task)
+        task.progress(f"{rival.effect.name} in the place of {name}")
+        fitted = _in_place(rival, last, less, own, task)
         if fitted is None or out_of_character(fitted, task.experiments):
             continue
         found[rival.effect.name] = fitted.evidence
         if best is None or fitted.evidence > best.evidence:
             best = fitted
-    return found, best if best is not None and best.evidence > found[own] + MARGIN else None
+    return found, best if best is not None and best.evidence > own + MARGIN else None
 
 
 def weigh_again(step: Round, found: Mapping[str, float]) -> None:

@@ -155,8 +155,9 @@ def settle_on(
     current.extensions = [*others, extension]
     _sort(current)
     if task.method.imitators and current.extensions[0] is extension:
-        _imitators(current, 1 if first is None else 2, task)
-        _polish(current, 1 if first is None else 2, task)
+        number = 1 if first is None else 2
+        _imitators(current, number, task)
+        _polish(current, number, task)
     own = next(e for e in current.extensions if e.effect is extension.effect)
     ranked = _ranked(current, task, first)
     _weigh(current, ranked if own in ranked else [own, *ranked], task)
