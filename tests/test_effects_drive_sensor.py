@@ -212,17 +212,18 @@ def test_hum_costs_no_steps_and_is_nothing_without_a_start() -> None:
 
 
 @pytest.mark.parametrize("single", [False, True], ids=["cascade", "single mass"])
-def test_expansion_is_proportional_to_the_temperature(single: bool) -> None:
+def test_expansion_follows_the_temperature_with_its_lag(single: bool) -> None:
     base = stack(STACK)
     if single:
         kept = {n: v for n, v in base.values.items() if n in compose(SIMPLIFIED).values}
         base = compose(SIMPLIFIED, kept)
-    model = base.with_effect(TEMPERATURE, {"expansion_gain": 2e-3})
+    lag = 20.0
+    model = base.with_effect(TEMPERATURE, {"expansion_gain": 2e-3, "temperature_lag": lag})
     t = np.linspace(0.0, 1000.0, 1001)
-    rise = 3.0 * np.sin(0.01 * t)
-    found = simulated(model, t, np.zeros_like(t), temperature=ROOM + rise)
+    found = simulated(model, t, np.zeros_like(t), temperature=ROOM + 1.5 + 0.003 * t)
     shown = found["measured_displacement"]
-    np.testing.assert_allclose(shown, 2e-3 * rise * stroke(model), rtol=1e-9, atol=1e-20)
+    follows = 1.5 + 0.003 * (t - lag + lag * np.exp(-t / lag))
+    np.testing.assert_allclose(shown, 2e-3 * follows * stroke(model), rtol=1e-5, atol=0)
     assert not np.any(found["displacement"])
 
 
@@ -246,7 +247,8 @@ def test_at_the_reference_temperature_nothing_changes() -> None:
     for _ in range(10):
         x = base.state_nominals() * generator.normal(size=len(base.state_names))
         u = [generator.uniform(-30.0, 120.0), generator.uniform(-200.0, 200.0)]
-        warm = model.structure.f(0.0, x, [*u, ROOM], model.parameter_vector())
-        plain = base.structure.f(0.0, x, u, base.parameter_vector())
-        for ours, theirs in zip(warm, plain, strict=True):
-            np.testing.assert_array_equal(np.array(ours), np.array(theirs))
+        at_rest = np.append(x, 0.0)  # the stack is as warm as the thermometer
+        warm = model.structure.f(0.0, at_rest, [*u, ROOM], model.parameter_vector())
+        rates, outputs = base.structure.f(0.0, x, u, base.parameter_vector())
+        np.testing.assert_array_equal(np.array(warm[0]).ravel(), [*np.array(rates).ravel(), 0.0])
+        np.testing.assert_array_equal(np.array(warm[1]), np.array(outputs))

@@ -161,7 +161,7 @@ def test_the_noise_floor_takes_the_best_source() -> None:
     records = [record(u, y + LEVEL * rng.standard_normal(u.size)) for u, y in rows]
     residuals = [measured(r) - y for r, (_, y) in zip(records, rows, strict=True)]
     floors = noise_floor(records, residuals)
-    assert [f.source for f in floors] == ["repeats", "holds", "fast differences"]
+    assert [f.source for f in floors] == ["repeats", "holds", "fast part"]
     for floor in floors:
         assert floor.level == pytest.approx(LEVEL, rel=0.05)
         assert floor.autocovariance[0] == pytest.approx(floor.level**2)

@@ -5,6 +5,7 @@ the package and have other equations than its effects. The strength of an effect
 the base's parameters cannot absorb, over the rms of the noise.
 """
 
+import itertools
 import sys
 import tempfile
 import time
@@ -29,6 +30,8 @@ Kind = Literal["known", "weak", "clean", "left out", "foreign", "two", "poor"]
 ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
 #: Classes of voltages that show less than a rich one.
 POOR = ("sine", "triangle", "steps", "slow", "loops")
+#: Noises of the cases of one effect, in turn: most sensors' is white, many have a filter.
+NOISES = ("white", "ar", "white", "quantised", "drop-outs")
 
 
 @dataclass(frozen=True)
@@ -137,20 +140,29 @@ def _found(case: Case, d: Diagnosis, truth: Any, seconds: float) -> Found:
 
 
 def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: int) -> list[Case]:
-    """Return the cases of a study: every effect with `seeds` seeds, and others to match."""
-    draws = range(first, first + seeds)
-    few = draws[: max(1, seeds // 4)]
-    cases = [Case("known", e, s) for e in known for s in draws]
-    cases += [Case("weak", e, s, WEAK) for e in known for s in few]
-    cases += [Case("clean", None, first + k) for k in range(4 * seeds)]
-    cases += [Case("clean", None, first + 1000 + k, noise="ar") for k in range(4 * seeds)]
-    cases += [Case("left out", e, s) for e in known for s in few]
-    cases += [Case("foreign", e, s) for e in foreign for s in draws[: max(1, seeds // 2)]]
-    rng = np.random.default_rng(first)
-    for k in range(3 * seeds):
+    """Return the cases of a study: every effect with `seeds` seeds, and others to match.
+
+    No two cases have a seed, and so stack, voltage and noise, in common.
+    """
+    seed, rng = itertools.count(first), np.random.default_rng(first)
+    few, half = range(max(1, seeds // 4)), range(max(1, seeds // 2))
+    cases = [
+        Case("known", e, next(seed), noise=NOISES[k % len(NOISES)])
+        for e in known
+        for k in range(seeds)
+    ]
+    cases += [
+        Case("weak", e, next(seed), WEAK, noise=NOISES[k % len(NOISES)])
+        for k, e in enumerate(e for e in known for _ in few)
+    ]
+    for noise in ("white", "ar"):
+        cases += [Case("clean", None, next(seed), noise=noise) for _ in range(10 * seeds)]
+    cases += [Case("left out", e, next(seed)) for e in known for _ in few]
+    cases += [Case("foreign", e, next(seed)) for e in foreign for _ in half]
+    for _ in range(3 * seeds):
         one, other = rng.choice(known, 2, replace=False)
-        cases.append(Case("two", str(one), first + k, STRONG, str(other)))
+        cases.append(Case("two", str(one), next(seed), STRONG, str(other)))
     for k in range(4 * seeds):
-        effect, excitation = str(rng.choice(known)), POOR[k % len(POOR)]
-        cases.append(Case("poor", effect, first + k, excitation=excitation))
+        excitation = POOR[k % len(POOR)]
+        cases.append(Case("poor", str(rng.choice(known)), next(seed), excitation=excitation))
     return cases

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from psa_casadi.experiment.repeats import autoregression_of
+from psa_casadi.identification.noise import first_order_noise
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -37,6 +38,12 @@ class Colour:
         """
         each = [_at_rest(a) / _power(a) for a in self.autoregression]
         return max(1.0, float(np.average(each, weights=self.lengths)))
+
+    @property
+    def rms(self) -> float:
+        """Rms of the noise over all records [m]."""
+        powers = [_power(a) for a in self.autoregression]
+        return self.level * float(np.sqrt(np.average(powers, weights=self.lengths)))
 
     def whiten(self, signal: FloatArray) -> FloatArray:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
@@ -79,6 +86,29 @@ def colour_of(
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
     each = tuple(shared if own is None else own for own in given)
     return _with_level(each, remainder, lengths)
+
+
+def noise_rms(residual: FloatArray, colour: Colour) -> float:
+    """Return the rms of the noise in a residual [m], from its fast part, at most the colour's.
+
+    Of noise with a colour the fast part alone holds little; what no candidate explains may hold
+    more than noise.
+    """
+    return min(first_order_noise(residual)[0], colour.rms)
+
+
+def excess_power(residual: FloatArray, colour: Colour, floor: float | None = None) -> float:
+    """Return the power [m^2] of a residual above its noise, negative where that is less.
+
+    The noise's power is `floor`^2, or what `noise_rms` finds, and what that is uncertain by.
+    """
+    level = noise_rms(residual, colour) if floor is None else floor
+    return float(np.mean(residual**2)) - level**2 * (1.0 + uncertain(len(residual), colour))
+
+
+def uncertain(samples: int, colour: Colour) -> float:
+    """Return the relative standard error of the noise's power from its fast part, 2/sqrt(n)."""
+    return 2.0 * float(np.sqrt(colour.inflation / max(samples, 1)))
 
 
 def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:

@@ -7,7 +7,9 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.backward import reconsidered
+from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.errors_of import held_out_rms
+from psa_casadi.diagnosis.extension import extend_any
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.retries import (
     BETTER_BASE,
@@ -16,7 +18,7 @@ from psa_casadi.diagnosis.retries import (
     from_mode,
     from_resonances,
 )
-from psa_casadi.diagnosis.rounds import Round, examine, search_cause
+from psa_casadi.diagnosis.rounds import AFRESH, Round, decide, examine, search_cause
 from psa_casadi.diagnosis.selection import OF_FIRST
 from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.diagnosis.verdict import PARTLY, conclude
@@ -26,7 +28,6 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment, split, whole
 from psa_casadi.experiment.suspects import cleaned
 from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.refitting import Progress, refit
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import chosen_start
@@ -94,25 +95,58 @@ def _experiments(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[
 def _search(base: Fit, task: Task) -> list[Round]:
     """Forward selection: add the best effect until nothing is seen or nothing helps."""
     rounds = _forward(base, task)
+    tried = [rounds]
     if _open(rounds):
         better = from_resonances(rounds[0].fit, task.experiments, task.progress)
         if better is not None and better.rms < BETTER_BASE * rounds[0].fit.rms:
             rounds = _forward(better, task)
+            tried.append(rounds)
     if _open(rounds):
         before = rounds[-1].fit
         resonant = from_band(rounds[0].fit, before, task.experiments, task.progress)
         if resonant is not None:
-            other = _forward(resonant, task)
-            if other[-1].fit.rms < rounds[-1].fit.rms:
-                rounds = other
+            rounds = min(rounds, _forward(resonant, task), key=_left)
+    for earlier in tried:
+        if _open(rounds):
+            rounds = min(rounds, _any(earlier, task), key=_left)
     return _settle(reconsidered(rounds, task), task)
+
+
+def _left(rounds: Sequence[Round]) -> float:
+    """What the last of the rounds leaves, rms [m]."""
+    return rounds[-1].fit.rms
+
+
+def _any(rounds: list[Round], task: Task) -> list[Round]:
+    """Search on from the best of the effects that were not fitted afresh, if that leads further.
+
+    Where the base is bent to a missing effect the screening may rank that one far behind.
+    """
+    first = replace(rounds[0], extensions=list(rounds[0].extensions))
+    done = {e.effect.name for e in first.extensions[:AFRESH]}
+    scores = [s for n, s in first.screening.best_by_effect().items() if n not in done]
+    task.progress("cause 1: all other effects afresh")
+    found = extend_any(first.fit, task.experiments, scores, first.screening.colour)
+    if found is None:
+        return rounds
+    first.extensions = [e for e in first.extensions if e.effect is not found.effect] + [found]
+    decide(first, 1, task)
+    if first.chosen is None:
+        return rounds
+    other = _causes(
+        [first, examine(first.chosen.fit, first.chosen.predicted, task, first.trials)],
+        task,
+        retry=True,
+    )
+    return min(rounds, other, key=_left)
 
 
 def _open(rounds: Sequence[Round]) -> bool:
     """Whether structure remains and the causes found explain less than a partly one must."""
-    first, last = rounds[0].fit.rms ** 2, rounds[-1].fit.rms ** 2
-    excess = first - high_frequency_noise(rounds[-1].fit.residuals) ** 2
-    return rounds[-1].test.alarm and first - last < PARTLY * excess
+    first, last = rounds[0], rounds[-1]
+    floor = noise_rms(last.fit.residuals, last.screening.colour)
+    excess = excess_power(first.fit.residuals, last.screening.colour, floor)
+    return last.test.alarm and first.fit.rms**2 - last.fit.rms**2 < PARTLY * excess
 
 
 def _forward(base: Fit, task: Task) -> list[Round]:
@@ -123,16 +157,16 @@ def _forward(base: Fit, task: Task) -> list[Round]:
         resonant = from_resonances(first.fit, task.experiments, task.progress)
         if resonant is not None and resonant.rms < BETTER_BASE * first.fit.rms:
             first = _round(resonant, task)
-    return _causes(first, task, retry=True)
+    return _causes([first], task, retry=True)
 
 
-def _causes(start: Round, task: Task, *, retry: bool) -> list[Round]:
-    """Add the best effect until nothing is seen or nothing helps.
+def _causes(rounds: list[Round], task: Task, *, retry: bool) -> list[Round]:
+    """Add the best effect to the rounds so far until nothing is seen or nothing helps.
 
     With `retry` the base is fitted again from where an effect led; that base replaces the effect,
     unless it leaves structure that the effect would have explained.
     """
-    rounds, tried = [start], set[str]()
+    tried = set[str]()
     while len(rounds) <= MOST_CAUSES and _worth_searching(rounds):
         current = rounds[-1]
         first = rounds[0].chosen if len(rounds) > 1 else None
@@ -142,7 +176,7 @@ def _causes(start: Round, task: Task, *, retry: bool) -> list[Round]:
             break
         better = _retried(rounds, tried, task) if retry else None
         if better is not None:
-            other = _causes(_round(better, task), task, retry=False)
+            other = _causes([_round(better, task)], task, retry=False)
             if not other[-1].test.alarm or other[-1].fit.rms < AS_GOOD * chosen.fit.rms:
                 return other
         rounds.append(examine(chosen.fit, chosen.predicted, task, current.trials))

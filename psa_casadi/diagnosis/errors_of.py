@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
+from psa_casadi.diagnosis.colour import Colour, uncertain
 from psa_casadi.diagnosis.result import Errors, Gain
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.prediction import measured
@@ -31,6 +32,13 @@ def held_out_rms(experiments: Sequence[Experiment], predicted: Sequence[FloatArr
     return rms(np.concatenate(held_out_residuals(experiments, predicted)))
 
 
+def whole_residuals(
+    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return measured minus predicted [m] of every record, nan where nothing was measured."""
+    return [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
+
+
 def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> Errors:
     """Return the errors of a model's predictions of whole records."""
     train = np.concatenate(
@@ -50,6 +58,27 @@ def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
         holdout_max_m=float(np.max(np.abs(held))),
         holdout_nrmse_percent=100.0 * float(np.sqrt(squares / shares)),
     )
+
+
+def explained_share(
+    experiments: Sequence[Experiment],
+    before: Sequence[FloatArray],
+    after: Sequence[FloatArray],
+    floor: float,
+    colour: Colour,
+) -> float:
+    """Share of the excess power that the predictions `after` remove from those `before`, 0 to 1.
+
+    What is left in the held-out samples is compared with the excess over the whole records: how
+    much an effect does in a few blocks of one record is chance. What the noise's own power is
+    uncertain by is no excess.
+    """
+    errors = np.concatenate(whole_residuals(experiments, before))
+    valid = errors[np.isfinite(errors)]
+    noise = floor**2 * (1.0 + uncertain(len(valid), colour))
+    excess = float(np.mean(valid**2)) - noise
+    left = held_out_rms(experiments, after) ** 2 - noise
+    return float(np.clip(1.0 - left / excess, 0.0, 1.0)) if excess > 0 else float(left <= 0)
 
 
 def gain_of(

@@ -23,7 +23,7 @@ FloatArray = npt.NDArray[np.float64]
 #: ln B is divided by this, or by this share of the largest, before it becomes a probability: the
 #: effects are not the true equations, so that their evidence differs by more than noise, and the
 #: more the stronger the effect is. Checked by the reliability table of `psa bench diagnose`.
-TEMPERATURE, FORM = 3.0, 0.007
+TEMPERATURE, FORM = 2.0, 0.004
 #: The set of effects that cannot be told apart holds the cause with this probability.
 CREDIBLE = 0.95
 

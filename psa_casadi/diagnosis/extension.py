@@ -1,6 +1,6 @@
 """Fits with one more effect: from its trial directions, from another effect's fit, afresh."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -22,9 +22,9 @@ from psa_casadi.identification.starting import ordinary_values
 FloatArray = npt.NDArray[np.float64]
 
 #: Evaluations of quick fits beside another effect, and of those afresh that go on: the best so
-#: many; there the gain begins at so many ordinary sizes.
+#: many, of one effect and of any; there the gain begins at so many ordinary sizes.
 _COPY, _AFRESH = 12, 17
-_CONTINUED, _ORDINARY = 2, 2.5
+_CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Tolerance of stepper and fit, and evaluations, to the end.
 _POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
 
@@ -112,31 +112,62 @@ def extend_afresh(
     A base fit without the effect has bent its loop and its lags to imitate it, and may hold the
     search there. Where the gain acts by thresholds or lags, it starts at their steps as well.
     """
-    effect = first.effect
+    fits = _from_ordinary(before, experiments, first.effect, first.fit.model.values)
+    final = _best_continued(fits, experiments, _CONTINUED)
+    if final is None or final.cost >= first.fit.cost:
+        return first
+    return _extension(before, final, first.effect, experiments, colour)
+
+
+def extend_any(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    scores: Sequence[Score],
+    colour: Colour,
+) -> Extension | None:
+    """Fit the effects of the scores afresh, as `extend_afresh` does, and return the best of all."""
+    fits: list[Fit] = []
+    for score in scores:
+        effect = score.direction.effect
+        fits += _from_ordinary(before, experiments, effect, score.direction.values)
+    final = _best_continued(fits, experiments, _CONTINUED_ANY)
+    if final is None:
+        return None
+    effect = next(e for e in final.model.components if e not in before.model.components)
+    return _extension(before, final, effect, experiments, colour)
+
+
+def _from_ordinary(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    effect: Component,
+    known: Mapping[str, float],
+) -> list[Fit]:
+    """Quick fits from an ordinary base and gains; forms and frequencies are the `known` ones."""
     gain = next(p for p in effect.parameters if p.name == effect.gain)
     size = gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
     sizes = [_ORDINARY, *(s for s in effect.finite_step if s > _ORDINARY)]
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
     values = {
-        n: first.fit.model.values[n]
-        if isinstance(grid, str) or n in FIXED
-        else _declared(effect, n)
+        n: known[n] if isinstance(grid, str) or n in FIXED else _declared(effect, n)
         for n, grid in effect.probe.items()
     }
     ordinary = ordinary_values(before.model, [e.record for e in experiments])
-    fits: list[Fit] = []
-    for s in sizes:
-        start = (values, s * size, tuple(before.starts()))
-        found = fit_from(before, experiments, effect, start, ordinary, QUICK)
-        fits += [found] if found is not None else []
-    for quick in sorted(fits, key=lambda f: f.cost)[:_CONTINUED]:
+    starts = [(values, s * size, tuple(before.starts())) for s in sizes]
+    found = [fit_from(before, experiments, effect, s, ordinary, QUICK) for s in starts]
+    return [f for f in found if f is not None]
+
+
+def _best_continued(
+    fits: Sequence[Fit], experiments: Sequence[Experiment], count: int
+) -> Fit | None:
+    """Go on with the best so many fits; return the best then."""
+    ended = list(fits)
+    for quick in sorted(fits, key=lambda f: f.cost)[:count]:
         with suppress(PsaError):
-            fits.append(continued(quick, experiments, QUICK_RTOL, 1e-3, _AFRESH))
-    final = min(fits, key=lambda f: f.cost, default=None)
-    if final is None or final.cost >= first.fit.cost:
-        return first
-    return _extension(before, final, effect, experiments, colour)
+            ended.append(continued(quick, experiments, QUICK_RTOL, 1e-3, _AFRESH))
+    return min(ended, key=lambda f: f.cost, default=None)
 
 
 def polish(

@@ -1,4 +1,4 @@
-"""The noise floor of every record: from repeats, from holds, or from fast differences."""
+"""The noise floor of every record: from repeats, from holds, or from the fast part."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,18 +8,21 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.diagnosis.colour import Colour, noise_rms
 from psa_casadi.experiment.quantum import quantum_of
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.repeats import MeasuredNoise, holds, repeats
-from psa_casadi.identification.noise import high_frequency_noise
+from psa_casadi.identification.noise import first_order_noise
 
 FloatArray = npt.NDArray[np.float64]
-Source = Literal["repeats", "holds", "fast differences"]
+Source = Literal["repeats", "holds", "fast part"]
 
 #: Fewer samples than this give no level to a few per cent.
 ENOUGH = 200
 #: Noise is called white where no autocorrelation exceeds this.
 VISIBLE = 0.1
+#: Lags of the autocovariance that a first-order autoregression is given with.
+_LAGS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,21 +49,24 @@ def noise_floor(
 ) -> tuple[NoiseFloor, ...]:
     """Return the noise floor of every record, from the best source that it offers.
 
-    Repeats come first, then holds: no model is involved in them. Else the third differences of the
-    residual (n,), nan where nothing counts, show the white part of the noise, which is a lower
-    bound. No level is below quantum/sqrt(12), the rms of rounding to a quantum.
+    Repeats come first, then holds: no model is involved in them. Else the fast part of the residual
+    (n,), nan where nothing counts, shows the noise, white or of first order (`first_order_noise`).
+    No level is below quantum/sqrt(12), the rms of rounding to a quantum.
     """
     return tuple(_floor(r, e) for r, e in zip(records, residuals, strict=True))
 
 
-def pooled_level(noise: Sequence[NoiseFloor], residuals: Sequence[FloatArray]) -> float:
+def pooled_level(
+    noise: Sequence[NoiseFloor], residuals: Sequence[FloatArray], colour: Colour
+) -> float:
     """Return the rms of the noise over all records [m].
 
-    Where no voltage was repeated that of the residual's fast differences counts: a hold may ring.
+    Where no voltage was repeated that of the residual's fast part counts, at most that of noise of
+    the given colour: a hold may ring.
     """
     counts = [np.count_nonzero(np.isfinite(e)) for e in residuals]
     powers = [
-        n.level**2 if n.source == "repeats" else high_frequency_noise(e[np.isfinite(e)]) ** 2
+        n.level**2 if n.source == "repeats" else noise_rms(e[np.isfinite(e)], colour) ** 2
         for n, e in zip(noise, residuals, strict=True)
     ]
     return float(np.sqrt(np.average(powers, weights=counts)))
@@ -86,8 +92,9 @@ def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
     quantum = quantum_of(y[np.isfinite(y)]) if y is not None else None
     source, found, how = _source(record)
     if found is None:
-        level = high_frequency_noise(valid) if valid.size else 0.0
-        found = MeasuredNoise(level, np.array([level**2]), np.zeros(0), valid.size)
+        level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
+        covariance = np.asarray(level**2 * r ** np.arange(_LAGS if r > 0 else 1), np.float64)
+        found = MeasuredNoise(level, covariance, np.array([r] if r > 0 else []), valid.size)
     rounding = (quantum or 0.0) / float(np.sqrt(12.0))
     level, covariance = found.level, found.autocovariance.copy()
     if level < rounding:
@@ -99,7 +106,7 @@ def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
         f"The noise of {record.name} is {quantity(level, record.displacement_unit)} rms, {how}"
         f" ({found.samples} samples)"
     )
-    said += f", and {colour}." if source != "fast differences" else "."
+    said += f", and {colour}."
     if quantum is not None:
         step = quantity(quantum, record.displacement_unit)
         least = quantity(rounding, record.displacement_unit)
@@ -120,7 +127,7 @@ def _source(record: Record) -> tuple[Source, MeasuredNoise | None, str]:
     if still is not None and still.samples >= ENOUGH:
         spans = "a held voltage" if still.count == 1 else f"{still.count} held voltages"
         return "holds", still, f"from {spans} after smooth creep is taken off"
-    return "fast differences", None, "from differences between neighbouring samples, its white part"
+    return "fast part", None, "from the fast part of what the model leaves"
 
 
 def figure(value: float) -> str:

@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.colour import residual_colour
-from psa_casadi.diagnosis.errors_of import held_out_rms
+from psa_casadi.diagnosis.colour import excess_power, noise_rms, residual_colour
 from psa_casadi.diagnosis.evidence import bic_probabilities, estimated, probabilities
 from psa_casadi.diagnosis.extension import (
     Extension,
@@ -24,7 +23,6 @@ from psa_casadi.diagnosis.screening import Screening, copies, screen
 from psa_casadi.diagnosis.selection import choose, leading
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.noise import high_frequency_noise
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -79,8 +77,8 @@ def examine(
     screening = _screened(fit, kept, task)
     voltage = np.concatenate([e.record.voltage[e.used] for e in task.experiments])
     time = np.concatenate([e.record.time[e.used] for e in task.experiments])
-    floor = high_frequency_noise(fit.residuals)
-    test = omnibus(fit.residuals, voltage, time, screening.colour, floor)
+    floor = noise_rms(fit.residuals, screening.colour)
+    test = omnibus(fit.residuals, voltage, time, screening.colour, floor, even=bool(known))
     guess = estimated(fit, screening)
     return Round(
         fit,
@@ -118,6 +116,12 @@ def search_cause(current: Round, number: int, task: Task, first: Extension | Non
             current.extensions.append(extension)
     _sort(current)
     _afresh(current, number, task)
+    decide(current, number, task, first)
+
+
+def decide(current: Round, number: int, task: Task, first: Extension | None = None) -> None:
+    """Fit the best extensions to the end and what could look like them, and choose."""
+    _sort(current)
     _polish(current, number, task)
     if current.extensions and task.method.imitators:
         _imitators(current, number, task)
@@ -129,8 +133,8 @@ def search_cause(current: Round, number: int, task: Task, first: Extension | Non
 
 def _afresh(current: Round, number: int, task: Task) -> None:
     """Fit extensions afresh, the best first, until one of them explains nearly everything."""
-    floor = high_frequency_noise(current.fit.residuals)
-    excess = current.fit.rms**2 - floor**2
+    floor = noise_rms(current.fit.residuals, current.screening.colour)
+    excess = excess_power(current.fit.residuals, current.screening.colour, floor)
     count = AFRESH if number == 1 else AFRESH_FURTHER
     for k, extension in enumerate(current.extensions[:count]):
         best = max(current.extensions, key=lambda e: e.removed)
@@ -165,10 +169,10 @@ def settle_on(
 
 
 def _ranked(current: Round, task: Task, first: Extension | None) -> list[Extension]:
-    floor = high_frequency_noise(current.fit.residuals)
-    before = held_out_rms(task.experiments, current.predicted)
     colour = current.screening.colour
-    return choose(current.extensions, task.experiments, current.fit, before, floor, colour, first)
+    return choose(
+        current.extensions, task.experiments, current.fit, current.predicted, colour, first
+    )
 
 
 def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:

@@ -1,11 +1,13 @@
 """Which effects are fitted, and the choice among them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.colour import Colour
+from psa_casadi.diagnosis.colour import Colour, excess_power
+from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.diagnosis.screening import Score, Screening
 from psa_casadi.experiment.drive import among_harmonics
@@ -23,10 +25,14 @@ _STARTS = 2
 _WORTH = 0.1
 #: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
 MARGIN = 3.0
-#: Share of the excess power that an effect must remove to be added.
-WORTHWHILE = 0.25
-#: Gain in log-likelihood of the held-out samples that a first and a further effect must bring.
+#: Share of the excess power that an effect must remove to be added, and share of what the best one
+#: removes that will do for its rivals.
+WORTHWHILE, _NEARLY = 0.25, 0.8
+#: Gain in log-likelihood of the held-out samples that a first effect, if these samples can show
+#: that, and a further effect must bring.
 HELD_OUT, HELD_OUT_FURTHER = 1.0, 4.0
+#: Evidence from which on held-out samples that hardly show an effect do not speak against it.
+_CLEAR = 8.0
 #: A further effect must remove this share of what the first one did: less may be the first one's
 #: form, which is not the true one.
 OF_FIRST = 0.05
@@ -46,49 +52,91 @@ def leading(screening: Screening) -> list[tuple[str, list[Score]]]:
 
 
 def starts_of(screening: Screening, name: str) -> list[Score]:
-    """Return the best directions of one effect, from which its fits start."""
+    """Return the best directions of one effect, from which its fits start.
+
+    Of an effect that has two forms, between which no fit moves, each form gets a start.
+    """
     own = [s for s in screening.scores if s.direction.effect.name == name]
+    near = [s for s in own if s.decrease >= 0.3 * own[0].decrease]
     starts: list[Score] = []
-    for score in own:
+    for score in near:
+        if all(_form(score) != _form(s) for s in starts):
+            starts.append(score)
+    for score in near:
         known = [s.direction.values for s in starts]
         new = score.direction.values not in known or score.direction.finite
-        if new and len(starts) < _STARTS and score.decrease >= 0.3 * own[0].decrease:
+        if new and score not in starts and len(starts) < _STARTS:
             starts.append(score)
     return starts
+
+
+def _form(score: Score) -> dict[str, float]:
+    return {n: v for n, v in score.direction.values.items() if n in FIXED}
 
 
 def choose(
     extensions: Sequence[Extension],
     experiments: Sequence[Experiment],
     before: Fit,
-    before_holdout: float,
-    floor: float,
+    predicted: Sequence[FloatArray],
     colour: Colour,
     first: Extension | None,
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
     Worth having: evidence; the effect in character; a share of the training residual's power above
-    the noise `floor` removed; and held-out data predicted better. A further cause, beside the
+    the noise removed, or nearly what another one removes that does; and held-out data predicted
+    better than by the model `before`, whose predictions are given. A further cause, beside the
     `first`, must also remove a share of what that one did. The order is that of the evidence;
     within the margin the better prediction leads.
     """
-    excess = before.rms**2 - floor**2
-    needed = HELD_OUT if first is None else HELD_OUT_FURTHER
-    held = sum(int(e.held_out.sum()) for e in experiments) / colour.inflation
-    good = [
+    least = WORTHWHILE * max(0.0, excess_power(before.residuals, colour))
+    held = _HeldOut(experiments, predicted, colour)
+    fit = [
         e
         for e in extensions
         if e.evidence > 0
         and not out_of_character(e, experiments)
-        and e.removed > WORTHWHILE * excess
         and (first is None or e.removed > OF_FIRST * first.removed)
-        and held * np.log(before_holdout / max(e.holdout_rms, 1e-300)) > needed
+        and held.gained(e) > (held.promised(e) if first is None else HELD_OUT_FURTHER)
     ]
+    most = max((e.removed for e in fit), default=0.0)
+    good = [e for e in fit if most > least and e.removed > min(least, _NEARLY * most)]
     good.sort(key=lambda e: -e.evidence)
     close = [e for e in good if good[0].evidence - e.evidence < MARGIN]
     close.sort(key=lambda e: e.holdout_rms)
     return close + [e for e in good if e not in close]
+
+
+@dataclass(frozen=True)
+class _HeldOut:
+    """Held-out samples, what a model predicts there, and the colour of the noise."""
+
+    experiments: Sequence[Experiment]
+    predicted: Sequence[FloatArray]
+    colour: Colour
+
+    def gained(self, e: Extension) -> float:
+        """Log-likelihood that an extension gains there."""
+        before = held_out_rms(self.experiments, self.predicted)
+        return self._samples() * float(np.log(before / max(e.holdout_rms, 1e-300)))
+
+    def promised(self, e: Extension) -> float:
+        """What it must gain: `HELD_OUT`, or less where clear evidence does little to these samples.
+
+        A change of prediction with the sum of squares D promises p = D/2 over the noise's power,
+        give or take sqrt(2 p); two such errors less will do.
+        """
+        if e.evidence < _CLEAR:
+            return HELD_OUT
+        pairs = zip(e.predicted, self.predicted, self.experiments, strict=True)
+        change = np.concatenate([(new - old)[x.held_out] for new, old, x in pairs])
+        share = float(np.mean(change**2)) / e.holdout_rms**2 if change.size else 0.0
+        promise = 0.5 * self._samples() * share
+        return min(HELD_OUT, promise - 2.0 * float(np.sqrt(2.0 * promise)))
+
+    def _samples(self) -> float:
+        return sum(int(e.held_out.sum()) for e in self.experiments) / self.colour.inflation
 
 
 def out_of_character(extension: Extension, experiments: Sequence[Experiment]) -> bool:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.contenders import contenders
-from psa_casadi.diagnosis.errors_of import errors_of, gain_of, held_out_rms
+from psa_casadi.diagnosis.errors_of import errors_of, explained_share, gain_of, whole_residuals
 from psa_casadi.diagnosis.evidence import CREDIBLE, credible_set
 from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
@@ -27,7 +27,6 @@ from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
-from psa_casadi.identification.prediction import measured
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,11 +43,13 @@ def conclude(
     """Judge the rounds of a search and return the diagnosis."""
     first, last = rounds[0], rounds[-1]
     chosen = [r for r in rounds if r.chosen is not None]
-    errors = _whole_residuals(experiments, last.predicted)
-    base_errors = _whole_residuals(experiments, first.predicted)
+    errors = whole_residuals(experiments, last.predicted)
+    base_errors = whole_residuals(experiments, first.predicted)
     noise = noise_floor([e.record for e in experiments], errors)
-    floor = pooled_level(noise, errors)
-    share = _explained_share(experiments, first, last, floor)
+    floor = pooled_level(noise, errors, last.screening.colour)
+    share = explained_share(
+        experiments, first.predicted, last.predicted, floor, last.screening.colour
+    )
     missing = first.test.alarm or first.chosen is not None
     verdict: Verdict
     if not missing:
@@ -71,7 +72,9 @@ def conclude(
             r.chosen,
             last.fit,
             found,
-            _explained_share(experiments, r, after, floor),
+            explained_share(
+                experiments, r.predicted, after.predicted, floor, after.screening.colour
+            ),
             partly=verdict == "partly_explained",
         )
         for r, after in zip(named, rounds[1:], strict=False)
@@ -107,13 +110,6 @@ def conclude(
     )
 
 
-def _whole_residuals(
-    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """Return measured minus predicted [m] of every record, nan where nothing was measured."""
-    return [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
-
-
 def _misfits(
     experiments: Sequence[Experiment],
     errors: Sequence[FloatArray],
@@ -124,16 +120,6 @@ def _misfits(
         for e, error, floor in zip(experiments, errors, noise, strict=True)
         if np.count_nonzero(np.isfinite(error)) >= FEWEST
     )
-
-
-def _explained_share(
-    experiments: Sequence[Experiment], first: Round, last: Round, floor: float
-) -> float:
-    """Share of the held-out excess power that the extension removes, between 0 and 1."""
-    before = held_out_rms(experiments, first.predicted)
-    after = held_out_rms(experiments, last.predicted)
-    excess = before**2 - floor**2
-    return float(np.clip((before**2 - after**2) / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
 
 def _told_from(r: Round) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ _NARROWEST = 0.025
 _RATIOS = (1.0, 2.0, 4.0)
 
 
-def _stop(s: Symbols, z: Expression, threshold: Expression) -> Expression:
+def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
     """Rate of a smooth stop element: z' = u' - (|u'| sgn(z) + u') / 2 * |z / threshold|^m."""
     ratio = z / threshold
     return s.voltage_rate - 0.5 * (
@@ -29,7 +29,7 @@ def _equations(s: Symbols) -> Equations:
     weighted = s.z_m1 + s.memory_weight_2 * s.z_m2 + s.memory_weight_3 * s.z_m3
     return Equations(
         der={
-            name: _stop(s, z, ratio * first)
+            name: stop_rate(s, z, ratio * first)
             for (name, z), ratio in zip(elements.items(), _RATIOS, strict=True)
         },
         add={"free_force": s.k_L * s.memory_gain * weighted},

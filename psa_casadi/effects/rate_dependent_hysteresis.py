@@ -1,22 +1,46 @@
 """Rate-dependent hysteresis: the loop's width changes with the logarithm of the voltage rate.
 
-The hysteresis force acts c-fold, c = exp(rate_gain L) with L = lg sqrt(1 + (u'/(rate_onset
-u_rated))^2), the decades above the onset, at every amplitude alike. A positive gain widens loops
-and lowers the stroke as the rate rises. The rate acts at once and leaves the memory as it is: of
-play operators whose thresholds grow with the rate this explains two thirds, coefficients scaled in
-the equation of f_H a third, as those keep what a past rate did.
+Two forms, of which one is tried after the other, with c - 1 = exp(rate_gain L) - 1 and
+L = lg sqrt(1 + (u'/(rate_onset u_rated))^2), the decades above the onset:
+
+* the hysteresis force acts c-fold, at every amplitude alike;
+* play elements' thresholds w grow c-fold (Al Janaideh): what is added is nothing after a reversal,
+  and (c - 1) w behind the motion once the element moves, whatever the amplitude.
+
+A positive gain widens loops and lowers the stroke as the rate rises. The rate acts at once and
+leaves the memory as it is.
 """
 
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.variables import Parameter
+from psa_casadi.effects.hysteresis_memory import stop_rate
+from psa_casadi.scales import voltage_scale
+from psa_casadi.smooth import direction, magnitude_power, signed_power
+from psa_casadi.variables import Parameter, State, Values
+
+#: Force over voltage of the play elements, over k_L: loops of some 10 % of the stroke.
+_SHARE = 0.3
+#: How steeply the force sets in where the stop element comes to its end.
+_ONSET = 6.0
 
 
 def _equations(s: Symbols) -> Equations:
     relative = s.voltage_rate / (s.rate_onset * s.u_rated)
-    decades = 0.5 * ca.log10(1 + relative**2)
-    return Equations(add={"free_force": (ca.exp(s.rate_gain * decades) - 1) * s.f_H})
+    grown = ca.exp(s.rate_gain * 0.5 * ca.log10(1 + relative**2)) - 1
+    width = s.rate_threshold * s.u_rated
+    at_end = magnitude_power(s.z_r / width, _ONSET)
+    same_way = 0.5 * (direction(s) + signed_power(s.z_r / width, 1.0))
+    behind = -_SHARE * s.k_L * width * at_end * same_way
+    force = s.f_H + s.rate_by_threshold * (behind - s.f_H)
+    return Equations(
+        der={"z_r": stop_rate(s, s.z_r, width)},
+        add={"free_force": grown * force},
+    )
+
+
+def _stop_scale(p: Values) -> float:
+    return 0.1 * voltage_scale(p)
 
 
 RATE_DEPENDENT_HYSTERESIS = Component(
@@ -24,11 +48,14 @@ RATE_DEPENDENT_HYSTERESIS = Component(
     description="loop width and stroke change with the logarithm of the voltage rate",
     source=(
         "Damjanovic, Phys. Rev. B 55 (1997) R649: logarithm of frequency; elements that grow with"
-        " the rate: Ang, Khosla and Riviere, IEEE/ASME Trans. Mechatronics 12 (2007) 134"
+        " the rate: Ang, Khosla and Riviere, IEEE/ASME Trans. Mechatronics 12 (2007) 134;"
+        " thresholds that do: Al Janaideh, Su and Rakheja, Smart Mater. Struct. 17 (2008) 035026"
     ),
     gain="rate_gain",
     equation_text=(
-        "force gains (c - 1) f_H,  c = (1 + (u'/(rate_onset u_rated))^2)^(rate_gain/(2 ln 10))"
+        "force gains (c - 1) f_H,  c = (1 + (u'/(rate_onset u_rated))^2)^(rate_gain/(2 ln 10)),  or"
+        " where rate_by_threshold = 1  -(c - 1) 0.3 k_L w |z/w|^6 (sgn(u') + z/w)/2,"
+        "  z' = u' - (|u'| sgn(z) + u')/2 (|z|/w)^4,  w = rate_threshold u_rated"
     ),
     parameters=(
         Parameter(
@@ -47,8 +74,27 @@ RATE_DEPENDENT_HYSTERESIS = Component(
             "rate over rated voltage, below which the loop no longer changes",
             log=True,
         ),
+        Parameter(
+            "rate_threshold",
+            0.1,
+            "1",
+            (0.01, 1.0),
+            "threshold of the elements over rated voltage",
+            log=True,
+        ),
+        Parameter("rate_by_threshold", 0.0, "1", (0.0, 1.0), "0: the loop grows, 1: thresholds do"),
+    ),
+    states=(
+        State(
+            "z_r",
+            "V",
+            "stop element of the thresholds that grow",
+            _stop_scale,
+            memory=True,
+            settles=False,
+        ),
     ),
     equations=_equations,
-    probe={"rate_onset": (0.1, 3.0)},
+    probe={"rate_onset": (0.1, 3.0), "rate_by_threshold": (0.0, 1.0)},
     looks_like="loops grow wider, or narrower, by the same share with every decade of rate",
 )

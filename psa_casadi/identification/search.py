@@ -24,7 +24,7 @@ from psa_casadi.model.compose import Model
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "c")
 #: Parameters of effects that only set a scale, or choose between two forms, and are never fitted.
-FIXED = frozenset({"drift_span", "temperature_reference", "ageing_by_travel"})
+FIXED = frozenset({"drift_span", "temperature_reference", "ageing_by_travel", "rate_by_threshold"})
 
 #: Where there are more starts than finalists, all get the first evaluations, those the rest.
 _QUICK, _FINALISTS, _FIRST = 12, 3, 5

@@ -2,12 +2,12 @@
 record.
 
     T(t) = T_0 + D (1 - exp(-t/tau)) + random walk           thermometer, a column of the record
-    tau_f T_f' + T_f = T - T(0)                               frame
+    (tau_f/2 s + 1)^2 T_f = T - T(0)                           frame, through a wall
     x -> x + g T_f (1 + b x/S)
 
 g: expansion for each kelvin; b: share by which it grows over the range S (gain of the ceramic).
 Source: frames of 10-20 ppm/K and 10-40 mm. Not the project's form: the frame follows the
-thermometer with a lag.
+thermometer through two lags in series, a coarse wall.
 """
 
 import numpy as np
@@ -48,11 +48,11 @@ def room(times: FloatArray, parameters: Parameters) -> FloatArray:
 def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
     """Displacement by temperature, (N,) [m]; g in m/K."""
     air = room(run.times, parameters)
-    lag = parameters["tau_f"]
-    frame = (
-        first_order(-1.0 / lag + 0j, air - air[0], float(run.times[1] - run.times[0])).real / lag
-    )
-    return gain * frame * (1.0 + parameters["b"] * run.displacement / parameters["span"])
+    frame, lag = air - air[0], 0.5 * parameters["tau_f"]
+    for _ in range(2):
+        frame = first_order(-1.0 / lag + 0j, frame, float(run.times[1] - run.times[0])).real / lag
+    grown = 1.0 + parameters["b"] * run.displacement / parameters["span"]
+    return np.asarray(gain * frame * grown, dtype=np.float64)
 
 
 TEMPERATURE = HiddenEffect(

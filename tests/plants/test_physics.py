@@ -219,11 +219,14 @@ def test_hum_is_a_line_and_its_third_harmonic(run: Run) -> None:
     assert np.allclose(waves @ found, hum, atol=1e-15)
 
 
-def test_frame_follows_the_thermometer_with_its_lag(run: Run) -> None:
+def test_frame_follows_the_thermometer_through_the_wall(run: Run) -> None:
+    """y = d L^-1{p^2/(s + p)^2 (1/s - 1/(s + a))}, a = 1/tau, p = 2/tau_f."""
     parameters = {**temperature.draw(np.random.default_rng(1), run), "walk": 0.0, "b": 0.0}
-    d, tau, lag = (parameters[name] for name in ("d", "tau", "tau_f"))
+    d, a, p = parameters["d"], 1.0 / parameters["tau"], 2.0 / parameters["tau_f"]
+    t, decay = run.times - run.times[0], np.exp(-p * (run.times - run.times[0]))
+    slow = (p / (p - a)) ** 2 * (np.exp(-a * t) - (1.0 + (p - a) * t) * decay)
     grown = temperature.contribution(run, parameters, 1e-7)
-    share = (tau * np.exp(-run.times / tau) - lag * np.exp(-run.times / lag)) / (tau - lag)
-    assert np.allclose(grown, 1e-7 * d * (1.0 - share), atol=1e-5 * np.ptp(grown))
+    expected = 1e-7 * d * (1.0 - (1.0 + p * t) * decay - slow)
+    assert np.allclose(grown, expected, atol=1e-5 * np.ptp(grown))
     room = temperature.room(run.times, {**parameters, "walk": 0.3})
     assert np.std(np.diff(room)) > 2.0 * np.std(np.diff(temperature.room(run.times, parameters)))

@@ -1,0 +1,99 @@
+"""Noise with a colour: its level from a residual's fast part, and a cause named beside it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import psa_casadi as psa
+from psa_casadi.diagnosis.colour import Colour, colour_of, excess_power, noise_rms
+from psa_casadi.diagnosis.omnibus import omnibus
+from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.noise import first_order_noise, high_frequency_noise
+from psa_casadi.units import FloatArray
+from tests.plants.make import make_record
+from tests.plants.noise import coloured
+
+N = 6000
+TIME = np.linspace(0.0, 6.0, N, endpoint=False)
+VOLTAGE = 50.0 * (1.0 - np.cos(2.0 * np.pi * TIME))
+
+
+def noise(correlation: float, seed: int = 4) -> FloatArray:
+    return coloured(np.random.default_rng(seed).standard_normal(N), correlation)
+
+
+@pytest.mark.parametrize(("correlation", "within"), [(0.3, 0.06), (0.6, 0.12)])
+def test_the_level_of_coloured_noise_shows_in_its_fast_part(
+    correlation: float, within: float
+) -> None:
+    for seed in range(8):
+        rms, found = first_order_noise(noise(correlation, seed))
+        assert rms == pytest.approx(1.0, rel=within)
+        assert found == pytest.approx(correlation, abs=within)
+    assert high_frequency_noise(noise(0.6)) < 0.6
+
+
+def test_white_noise_stays_white_whatever_is_slow_beside_it() -> None:
+    triangle = 2.0 * np.abs((TIME / 0.15) % 2.0 - 1.0)
+    steps = np.sign(np.sin(2.0 * np.pi * 1.4 * TIME))
+    tone = np.sin(2.0 * np.pi * 157.0 * TIME)
+    for misfit in (0.0 * TIME, triangle, steps, tone):
+        for seed in range(4):
+            rms, found = first_order_noise(noise(0.0, seed) + misfit)
+            assert found == 0.0
+            assert rms == pytest.approx(1.0, rel=0.06)
+
+
+def test_a_short_or_constant_signal_has_a_level_too() -> None:
+    short = noise(0.0)[:100]
+    assert first_order_noise(short) == (high_frequency_noise(short), 0.0)
+    assert first_order_noise(np.zeros(N)) == (0.0, 0.0)
+
+
+def test_what_is_above_coloured_noise_is_its_excess() -> None:
+    e = noise(0.7)
+    colour = colour_of(e, [N])
+    assert colour.rms == pytest.approx(np.std(e), rel=0.03)
+    assert abs(excess_power(e, colour)) < 0.25
+    more = e + np.sqrt(2.0) * np.sin(2.0 * np.pi * TIME)
+    assert excess_power(more, colour) == pytest.approx(1.0, abs=0.25)
+    assert noise_rms(more, colour) <= colour.rms
+
+
+def _size_test(
+    residual: FloatArray, *, even: bool = True, lengths: tuple[int, ...] = (N,)
+) -> float:
+    colour = Colour(tuple(np.zeros(0) for _ in lengths), 1.0, lengths)
+    return omnibus(residual, VOLTAGE, TIME, colour, 1.0, even=even).p_value
+
+
+def test_noise_of_one_size_is_no_misfit_and_noise_after_reversals_only_is() -> None:
+    """What a colour swallows of a misfit is larger where the misfit is."""
+    quiet = [_size_test(noise(0.0, seed)) for seed in range(20)]
+    assert min(quiet) > 1e-3
+    after = 1.0 + np.exp(-((TIME % 0.5) / 0.05))
+    assert _size_test(after * noise(0.0)) < 1e-6
+    assert _size_test(after * noise(0.0), even=False) > 1e-3
+
+
+def test_records_may_differ_in_the_size_of_their_noise() -> None:
+    two = np.repeat([1.0, 3.0], N // 2) * noise(0.0)
+    assert _size_test(two) < 1e-6
+    assert _size_test(two, lengths=(N // 2, N // 2)) > 1e-3
+
+
+def test_a_cause_is_named_beside_coloured_noise(tmp_path: Path) -> None:
+    """It removes a fifth of the residual; the rest looks like excess if noise were white."""
+    path = tmp_path / "record.csv"
+    truth = make_record("field_dependent_gain", 110, path, noise="ar", visible=(0.3, 3.0))
+    table = [EFFECTS[n] for n in ("field_dependent_gain", "saturation_of_strain", "slow_creep")]
+    found = psa.diagnose([psa.read_record(path)], effects=table)
+    assert found.verdict == "cause_named"
+    assert [c.effect for c in found.causes] == ["field_dependent_gain"]
+    assert found.noise_floor_rms_m == pytest.approx(truth.sigma, rel=0.1)
+    white = np.asarray(
+        lfilter([1.0, -truth.noise.correlation], [1.0], found.extended_fit.residuals)
+    )
+    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
