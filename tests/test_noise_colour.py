@@ -10,7 +10,7 @@ import psa_casadi as psa
 from psa_casadi.diagnosis.colour import Colour, colour_of, excess_power, noise_rms
 from psa_casadi.diagnosis.omnibus import omnibus
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.noise import first_order_noise, high_frequency_noise
+from psa_casadi.experiment.noise import first_order_noise, high_frequency_noise
 from psa_casadi.units import FloatArray
 from tests.plants.make import make_record
 from tests.plants.noise import coloured

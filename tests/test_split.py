@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from psa_casadi.experiment import Record
+from psa_casadi.experiment.noise import correlation_inflation, high_frequency_noise
 from psa_casadi.experiment.split import reversals, split, whole
-from psa_casadi.identification.noise import correlation_inflation, high_frequency_noise
 
 FloatArray = NDArray[np.float64]
 

@@ -207,3 +207,20 @@ def test_a_million_samples_are_looked_at_quickly() -> None:
     found = suspects(Record("long", t, u, y))
     assert clock.process_time() - started < 10.0
     assert list(np.flatnonzero(found.mask)) == [200, 500_000, t.size - 5]
+
+
+def test_a_reading_repeated_shortly_while_the_stack_moves_is_masked() -> None:
+    """The next reading makes up for what was missed; a stack that always answers late is none."""
+    given = record("triangle", "white")
+    y = np.array(given.displacement)
+    per_sample = 0.01 * RANGE * float(np.max(np.abs(np.diff(given.voltage))))
+    repeats = int(np.ceil(1e-2 * RANGE / per_sample))
+    expected = set[int]()
+    for k in (300, 460, 777):
+        y[k : k + repeats] = y[k - 1]
+        expected |= set(range(k, k + repeats))
+    found = suspects(replace(given, displacement=y))
+    assert set(np.flatnonzero(found.mask).tolist()) == expected
+    assert found.counts["stuck"] == len(expected)
+    slow = np.repeat(y[::4], 4)[: y.size]  # a sensor that is read every fourth sample only
+    assert suspects(replace(given, displacement=slow)).counts["stuck"] == 0

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
+from psa_casadi.experiment.noise import first_order_noise
 from psa_casadi.experiment.repeats import autoregression_of
-from psa_casadi.identification.noise import first_order_noise
 
 FloatArray = npt.NDArray[np.float64]
 

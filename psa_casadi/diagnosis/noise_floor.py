@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour, noise_rms
+from psa_casadi.experiment.noise import first_order_noise
 from psa_casadi.experiment.quantum import quantum_of
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.repeats import MeasuredNoise, holds, repeats
-from psa_casadi.identification.noise import first_order_noise
 
 FloatArray = npt.NDArray[np.float64]
 Source = Literal["repeats", "holds", "fast part"]

@@ -14,25 +14,20 @@ from scipy.ndimage import maximum_filter1d
 from psa_casadi.experiment.quantum import quantum_of
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.runs import runs_of
+from psa_casadi.experiment.stuck import AFTER, BEFORE, LIMIT, SPIKE, equal_runs, missed_a_move
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]
 Kind = Literal["outlier", "drop-out", "stuck"]
 
 #: Samples that a running line is laid through; no spike of up to `SPIKE` samples moves it.
-WINDOW, SPIKE = 13, 3
-#: A sample is an outlier beyond this many standard deviations of its surroundings, ...
-LIMIT = 8.0
-#: ... and beyond this share of the record's range, however quiet the sensor.
+WINDOW = 13
+#: A sample is an outlier beyond `LIMIT` standard deviations of its surroundings, and beyond this
+#: share of the record's range, however quiet the sensor.
 SMALLEST = 1e-3
 #: Blocks in which the standard deviation of the surroundings is taken.
 BLOCK = 32
 _ROWS = 100_000
-#: Samples before a sudden change of voltage or load in which the stack may move fast, and by which
-#: share of what it may do at once it may still move so many samples after it.
-BEFORE, AFTER = 4, ((1.0, 24), (0.25, 48), (0.03, 96))
-#: Equal samples in a row that may be a sensor at rest, and the share of the range it missed.
-EQUAL, MISSED = 8, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +79,8 @@ def suspects(record: Record) -> Suspects:
     if span <= 0:
         return Suspects(mask, counts, None)
     quantum = quantum_of(y)
-    stuck, dropped = _equal_runs(y, record.voltage[valid], quantum)
+    stuck, dropped = equal_runs(y, record.voltage[valid], quantum)
+    stuck |= missed_a_move(y, record.voltage[valid], quantum) & ~dropped
     rest = ~(stuck | dropped)
     outlying = np.zeros(valid.size, dtype=np.bool_)
     outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
@@ -106,51 +102,6 @@ def masked(record: Record, found: Suspects) -> Record:
     if record.displacement is None or not found.mask.any():
         return record
     return replace(record, displacement=np.where(found.mask, np.nan, record.displacement))
-
-
-def _equal_runs(
-    y: FloatArray, voltage: FloatArray, quantum: float | None
-) -> tuple[BoolArray, BoolArray]:
-    """Return where one value is repeated as by a stuck sensor, and where as in a drop-out."""
-    span, reach = float(np.ptp(y)), float(np.ptp(voltage))
-    stuck, dropped = (np.zeros(y.size, dtype=np.bool_) for _ in range(2))
-    edges = np.flatnonzero(np.abs(np.diff(y)) > 1e-12 * span) + 1
-    starts, stops = np.r_[0, edges], np.r_[edges, y.size]
-    lengths = stops - starts
-    usual = float(np.percentile(lengths, 95))
-    slope = span / reach if reach > 0 else 0.0
-    swing = slope * np.abs(np.diff(voltage, prepend=voltage[0]))
-    floor = max(20.0 * (quantum or 0.0), MISSED * span)
-    for start, stop in zip(starts, stops, strict=True):
-        if stop - start <= SPIKE:
-            continue
-        jumps = _jumps(y, start, stop)
-        expected = slope * float(np.ptp(voltage[start:stop]))
-        near = swing[max(0, start - AFTER[0][1]) : stop + BEFORE]
-        off = min(jumps) > max(floor, 3.0 * float(np.max(near)))
-        if off and _returns(y, start, stop, expected):
-            dropped[start:stop] = True
-        elif stop - start >= max(EQUAL, 4.0 * usual) and expected > floor:
-            sudden = np.abs(jumps) > 0.5 * MISSED * span
-            if sudden[0]:
-                dropped[start:stop] = True
-            elif sudden[1] or (usual <= 1.0 and quantum is None):
-                stuck[start + 1 : stop] = True
-    return stuck, dropped
-
-
-def _jumps(y: FloatArray, start: int, stop: int) -> tuple[float, float]:
-    """Return the jumps into and out of a run, both positive where it is off to one side."""
-    before = y[start] - y[start - 1] if start > 0 else 0.0
-    after = y[stop - 1] - y[stop] if stop < y.size else 0.0
-    sign = np.sign(before) or 1.0
-    return float(sign * before), float(sign * after)
-
-
-def _returns(y: FloatArray, start: int, stop: int, expected: float) -> bool:
-    """Whether the values before and after a run agree, but for what the voltage explains."""
-    into, out = _jumps(y, start, stop)
-    return abs(into - out) < 0.5 * min(into, out) + 1.5 * expected
 
 
 def _outliers(

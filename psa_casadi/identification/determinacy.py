@@ -7,9 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import oaconvolve
 
+from psa_casadi.experiment.noise import autocovariance
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit
-from psa_casadi.identification.noise import autocovariance
 from psa_casadi.identification.prediction import predict_record
 from psa_casadi.variables import Interval
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.record import Record
 from psa_casadi.identification.linear_response import FloatArray, orthonormal, plays
-from psa_casadi.identification.noise import high_frequency_noise
 
 BoolArray = npt.NDArray[np.bool_]
 

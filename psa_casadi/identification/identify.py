@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment, whole
 from psa_casadi.identification.advice import Advice, advice
@@ -12,7 +13,6 @@ from psa_casadi.identification.combinations import Combination, free_combination
 from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.linear_start import linear_start
-from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.refitting import Progress, record_rms, refit
 from psa_casadi.identification.search import Search, StartOutcome, search

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.experiment.drive import turns
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.identification.excerpts import RADII, Excerpt
 from psa_casadi.identification.levenberg_marquardt import Evaluate, minimise
 from psa_casadi.identification.linear_response import (
@@ -26,7 +27,6 @@ from psa_casadi.identification.linear_response import (
     plays,
     respond,
 )
-from psa_casadi.identification.noise import high_frequency_noise
 
 IndexArray = npt.NDArray[np.intp]
 

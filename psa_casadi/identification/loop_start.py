@@ -18,8 +18,8 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from psa_casadi.experiment.drive import turns
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.record import Record
-from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prediction import measured
 from psa_casadi.identification.starting import static_slope
 from psa_casadi.identification.unknowns import static_compliance

@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fit import Fit, fit
-from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prediction import measured
 
 #: Evaluations that a fit gets to its end, and those with the tolerance of a quick one.

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.identify import Identification
-from psa_casadi.identification.noise import high_frequency_noise
 from psa_casadi.identification.prediction import measured
 from psa_casadi.report.phrases import Scale, added, length_scale
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.identification.noise import high_frequency_noise
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.identification.paper.shapes import STEADY_SHARE, Step
 
 FloatArray = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from psa_casadi.identification.noise import high_frequency_noise
+from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.identification.paper.shapes import Loop
 
 FloatArray = npt.NDArray[np.float64]

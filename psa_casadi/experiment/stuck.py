@@ -1,0 +1,96 @@
+"""Readings that are repeated although the stack moves: a stuck sensor, a drop-out."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.experiment.noise import high_frequency_noise
+from psa_casadi.experiment.runs import runs_of
+from psa_casadi.units import FloatArray
+
+BoolArray = NDArray[np.bool_]
+
+#: Samples that no spike exceeds, and standard deviations of its surroundings that make an outlier.
+SPIKE, LIMIT = 3, 8.0
+#: Samples before a sudden change of voltage or load in which the stack may move fast, and by which
+#: share of what it may do at once it may still move so many samples after it.
+BEFORE, AFTER = 4, ((1.0, 24), (0.25, 48), (0.03, 96))
+#: Equal samples in a row that may be a sensor at rest, and the share of the range it missed.
+EQUAL, MISSED = 8, 0.05
+#: Share of fast changes of the voltage without a new reading from which on the stack is late.
+LATE = 0.3
+#: Runs of equal readings that chance may make where the voltage is fast, and that are none then.
+CHANCE = 0.05
+
+
+def equal_runs(
+    y: FloatArray, voltage: FloatArray, quantum: float | None
+) -> tuple[BoolArray, BoolArray]:
+    """Return where one value is repeated as by a stuck sensor, and where as in a drop-out."""
+    span, reach = float(np.ptp(y)), float(np.ptp(voltage))
+    stuck, dropped = (np.zeros(y.size, dtype=np.bool_) for _ in range(2))
+    edges = np.flatnonzero(np.abs(np.diff(y)) > 1e-12 * span) + 1
+    starts, stops = np.r_[0, edges], np.r_[edges, y.size]
+    lengths = stops - starts
+    usual = float(np.percentile(lengths, 95))
+    slope = span / reach if reach > 0 else 0.0
+    swing = slope * np.abs(np.diff(voltage, prepend=voltage[0]))
+    floor = max(20.0 * (quantum or 0.0), MISSED * span)
+    for start, stop in zip(starts, stops, strict=True):
+        if stop - start <= SPIKE:
+            continue
+        jumps = _jumps(y, start, stop)
+        expected = slope * float(np.ptp(voltage[start:stop]))
+        near = swing[max(0, start - AFTER[0][1]) : stop + BEFORE]
+        off = min(jumps) > max(floor, 3.0 * float(np.max(near)))
+        if off and _returns(y, start, stop, expected):
+            dropped[start:stop] = True
+        elif stop - start >= max(EQUAL, 4.0 * usual) and expected > floor:
+            sudden = np.abs(jumps) > 0.5 * MISSED * span
+            if sudden[0]:
+                dropped[start:stop] = True
+            elif sudden[1] or (usual <= 1.0 and quantum is None):
+                stuck[start + 1 : stop] = True
+    return stuck, dropped
+
+
+def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
+    """Return where a reading is repeated, however shortly, while the voltage moves the stack.
+
+    The motion that the voltage's change makes must stand out from the noise, and at the end of the
+    run the reading must make up for at least half of it at once; and runs of that length, from the
+    share of readings that are repeated, must not be expected where the voltage is fast. Where that
+    is how the record answers fast changes in general, the stack is late and no sensor stuck.
+    """
+    found = np.zeros(y.size, dtype=np.bool_)
+    centred = voltage - np.mean(voltage)
+    power = float(centred @ centred)
+    slope = float(centred @ y) / power if power > 0 else 0.0
+    least = LIMIT * max(high_frequency_noise(y), 0.5 * (quantum or 0.0))
+    same = np.abs(np.diff(y)) <= 1e-12 * float(np.ptp(y))
+    fast = np.abs(slope * np.diff(voltage)) > least
+    by_chance = float(np.mean(same)) ** np.arange(same.size + 1) * float(np.count_nonzero(fast))
+    for start, stop in zip(*(ends.tolist() for ends in runs_of(same)), strict=True):
+        # y[start] ... y[stop] are equal, y[stop + 1] is the first new one
+        if stop + 1 >= y.size or by_chance[stop - start] > CHANCE:
+            continue
+        missed = slope * (voltage[stop] - voltage[start])
+        made_up = (y[stop + 1] - y[stop]) * np.sign(missed)
+        expected = abs(slope * (voltage[stop + 1] - voltage[start]))
+        if abs(missed) > least and made_up > max(least, 0.5 * expected):
+            found[start + 1 : stop + 1] = True
+    late = fast.any() and float(np.mean(same[fast])) > LATE
+    return np.zeros_like(found) if late else found
+
+
+def _jumps(y: FloatArray, start: int, stop: int) -> tuple[float, float]:
+    """Return the jumps into and out of a run, both positive where it is off to one side."""
+    before = y[start] - y[start - 1] if start > 0 else 0.0
+    after = y[stop - 1] - y[stop] if stop < y.size else 0.0
+    sign = np.sign(before) or 1.0
+    return float(sign * before), float(sign * after)
+
+
+def _returns(y: FloatArray, start: int, stop: int, expected: float) -> bool:
+    """Whether the values before and after a run agree, but for what the voltage explains."""
+    into, out = _jumps(y, start, stop)
+    return abs(into - out) < 0.5 * min(into, out) + 1.5 * expected
