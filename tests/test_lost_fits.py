@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from psa_casadi.diagnosis.backward import reconsidered
+from psa_casadi.diagnosis.colour import excess_power
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.extension import extend, polish
 from psa_casadi.diagnosis.rounds import Round, examine, settle_on
-from psa_casadi.diagnosis.selection import starts_of
+from psa_casadi.diagnosis.selection import WORTHWHILE, choose, starts_of
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.reading import read_record
@@ -102,3 +103,41 @@ def _also(step: Round, task: Task, name: str) -> None:
     assert found is not None
     step.extensions.append(polish(step.fit, found, task.experiments, colour))
     step.evidence = {**step.evidence, name: step.extensions[-1].evidence}
+
+
+def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
+    """Four effects lead the screening, none explains the data: an amplifier of 0.9 ms does."""
+    path = tmp_path / "record.csv"
+    make_record("drive_lag", 52001, path, visible=(0.3, 3.0))
+    names = ("rate_dependent_hysteresis", "voltage_saturation", "preload_loss", "load_stiffness")
+    table = [EFFECTS[n] for n in (*names, "drive_lag")]
+    told: list[str] = []
+    found = diagnose([read_record(path)], effects=table, progress=told.append)
+    assert found.verdict == "cause_named"
+    assert [c.effect for c in found.causes] == ["drive_lag"]
+    assert any("all other effects afresh" in step for step in told)
+
+
+def test_each_form_of_an_effect_gets_a_start_and_near_ones_stay_rivals(tmp_path: Path) -> None:
+    """Between its forms no fit moves; a threshold of worth does not cut rivals from each other."""
+    make_record("rate_dependent_hysteresis", 303, tmp_path / "a.csv", visible=(0.3, 3.0))
+    record = read_record(tmp_path / "a.csv").slice(0, 3000)
+    name = "rate_dependent_hysteresis"
+    rounds, task = _begun(record, (name, "slow_creep"))
+    current = rounds[0]
+    starts = starts_of(current.screening, name)
+    assert {s.direction.values["rate_by_threshold"] for s in starts} == {0.0, 1.0}
+    colour = current.screening.colour
+    one = extend(current.fit, task.experiments, starts, colour)
+    assert one is not None
+    excess = excess_power(current.fit.residuals, colour)
+    best = replace(one, removed=1.01 * WORTHWHILE * excess)
+
+    def chosen(share: float) -> list[str]:
+        other = replace(best.effect, name="another")
+        rival = replace(best, effect=other, removed=share * best.removed)
+        given = (task.experiments, current.fit, current.predicted, colour, None)
+        return [e.effect.name for e in choose([best, rival], *given)]
+
+    assert set(chosen(0.98)) == {name, "another"}
+    assert chosen(0.5) == [name]
