@@ -69,14 +69,15 @@ def explained_share(
 ) -> float:
     """Share of the excess power that the predictions `after` remove from those `before`, 0 to 1.
 
-    What is left in the held-out samples is compared with the excess over the whole records: how
-    much an effect does in a few blocks of one record is chance. What the noise's own power is
-    uncertain by is no excess.
+    Judged by what is left in the held-out samples, against the excess there or that over the whole
+    records, whichever is larger: what an effect does in a few blocks of one record may be little by
+    chance. What the noise's own power is uncertain by is no excess.
     """
     errors = np.concatenate(whole_residuals(experiments, before))
     valid = errors[np.isfinite(errors)]
     noise = floor**2 * (1.0 + uncertain(len(valid), colour))
-    excess = float(np.mean(valid**2)) - noise
+    powers = (float(np.mean(valid**2)), held_out_rms(experiments, before) ** 2)
+    excess = max(powers) - noise
     left = held_out_rms(experiments, after) ** 2 - noise
     return float(np.clip(1.0 - left / excess, 0.0, 1.0)) if excess > 0 else float(left <= 0)
 
