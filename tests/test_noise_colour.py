@@ -97,3 +97,14 @@ def test_a_cause_is_named_beside_coloured_noise(tmp_path: Path) -> None:
         lfilter([1.0, -truth.noise.correlation], [1.0], found.extended_fit.residuals)
     )
     assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
+
+
+def test_a_cause_is_named_beside_a_sensor_that_sticks(tmp_path: Path) -> None:
+    """Repeated readings far from the model are masked and said; without that nothing is named."""
+    path = tmp_path / "record.csv"
+    make_record("charge_leakage", 93096, path, noise="drop-outs", visible=(0.3, 3.0))
+    table = [EFFECTS[n] for n in ("charge_leakage", "slow_creep", "offset_drift")]
+    found = psa.diagnose([psa.read_record(path)], effects=table)
+    assert found.verdict == "cause_named"
+    assert [c.effect for c in found.causes] == ["charge_leakage"]
+    assert any("stuck sensor" in note for note in found.notes)

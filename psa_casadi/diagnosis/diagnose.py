@@ -20,6 +20,7 @@ from psa_casadi.diagnosis.retries import (
 )
 from psa_casadi.diagnosis.rounds import AFRESH, Round, decide, examine, search_cause
 from psa_casadi.diagnosis.selection import OF_FIRST
+from psa_casadi.diagnosis.stuck_readings import without_stuck_readings
 from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.diagnosis.verdict import PARTLY, conclude
 from psa_casadi.effects import EFFECTS
@@ -40,6 +41,8 @@ MOST_CAUSES = 3
 PROMISE, REMAINDER = 0.5, 0.35
 #: A better base replaces an effect if it leaves at most this much more of the residual.
 AS_GOOD = 1.005
+#: What is said of readings that a stuck sensor repeats.
+STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 #: Sampling interval [s] below which a stack may ring within the record's band.
 FAST = 5e-4
 
@@ -68,10 +71,14 @@ def diagnose(
     there = {c.name for c in start.components}
     table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
     base = fit_base(start, experiments, progress=progress)
+    experiments, stuck = without_stuck_readings(experiments, base)
+    if stuck:
+        base = fit_base(start, experiments, progress=progress)
     task = Task(experiments, tuple(table), method or Method(), progress)
     rounds = _search(base, task)
     progress("judging")
-    return conclude(rounds, experiments, table, scale_given)
+    found = conclude(rounds, experiments, table, scale_given)
+    return replace(found, notes=(*found.notes, STUCK_NOTE.format(stuck))) if stuck else found
 
 
 def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:
