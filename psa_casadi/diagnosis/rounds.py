@@ -144,7 +144,6 @@ def _afresh(current: Round, number: int, task: Task) -> None:
         current.extensions[k] = extend_afresh(
             current.fit, task.experiments, extension, current.screening.colour
         )
-    _sort(current)
 
 
 def settle_on(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -118,8 +119,7 @@ class _HeldOut:
 
     def gained(self, e: Extension) -> float:
         """Log-likelihood that an extension gains there."""
-        before = held_out_rms(self.experiments, self.predicted)
-        return self._samples() * float(np.log(before / max(e.holdout_rms, 1e-300)))
+        return self._samples() * float(np.log(self._before / max(e.holdout_rms, 1e-300)))
 
     def promised(self, e: Extension) -> float:
         """What it must gain: `HELD_OUT`, or less where clear evidence does little to these samples.
@@ -134,6 +134,10 @@ class _HeldOut:
         share = float(np.mean(change**2)) / e.holdout_rms**2 if change.size else 0.0
         promise = 0.5 * self._samples() * share
         return min(HELD_OUT, promise - 2.0 * float(np.sqrt(2.0 * promise)))
+
+    @cached_property
+    def _before(self) -> float:
+        return held_out_rms(self.experiments, self.predicted)
 
     def _samples(self) -> float:
         return sum(int(e.held_out.sum()) for e in self.experiments) / self.colour.inflation

@@ -28,7 +28,7 @@ def equal_runs(
     """Return where one value is repeated as by a stuck sensor, and where as in a drop-out."""
     span, reach = float(np.ptp(y)), float(np.ptp(voltage))
     stuck, dropped = (np.zeros(y.size, dtype=np.bool_) for _ in range(2))
-    edges = np.flatnonzero(np.abs(np.diff(y)) > 1e-12 * span) + 1
+    edges = np.flatnonzero(~_repeated(y)) + 1
     starts, stops = np.r_[0, edges], np.r_[edges, y.size]
     lengths = stops - starts
     usual = float(np.percentile(lengths, 95))
@@ -66,7 +66,7 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
     power = float(centred @ centred)
     slope = float(centred @ y) / power if power > 0 else 0.0
     least = LIMIT * max(high_frequency_noise(y), 0.5 * (quantum or 0.0))
-    same = np.abs(np.diff(y)) <= 1e-12 * float(np.ptp(y))
+    same = _repeated(y)
     fast = np.abs(slope * np.diff(voltage)) > least
     by_chance = float(np.mean(same)) ** np.arange(same.size + 1) * float(np.count_nonzero(fast))
     for start, stop in zip(*(ends.tolist() for ends in runs_of(same)), strict=True):
@@ -80,6 +80,11 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
             found[start + 1 : stop + 1] = True
     late = fast.any() and float(np.mean(same[fast])) > LATE
     return np.zeros_like(found) if late else found
+
+
+def _repeated(y: FloatArray) -> BoolArray:
+    """Return which samples but the first repeat the one before, (n - 1,)."""
+    return np.asarray(np.abs(np.diff(y)) <= 1e-12 * float(np.ptp(y)), dtype=np.bool_)
 
 
 def _jumps(y: FloatArray, start: int, stop: int) -> tuple[float, float]:
