@@ -17,6 +17,7 @@ from psa_casadi.diagnosis.retries import (
     from_extension,
     from_mode,
     from_resonances,
+    instead_of,
 )
 from psa_casadi.diagnosis.rounds import AFRESH, Round, decide, examine, search_cause
 from psa_casadi.diagnosis.selection import OF_FIRST
@@ -44,7 +45,7 @@ AS_GOOD = 1.005
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 #: Sampling interval [s] below which a stack may ring within the record's band.
-FAST = 5e-4
+FAST = 7e-4
 
 
 def diagnose(
@@ -105,10 +106,10 @@ def _search(base: Fit, task: Task) -> list[Round]:
     tried = [rounds]
     if _open(rounds):
         better = from_resonances(rounds[0].fit, task.experiments, task.progress)
-        if better is not None and better.rms < BETTER_BASE * rounds[0].fit.rms:
+        if better is not None:
             rounds = _forward(better, task)
             tried.append(rounds)
-    if _open(rounds):
+    if rounds[-1].test.alarm:
         before = rounds[-1].fit
         resonant = from_band(rounds[0].fit, before, task.experiments, task.progress)
         if resonant is not None:
@@ -162,7 +163,7 @@ def _forward(base: Fit, task: Task) -> list[Round]:
     fast = min(e.record.sample_time for e in task.experiments) < FAST
     if fast and first.test.alarm:
         resonant = from_resonances(first.fit, task.experiments, task.progress)
-        if resonant is not None and resonant.rms < BETTER_BASE * first.fit.rms:
+        if resonant is not None:
             first = _round(resonant, task)
     return _causes([first], task, retry=True)
 
@@ -207,7 +208,9 @@ def _retried(rounds: Sequence[Round], tried: set[str], task: Task) -> Fit | None
     tried.add("extension")
     task.progress("base fit, from the extension's parameters")
     again = from_extension(base, chosen, task.experiments)
-    return again if again is not None and again.rms < BETTER_BASE * base.rms else None
+    if again is not None and again.rms < BETTER_BASE * base.rms:
+        return again
+    return None if rings else instead_of(base, chosen, task.experiments, task.progress)
 
 
 def _round(base: Fit, task: Task) -> Round:

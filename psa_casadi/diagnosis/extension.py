@@ -11,11 +11,12 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.evidence import evidence
-from psa_casadi.diagnosis.quick_fits import QUICK, QUICK_RTOL, continued, fit_from, quick_fit
+from psa_casadi.diagnosis.quick_fits import QUICK, continued, fit_from, quick_fit
 from psa_casadi.diagnosis.screening import Copy, Score, Screening
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit
+from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import FIXED
 from psa_casadi.identification.starting import ordinary_values
 
@@ -166,7 +167,8 @@ def _best_continued(
     ended = list(fits)
     for quick in sorted(fits, key=lambda f: f.cost)[:count]:
         with suppress(PsaError):
-            ended.append(continued(quick, experiments, QUICK_RTOL, 1e-3, _AFRESH))
+            rtol = quick_rtol(quick.sigma, experiments)
+            ended.append(continued(quick, experiments, rtol, 1e-3, _AFRESH))
     return min(ended, key=lambda f: f.cost, default=None)
 
 
@@ -175,9 +177,10 @@ def polish(
 ) -> Extension:
     """Continue an extension's fit until it converges, loosely first, then at full tolerance."""
     current = extension.fit
+    loosest = quick_rtol(current.sigma, experiments)
     for rtol, tolerance, evaluations in _POLISHING:
         try:
-            current = continued(current, experiments, rtol, tolerance, evaluations)
+            current = continued(current, experiments, min(rtol, loosest), tolerance, evaluations)
         except PsaError:
             return extension
     return _extension(before, current, extension.effect, experiments, colour, final=True)

@@ -8,10 +8,11 @@ from psa_casadi.component import Component
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import FIXED
 
-#: Evaluations of a quick fit from a direction, and its tolerance of the stepper.
-QUICK, QUICK_RTOL = 8, 1e-4
+#: Evaluations of a quick fit from a direction.
+QUICK = 8
 
 #: An effect's values without its gain, the gain, and the records' memories.
 Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
@@ -64,7 +65,7 @@ def fit_from(
                 start_states=memory,
                 evaluations=evaluations,
                 tolerance=1e-3,
-                rtol=QUICK_RTOL,
+                rtol=quick_rtol(before.sigma, experiments),
             )
         except PsaError:
             continue

@@ -9,15 +9,19 @@ from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.linear_start import linear_start
-from psa_casadi.identification.refitting import QUICK_RTOL, Progress, refit
+from psa_casadi.identification.refitting import Progress, quick_rtol, refit
 from psa_casadi.identification.search import search
+from psa_casadi.identification.starting import ordinary_values
 from psa_casadi.identification.starting_points import resolved
 
 #: A base fit tried again counts if its rms falls to this share.
 BETTER_BASE = 0.95
 #: Log-likelihood by which a resonance of the stack's own may fall short of a further mode.
 _AS_GOOD = 10.0
+#: ... and of another effect.
+_LIKE = 3.0
 #: ... and to what share of the rms one beside the causes found must lead.
 _MUCH = 0.985
 #: Log-likelihood by which a fit with a further mass must be better to count.
@@ -25,6 +29,8 @@ _CLEAR = 15.0
 #: Multiples of the sampling rate about which the images of a tone are tried.
 _IMAGES = (0, 1, 2, 3)
 _QUICK, _FIRST, _BEST = 8, 4, 2
+#: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
+_AGAIN = 1.5
 #: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band, the
 #: resonances over the rate that are tried there, and their damping ratio.
 _NEAR_BAND, _GRID, _DAMPING = (300.0, 10_000.0), (0.4, 0.7, 1.0, 1.4, 2.0, 2.8), 0.15
@@ -38,9 +44,10 @@ def from_extension(
 
 
 def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
-    """Fit the base from the resonances and lags that fast records show; None without any.
+    """Fit the base from resonances and lags that fast records show; None if none explain more.
 
-    Ordinary lags lead nowhere for a stack that rings within the record's band.
+    Ordinary lags lead nowhere for a stack that rings within the record's band. The search begins
+    with an ordinary loop and, while it misses something, with that of the base.
     """
     records = [e.record for e in experiments]
     progress("resonances and lags that the records show")
@@ -48,7 +55,14 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     fastest = min(r.sample_time for r in records)
     if linear is None or not resolved(base.model, linear.candidates, fastest):
         return None
-    return search(base.model, experiments, linear=linear.candidates, progress=progress).best
+    ordinary = base.model.with_values(ordinary_values(base.model, records))
+    found: list[Fit] = []
+    for model in (ordinary, base.model):
+        found.append(search(model, experiments, linear=linear.candidates, progress=progress).best)
+        if found[-1].cost < _AGAIN * len(found[-1].residuals):
+            break
+    best = min(found, key=lambda f: f.rms)
+    return best if _short(base, best) > _CLEAR else None
 
 
 def from_band(
@@ -67,7 +81,8 @@ def from_band(
     found = _with_masses(before, starts, experiments)
     if found is None or found.rms > _MUCH * before.rms:
         return None
-    return _in_base(base, before, found, experiments)
+    resonant = _in_base(base, before, found, experiments)
+    return None if resonant is None else retuned(resonant, experiments, progress)
 
 
 def from_mode(
@@ -81,20 +96,43 @@ def from_mode(
 
     `before` is the model, perhaps with causes named before, to which the mode was added. A stack
     that rings near the sampling rate shows a tone at one of its images, |k f_s + f| and
-    |k f_s - f|. None where no mass explains the data about as well as the mode.
+    |k f_s - f|, which decays as fast: its damping ratio times its frequency is the same. None where
+    no mass explains the data about as well as the mode.
     """
     progress("base fit, with the mode as a resonance of the stack's own")
     found, values = mode.fit.model.values, before.model.values
     tone, damping = found[mode.effect.tone or ""], found["mode_damping"]
     rate = 1.0 / min(e.record.sample_time for e in experiments)
     images = {abs(k * rate + sign * tone) for k in _IMAGES for sign in (1.0, -1.0)}
-    final = _with_masses(before, list(_masses(values, sorted(images), damping)), experiments)
-    if final is None:
-        return None
-    short = len(before.residuals) * float(np.log(final.rms / mode.fit.rms))
-    if short >= _AS_GOOD:
+    starts = [m for f in sorted(images) for m in _masses(values, [f], damping * tone / f)]
+    final = _with_masses(before, starts, experiments)
+    if final is None or _short(final, mode.fit) >= _AS_GOOD:
         return None
     return _in_base(base, before, final, experiments)
+
+
+def instead_of(
+    base: Fit, extension: Extension, experiments: Sequence[Experiment], progress: Progress
+) -> Fit | None:
+    """Fit the base with a resonance near or above the band where an effect was found.
+
+    None where no mass explains the data about as well as the effect: a resonance above the band
+    delays what is within it, as a lag would.
+    """
+    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
+        return None
+    progress(f"base fit, with resonances instead of {extension.effect.name}")
+    starts = list(_masses(base.model.values, [g * rate for g in _GRID], _DAMPING))
+    found = _with_masses(base, starts, experiments)
+    if found is None or _short(found, extension.fit) >= _LIKE:
+        return None
+    return retuned(found, experiments, progress)
+
+
+def _short(found: Fit, other: Fit) -> float:
+    """Return the log-likelihood by which a fit falls short of another one."""
+    return len(other.residuals) * float(np.log(found.rms / other.rms))
 
 
 def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experiment]) -> Fit | None:
@@ -165,7 +203,7 @@ def _try(
             start=start,
             start_states=states,
             evaluations=evaluations,
-            rtol=QUICK_RTOL,
+            rtol=quick_rtol(before.sigma, experiments),
         )
     except PsaError:
         return None

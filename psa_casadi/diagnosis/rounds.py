@@ -27,13 +27,13 @@ from psa_casadi.identification.fit import Fit
 FloatArray = npt.NDArray[np.float64]
 
 #: An extension whose residual is within this factor of the noise needs no further starts.
-SETTLED = 1.05
+SETTLED = 1.02
 #: How many extensions are fitted to the end, if their evidence is this share of the best one's or
 #: this close to it.
 FINALISTS, RUNNER_UP, NEAR = 3, 0.8, 30.0
 #: How many extensions are fitted afresh, of a first and of a further cause: the best one and, while
 #: none removes this share of the excess power, the next ones.
-AFRESH, AFRESH_FURTHER, MOST = 4, 2, 0.9
+AFRESH, AFRESH_FURTHER, MOST = 4, 2, 0.95
 #: How many effects that could stand in the best one's place are fitted besides, at most.
 IMITATORS = 3
 

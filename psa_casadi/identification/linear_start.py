@@ -76,12 +76,12 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
         fits = [
             fit_linear(parts, s, ratio_free=False, evaluations=evaluations) for s in starts[:count]
         ]
-        best = _different(sorted(fits, key=lambda f: f.cost))
+        best = different(sorted(fits, key=lambda f: f.cost))
         starts = [f.theta for f in best]
         parts = _reweighted(parts, best[0])
     best = best[:CANDIDATES]
     fits = [_refined(parts, f) for f in best]
-    fits = _different(sorted(fits, key=lambda f: f.cost))
+    fits = different(sorted(fits, key=lambda f: f.cost))
     kept = [f for f in fits if _explains(parts, f)]
     if not kept:
         return None
@@ -127,8 +127,8 @@ def _refined(parts: Sequence[Excerpt], fit: LinearFit) -> LinearFit:
     return free if told else fixed
 
 
-def _different(fits: Sequence[LinearFit]) -> list[LinearFit]:
-    """Return the fits without those that repeat an earlier one within 10 %."""
+def different(fits: Sequence[LinearFit]) -> list[LinearFit]:
+    """Return the fits, best first, without those that repeat a better one within 10 %."""
     kept: list[LinearFit] = []
     for f in fits:
         if all(np.max(np.abs(f.theta - k.theta)) > _ALIKE for k in kept):

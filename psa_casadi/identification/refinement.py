@@ -11,7 +11,7 @@ from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.prediction import predict
-from psa_casadi.identification.refitting import QUICK_RTOL, Progress, differing, equal, refit
+from psa_casadi.identification.refitting import Progress, differing, equal, quick_rtol, refit
 from psa_casadi.identification.unknowns import unknowns_of
 
 #: Parameters that only fast records determine: each is freed when the data can tell it.
@@ -96,7 +96,7 @@ def _from(
             sigma=best.sigma,
             start_states=states,
             evaluations=_FIRST,
-            rtol=QUICK_RTOL,
+            rtol=quick_rtol(best.sigma, experiments),
         )
         if quick.interrupted or quick.cost > _HOPEFUL * best.cost:
             return None

@@ -7,11 +7,14 @@ import numpy as np
 from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.prediction import measured
 
-#: Evaluations that a fit gets to its end, and those with the tolerance of a quick one.
-POLISH, QUICK_RTOL = 100, 1e-4
+#: Evaluations that a fit gets to its end.
+POLISH = 100
+#: The stepper's loosest tolerance, and its tolerance over the noise's share of the range, in quick
+#: fits. Its error is some six times the tolerance, of the range.
+_QUICK_RTOL, _OF_NOISE = 1e-4, 0.02
 #: Fits whose costs differ by less, in units of the log-likelihood's double, are equally good.
 _EQUAL = 3.84
 #: ... or by less than this share of what the model's own error adds to the cost.
@@ -29,6 +32,15 @@ def noise_levels(experiments: Sequence[Experiment]) -> list[float]:
         y = measured(e.record)[e.used]
         levels.append(max(high_frequency_noise(y), 1e-6 * float(np.ptp(y)), 1e-15))
     return levels
+
+
+def quick_rtol(sigma: Sequence[float], experiments: Sequence[Experiment]) -> float:
+    """Return the stepper's tolerance for quick fits: its error stays well below the noise [m]."""
+    parts = [measured(e.record)[e.used] for e in experiments]
+    shares = [
+        s / max(float(np.ptp(y)), 1e-300) for s, y in zip(sigma, parts, strict=True) if y.size
+    ]
+    return float(np.clip(_OF_NOISE * min(shares, default=1.0), FIT_RTOL, _QUICK_RTOL))
 
 
 def record_rms(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:

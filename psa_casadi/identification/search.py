@@ -7,14 +7,15 @@ from typing import Any
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.linear_start import LinearCandidate
 from psa_casadi.identification.refinement import exchanged, with_fast, without_blur
 from psa_casadi.identification.refitting import (
-    QUICK_RTOL,
     Progress,
     differing,
     equal,
     noise_levels,
+    quick_rtol,
     refit,
     residual_noise,
 )
@@ -110,6 +111,7 @@ def search(
     outcomes, not_unique = _outcomes(found, polished, best, experiments)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
+        best = retuned(best, experiments, progress) if told else best
         best = without_blur(best, experiments)
     if thorough and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)
@@ -152,7 +154,7 @@ def _quick_fits(
 ) -> list[tuple[str, Fit]]:
     """Fit from every start with few evaluations; return those that could be simulated."""
     sigma = noise_levels(experiments)
-    quickly: dict[str, Any] = {"sigma": sigma, "rtol": QUICK_RTOL}
+    quickly: dict[str, Any] = {"sigma": sigma, "rtol": quick_rtol(sigma, experiments)}
     found: list[tuple[str, Fit]] = []
     rounds: tuple[int, ...] = (_QUICK,) if len(starts) <= _FINALISTS else (_FIRST, _QUICK - _FIRST)
     for name, start in starts:

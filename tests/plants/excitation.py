@@ -29,13 +29,25 @@ def draw_voltage(rng: np.random.Generator, span: float) -> tuple[FloatArray, Flo
     block = (count - rest - 2 * hold) // 4
     pieces = [np.zeros(count - 4 * block - 2 * hold)]
     for number in range(4):
-        classes = _block(rng, block, rate)
+        classes = draw_block(rng, block, rate)
         if number in (1, 3):
             place = 0 if number == 3 else int(rng.integers(len(classes) + 1))
             classes.insert(place, np.full(hold, _level(rng)))
         pieces.extend(classes)
     voltage = np.round(span * np.concatenate(pieces), VOLTAGE_DECIMALS)
     return np.arange(voltage.size) / rate, voltage
+
+
+def draw_block(rng: np.random.Generator, count: int, rate: float) -> list[FloatArray]:
+    """One block: a multisine, a decaying triangle, loops and steps, in random order."""
+    lengths = [int(0.27 * count), int(0.2 * count), int(0.33 * count)]
+    signals = [
+        multisine(rng, lengths[0], rate),
+        decaying_triangle(rng, lengths[1]),
+        loops(rng, lengths[2]),
+        steps(rng, count - sum(lengths)),
+    ]
+    return [signals[int(index)] for index in rng.permutation(len(signals))]
 
 
 def multisine(rng: np.random.Generator, count: int, rate: float) -> FloatArray:
@@ -97,17 +109,6 @@ def loops(rng: np.random.Generator, count: int) -> FloatArray:
 def triangle(phase: FloatArray) -> FloatArray:
     """Triangle of amplitude 1 and period 1 in phase, 0 and rising at phase 0."""
     return np.asarray(1.0 - 4.0 * np.abs(np.mod(phase + 0.25, 1.0) - 0.5))
-
-
-def _block(rng: np.random.Generator, count: int, rate: float) -> list[FloatArray]:
-    lengths = [int(0.27 * count), int(0.2 * count), int(0.33 * count)]
-    signals = [
-        multisine(rng, lengths[0], rate),
-        decaying_triangle(rng, lengths[1]),
-        loops(rng, lengths[2]),
-        steps(rng, count - sum(lengths)),
-    ]
-    return [signals[int(index)] for index in rng.permutation(len(signals))]
 
 
 def _level(rng: np.random.Generator) -> float:

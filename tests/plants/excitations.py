@@ -1,5 +1,5 @@
 """Poorer test voltages beside the rich one: what users have. All start at rest at 0 V, lie between
-0 and the span, and are linear between samples.
+0 and the span, and are linear between samples. Then the designs of `designs.py`.
 """
 
 import math
@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from tests.plants.designs import DesignKind, draw_design
 from tests.plants.excitation import (
     RATES_AND_SAMPLES,
     REST,
@@ -19,8 +20,10 @@ from tests.plants.excitation import (
 )
 from tests.plants.stack import FloatArray
 
-ExcitationKind = Literal["rich", "sine", "triangle", "steps", "slow", "loops"]
-EXCITATIONS: tuple[ExcitationKind, ...] = get_args(ExcitationKind)
+PoorKind = Literal["sine", "triangle", "steps", "slow", "loops"]
+ExcitationKind = Literal["rich"] | PoorKind | DesignKind
+DESIGNS: tuple[DesignKind, ...] = get_args(DesignKind)
+EXCITATIONS: tuple[ExcitationKind, ...] = ("rich", *get_args(PoorKind), *DESIGNS)
 SLOW_RATE = 10.0
 """Sampling rate of the slow record [Hz], which lasts 5 to 8 minutes."""
 
@@ -31,15 +34,22 @@ def draw_excitation(
     """Draw a record's times (N,) [s] and commands (N,) [V], rounded to 1 mV."""
     if kind == "rich":
         return draw_voltage(rng, span)
+    if kind in DESIGNS:
+        rate, wave = draw_design(rng, kind)
+        return np.arange(wave.size) / rate, _played(span, wave)
     rate, least = RATES_AND_SAMPLES[int(rng.integers(len(RATES_AND_SAMPLES)))]
     count = int(rng.integers(least, 6001))
     if kind == "slow":
         rate, count = SLOW_RATE, int(rng.integers(3000, 4801))
     rest = max(2, round(REST * rate))
     wave = _SHAPES[kind](rng, count - rest)
+    return np.arange(count) / rate, _played(span, np.concatenate((np.zeros(rest), wave)))
+
+
+def _played(span: float, wave: FloatArray) -> FloatArray:
+    """The command of a wave over the span, rounded to 1 mV but not beyond the span."""
     highest = math.floor(span * 10**VOLTAGE_DECIMALS) / 10**VOLTAGE_DECIMALS
-    voltage = np.round(span * np.concatenate((np.zeros(rest), wave)), VOLTAGE_DECIMALS)
-    return np.arange(count) / rate, np.minimum(voltage, highest)
+    return np.asarray(np.minimum(np.round(span * wave, VOLTAGE_DECIMALS), highest))
 
 
 def _sine(rng: np.random.Generator, count: int) -> FloatArray:

@@ -1,0 +1,175 @@
+"""Mechanics sought again where a fit has found the force but not what is behind it.
+
+Two resonances within the band, a lag and the zero between them give a fit many places to come to
+rest, most of them far above the noise. There the force is nearly right: what it has of the
+voltage's history is quasi-static and hardly depends on the mechanics. So the fit's own force,
+simulated, takes the voltage's place in `linear_start`: poles by vector fitting, placed, refined
+with the ratio k_P/k_B free, and a full fit from each of the best. A better fit has a better force.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from math import log
+
+import numpy as np
+
+from psa_casadi.errors import PsaError
+from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.excerpts import Excerpt
+from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.linear_fit import LinearFit, cost_of, fit_linear
+from psa_casadi.identification.linear_response import FloatArray
+from psa_casadi.identification.linear_start import arrangements, different
+from psa_casadi.identification.prediction import measured
+from psa_casadi.identification.refitting import Progress, quick_rtol, refit, residual_noise
+from psa_casadi.identification.unknowns import static_compliance
+from psa_casadi.identification.vector_fitting import Response, contributions, vector_fit
+from psa_casadi.simulation.simulate import simulate_record
+
+#: Samples of a record that are used, and the share of them given to its transient.
+_MOST, _LEAD = 6_000, 0.01
+#: Records sampled this much more slowly than the fastest add no dynamics.
+_SLOWER = 30.0
+#: Orders of vector fitting; poles that count are this share of the noise, or of the strongest.
+_ORDERS, _COUNTS = (2, 3, 4, 5, 6), 0.2
+#: How many starts get a few evaluations, how many of these a full refinement.
+_ROUNDS = ((12, 6), (4, 25))
+#: How many full fits are begun, with how many evaluations, how many of them are ended, and rounds.
+_BEGUN, _QUICK, _ENDED, _REPEATS = 3, 15, 2, 4
+#: The fit misses something where its mean weighted square is above this; a better one lowers the
+#: cost, twice the log-likelihood, by more than this.
+_MISSED, _BETTER = 1.02, 20.0
+#: Share of the rms that is taken for noise at least.
+_FLOOR = 0.1
+_FREE = ("m_P", "m_B", "k_P")
+_FORCES = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
+
+
+def retuned(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+    """Return a fit whose mechanics was sought again while that explains more; `best` if nothing.
+
+    Needs two resonators (k_P, k_B) and records on uniform instants.
+    """
+    if "k_P" not in best.model.values:
+        return best
+    for _ in range(_REPEATS):
+        if best.interrupted or best.cost < _MISSED * len(best.residuals):
+            return best
+        progress("base fit, mechanics again behind the force found")
+        better = _once(best, experiments)
+        if better is None or better.cost > best.cost - _BETTER:
+            return best
+        best = better
+    return best
+
+
+def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
+    parts = list(_parts(best, experiments))
+    if not parts:
+        return None
+    names = list(dict.fromkeys([*best.unknowns.names, *_FREE]))
+    begun = [
+        _begun(best, experiments, names, _values(best, linear.theta))
+        for linear in _linear_fits(best, parts)[:_BEGUN]
+    ]
+    found = sorted((f for f in begun if f is not None), key=lambda f: f.cost)[:_ENDED]
+    ended = [refit(f, experiments, names, sigma=best.sigma) for f in found]
+    return min(ended, key=lambda f: f.cost, default=None)
+
+
+def _begun(
+    best: Fit, experiments: Sequence[Experiment], names: Sequence[str], values: Mapping[str, float]
+) -> Fit | None:
+    """Fit a little from other values; None where these cannot be simulated."""
+    try:
+        return fit(
+            best.model.with_values(values),
+            experiments,
+            names,
+            sigma=best.sigma,
+            start_states=best.starts(),
+            evaluations=_QUICK,
+            rtol=quick_rtol(best.sigma, experiments),
+        )
+    except PsaError:
+        return None
+
+
+def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
+    """Yield the records with the fit's force, in metres of static displacement, for a voltage."""
+    fastest = min(e.record.sample_time for e in experiments)
+    values, levels = best.model.values, residual_noise(best, experiments)
+    for k, e in enumerate(experiments):
+        record, y = e.record, measured(e.record)
+        steps, there = np.diff(record.time), np.isfinite(y)
+        uneven = np.ptp(steps) > 0.01 * record.sample_time
+        if uneven or record.sample_time > _SLOWER * fastest or not e.used.any():
+            continue
+        states = simulate_record(best.model, record, memory=best.start(k)).states
+        force = values["k_L"] * states["u"] + states["f_H"]
+        source = (force - force[0]) * static_compliance(values)
+        filled = np.interp(np.arange(y.size), np.flatnonzero(there), y[there])
+        valid = e.used & there
+        valid[: max(1, int(_LEAD * min(y.size, _MOST)))] = False
+        level = max(levels[k], _FLOOR * best.rms)
+        cut = slice(0, _MOST)
+        yield Excerpt(
+            name=record.name,
+            h=record.duration / steps.size,
+            longest=record.duration,
+            v=source[cut],
+            y=(filled - filled[0])[cut],
+            valid=valid[cut],
+            sigma=level,
+            loop=source[cut],
+            static=best.rms,
+        )
+
+
+def _linear_fits(best: Fit, parts: Sequence[Excerpt]) -> list[LinearFit]:
+    """Return fits of the mechanics behind the force, the best first."""
+    own = log(best.model.values["k_P"] / best.model.values["k_B"])
+    starts: list[FloatArray] = []
+    for e in parts:
+        response = [Response(e.h, e.v, e.y, e.valid, e.sigma)]
+        for order in _ORDERS:
+            poles = vector_fit(response, order)
+            share = contributions(response, poles)
+            kept = poles[share >= _COUNTS * min(1.0, share.max())]
+            for placed in arrangements(kept, e.h):
+                for ratio in (own, -own):
+                    theta = np.append(placed, ratio)
+                    if all(np.max(np.abs(theta - s)) > 0.1 for s in starts):
+                        starts.append(theta)
+    starts.sort(key=lambda theta: cost_of(parts, theta))
+    fits: list[LinearFit] = []
+    for count, evaluations in _ROUNDS:
+        fits = [
+            fit_linear(parts, s, ratio_free=True, evaluations=evaluations) for s in starts[:count]
+        ]
+        fits = different(sorted(fits, key=lambda f: f.cost))
+        starts = [f.theta for f in fits]
+    return fits
+
+
+def _values(best: Fit, theta: FloatArray) -> dict[str, float]:
+    """Return the parameters of theta, forces scaled to keep the displacement.
+
+    Of the two lags behind the force the slower is the creep lag; the other one is added to the
+    drive's.
+    """
+    p = best.model.values
+    one, two, a_p, q_p, a_b, q_b, ratio = np.exp(theta).tolist()
+    k_b, k_p = p["k_B"], ratio * p["k_B"]
+    found = {
+        "tau": max(one, two),
+        "R_s": p["R_s"] + min(one, two) / p["C_p"],
+        "k_P": k_p,
+        "c_P": a_p * k_p,
+        "m_P": q_p * k_p,
+        "c_B": a_b * k_b,
+        "m_B": q_b * k_b,
+    }
+    scale = static_compliance(p) / static_compliance({**p, **found})
+    found |= {n: scale * p[n] for n in _FORCES}
+    bounds = {n: best.model.parameter(n).bounds for n in found}
+    return {n: float(np.clip(v, *bounds[n])) for n, v in found.items()}

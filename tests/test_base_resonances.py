@@ -1,0 +1,101 @@
+"""Stacks that ring within a record's band, or just above it: the base must find that itself."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.extension import extend, polish
+from psa_casadi.diagnosis.retries import from_resonances, instead_of
+from psa_casadi.diagnosis.rounds import examine
+from psa_casadi.diagnosis.selection import starts_of
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment.reading import read_record
+from psa_casadi.experiment.split import Experiment, split
+from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.force_start import retuned
+from psa_casadi.identification.refitting import quick_rtol
+from psa_casadi.identification.search import fit_base
+from psa_casadi.identification.starting import starting_model
+from psa_casadi.simulation.simulate import simulate_record
+from tests.plants.designs import DesignKind
+from tests.plants.make import Truth, make_record
+
+
+def _fitted(path: Path, kind: DesignKind, seed: int) -> tuple[Truth, tuple[Experiment, ...], Fit]:
+    truth = make_record(None, seed, path, excitation=kind)
+    record = read_record(path)
+    experiments = (split(record),)
+    return truth, experiments, fit_base(starting_model([record], None), experiments)
+
+
+def _quietly(_: str) -> None:
+    pass
+
+
+def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) -> None:
+    """From the linear part's starts alone this fit ended at 1.16 times the noise."""
+    truth, experiments, base = _fitted(tmp_path / "a.csv", "fast", 1)
+    found = from_resonances(base, experiments, _quietly)
+    assert found is not None
+    assert found.rms < 1.02 * truth.sigma
+    stack, p = truth.stack, found.model.values
+    tones = sorted([np.sqrt(stack.k_p / stack.m_p), np.sqrt(stack.k_b / stack.m_b)])
+    mine = sorted([np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])])
+    assert mine[0] == pytest.approx(tones[0], rel=0.1)
+
+
+def test_wrong_mechanics_is_found_behind_a_right_force(tmp_path: Path) -> None:
+    truth, experiments, base = _fitted(tmp_path / "a.csv", "fast", 5)
+    assert base.rms > 5.0 * truth.sigma
+    found = retuned(base, experiments, _quietly)
+    assert found.rms < 1.03 * truth.sigma
+
+
+def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Path) -> None:
+    """1.69 kHz sampled at 2 kHz, seen at 0.33 kHz, where it decays as fast in time."""
+    make_record(None, 19, tmp_path / "a.csv", excitation="short")
+    found = diagnose([read_record(tmp_path / "a.csv")], effects=[EFFECTS["structural_mode"]])
+    assert found.verdict == "adequate"
+
+
+@pytest.mark.parametrize(
+    ("hidden", "seed", "like", "own"),
+    [(None, 93180, "sensor_lag", True), ("sensor_delay", 93099, "sensor_delay", False)],
+)
+def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
+    hidden: str | None, seed: int, like: str, own: bool, tmp_path: Path
+) -> None:
+    """The first record is clean: a lag of 63 us was named with ln B = 22."""
+    make_record(hidden, seed, tmp_path / "a.csv", visible=(0.3, 3.0) if hidden else None)
+    record = read_record(tmp_path / "a.csv")
+    experiments = (split(record),)
+    base = fit_base(starting_model([record], None), experiments)
+    task = Task(experiments, (EFFECTS[like],))
+    seen = examine(base, tuple(base.predicted(experiments)), task)
+    colour = seen.screening.colour
+    quick = extend(base, experiments, starts_of(seen.screening, like), colour)
+    assert quick is not None
+    lag = polish(base, quick, experiments, colour)
+    assert lag.evidence > 10.0
+    found = instead_of(base, lag, experiments, _quietly)
+    assert (found is not None) == own
+    assert found is None or found.rms < 1.001 * lag.fit.rms
+
+
+def test_quick_fits_integrate_below_the_noise(tmp_path: Path) -> None:
+    """A sensor with a noise of 2e-4 of the range: at 1e-4 the stepper's error was larger."""
+    path = tmp_path / "a.csv"
+    make_record(None, 3, path, excitation="sines")
+    record = read_record(path).slice(0, 3000)
+    experiments = (split(record),)
+    model = starting_model([record], None)
+    range_ = float(np.ptp(np.asarray(record.displacement)))
+    noise = 2e-4 * range_
+    rtol = quick_rtol([noise], experiments)
+    exact = simulate_record(model, record, rtol=1e-9).outputs["displacement"]
+    quick = simulate_record(model, record, rtol=rtol).outputs["displacement"]
+    assert float(np.std(quick - exact)) < 0.3 * noise * float(np.ptp(exact)) / range_
+    assert quick_rtol([1e6 * noise], experiments) > 5.0 * rtol
