@@ -73,8 +73,8 @@ def test_bic_weights_are_those_of_the_criterion(
     assert sum(weights.values()) == pytest.approx(1.0)
 
 
-def _found(effect: str, named: tuple[str, ...], kind: str = "known") -> Found:
-    case = Case(kind, effect, 1)  # type: ignore[arg-type]  # the kinds below are those it knows
+def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1) -> Found:
+    case = Case(kind, effect, seed)  # type: ignore[arg-type]  # the kinds below are those it knows
     return Found(
         case,
         1.0,
@@ -91,7 +91,9 @@ def _found(effect: str, named: tuple[str, ...], kind: str = "known") -> Found:
 
 
 def test_shuffled_labels_and_weaker_methods_show_in_the_table() -> None:
-    right = [_found(n, (n,)) for n in NAMES] + [_found("dry_friction", (), "foreign")]
+    every = [*NAMES, NAMES[0]]  # one record of each effect is repeated, whatever its seed
+    right = [_found(n, (n,), seed=k) for k, n in enumerate(every)]
+    right.append(_found("dry_friction", (), "foreign", 9))
     misled = {n: _found(n, ("backlash",)) for n in NAMES}
     asked: list[Method] = []
 
@@ -99,7 +101,7 @@ def test_shuffled_labels_and_weaker_methods_show_in_the_table() -> None:
         asked.append(method)
         return [misled.get(str(c.effect), _found(str(c.effect), (), c.kind)) for c in cases]
 
-    table = control_table(right, 1, diagnose_all).table
+    table = control_table(right, diagnose_all).table
     rows = {row[0]: row[1:] for row in table.rows}
     assert rows["the method"] == ("3 of 3", "3 of 3", "0 of 4", "90 %, 100 %")
     assert rows["shuffled labels"] == ("0 of 3", "0 of 3", "3 of 3", "90 %, 0 %")

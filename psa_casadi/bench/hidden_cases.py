@@ -24,12 +24,16 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.experiment.reading import read_record
 
-Kind = Literal["known", "weak", "clean", "left out", "foreign", "two", "poor"]
+Kind = Literal["known", "weak", "clean", "left out", "foreign", "two", "poor", "design", "ringing"]
 
 #: Ranges of rho, from which a case's is drawn evenly in its logarithm.
 ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
 #: Classes of voltages that show less than a rich one.
 POOR = ("sine", "triangle", "steps", "slow", "loops")
+#: Other designs of record; and those with resonances in their band or near it, all clean: there
+#: the static effects of the plants are no physics.
+DESIGNS = ("bipolar", "short", "long", "sines", "staircase", "small")
+RINGING = ("fast", "sweep", "short")
 #: Noises of the cases of one effect, in turn: most sensors' is white, many have a filter.
 NOISES = ("white", "ar", "white", "quantised", "drop-outs")
 
@@ -165,4 +169,9 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
     for k in range(4 * seeds):
         excitation = POOR[k % len(POOR)]
         cases.append(Case("poor", str(rng.choice(known)), next(seed), excitation=excitation))
+    for k in range(6 * seeds):
+        excitation = DESIGNS[k % len(DESIGNS)]
+        cases.append(Case("design", str(rng.choice(known)), next(seed), excitation=excitation))
+    for k in range(3 * seeds):
+        cases.append(Case("ringing", None, next(seed), excitation=RINGING[k % len(RINGING)]))
     return cases

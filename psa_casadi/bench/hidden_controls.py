@@ -23,14 +23,13 @@ _KINDS = ("known", "foreign")
 
 def control_table(
     found: Sequence[Found],
-    first: int,
     diagnose_all: Callable[[Sequence[Case], Method], Sequence[Found]],
 ) -> TitledTable:
-    """Repeat the cases of the study's first seed, without one part of the method after another.
+    """Repeat a case of every effect, without one part of the method after another.
 
     `found` are the study's results that count; `diagnose_all` runs cases with a method.
     """
-    kept = [f for f in found if f.case.kind in _KINDS and f.case.seed == first]
+    kept = list({(f.case.kind, f.case.effect): f for f in found if f.case.kind in _KINDS}.values())
     rows = [("the method", *_figures(kept)), ("shuffled labels", *_figures(_shuffled(kept)))]
     for name, method in CONTROLS.items():
         rows.append((name, *_figures(diagnose_all([f.case for f in kept], method))))
@@ -38,7 +37,7 @@ def control_table(
     return TitledTable(
         "Negative controls",
         Table(head, tuple(rows)),
-        f"{len(kept)} cases, those of the study's first seed. Wrong, as if settled: `cause_named`"
+        f"{len(kept)} cases, one of every effect of the study. Wrong, as if settled: `cause_named`"
         " without the cause, foreign ones too. Stated, right: the mean confidence of the named"
         " cases with a known cause, and how often the name is right.",
     )

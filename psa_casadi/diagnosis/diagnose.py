@@ -104,11 +104,10 @@ def _search(base: Fit, task: Task) -> list[Round]:
     """Forward selection: add the best effect until nothing is seen or nothing helps."""
     rounds = _forward(base, task)
     tried = [rounds]
-    if _open(rounds):
+    if _open(rounds) and not _fast(task):
         better = from_resonances(rounds[0].fit, task.experiments, task.progress)
         if better is not None:
-            rounds = _forward(better, task)
-            tried.append(rounds)
+            tried.append(rounds := _forward(better, task))
     if rounds[-1].test.alarm:
         before = rounds[-1].fit
         resonant = from_band(rounds[0].fit, before, task.experiments, task.progress)
@@ -118,6 +117,10 @@ def _search(base: Fit, task: Task) -> list[Round]:
         if _open(rounds):
             rounds = min(rounds, _any(earlier, task), key=_left)
     return _settle(reconsidered(rounds, task), task)
+
+
+def _fast(task: Task) -> bool:
+    return min(e.record.sample_time for e in task.experiments) < FAST
 
 
 def _left(rounds: Sequence[Round]) -> float:
@@ -160,11 +163,9 @@ def _open(rounds: Sequence[Round]) -> bool:
 def _forward(base: Fit, task: Task) -> list[Round]:
     """Make sure of the base where something is missing, then add causes."""
     first = _round(base, task)
-    fast = min(e.record.sample_time for e in task.experiments) < FAST
-    if fast and first.test.alarm:
+    if _fast(task) and first.test.alarm:
         resonant = from_resonances(first.fit, task.experiments, task.progress)
-        if resonant is not None:
-            first = _round(resonant, task)
+        first = first if resonant is None else _round(resonant, task)
     return _causes([first], task, retry=True)
 
 
@@ -192,7 +193,7 @@ def _causes(rounds: list[Round], task: Task, *, retry: bool) -> list[Round]:
 
 
 def _retried(rounds: Sequence[Round], tried: set[str], task: Task) -> Fit | None:
-    """Fit the base from where the last round led, once in each way; None if it is not better."""
+    """Fit the base from where the last round led, or with resonances; None if it is no better."""
     base, current = rounds[0].fit, rounds[-1]
     chosen = current.chosen
     if chosen is None:

@@ -1,6 +1,7 @@
 """Further attempts at the base fit: a base that is lost looks like a base that lacks something."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -11,20 +12,20 @@ from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit, fit
 from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.linear_start import linear_start
+from psa_casadi.identification.refinement import without_blur
 from psa_casadi.identification.refitting import Progress, quick_rtol, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.starting import ordinary_values
 from psa_casadi.identification.starting_points import resolved
 
-#: A base fit tried again counts if its rms falls to this share.
+#: A base fit from an extension's parameters counts if its rms falls to this share.
 BETTER_BASE = 0.95
-#: Log-likelihood by which a resonance of the stack's own may fall short of a further mode.
-_AS_GOOD = 10.0
-#: ... and of another effect.
-_LIKE = 3.0
-#: ... and to what share of the rms one beside the causes found must lead.
+#: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
+#: of another effect.
+_AS_GOOD, _LIKE = 10.0, 3.0
+#: To what share of the rms one beside the causes found must lead.
 _MUCH = 0.985
-#: Log-likelihood by which a fit with a further mass must be better to count.
+#: n ln(ratio of rms) by which a fit with resonances must be better to count.
 _CLEAR = 15.0
 #: Multiples of the sampling rate about which the images of a tone are tried.
 _IMAGES = (0, 1, 2, 3)
@@ -49,6 +50,8 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     Ordinary lags lead nowhere for a stack that rings within the record's band. The search begins
     with an ordinary loop and, while it misses something, with that of the base.
     """
+    if "k_P" not in base.model.values:
+        return None
     records = [e.record for e in experiments]
     progress("resonances and lags that the records show")
     linear = linear_start(records, base.model.values)
@@ -56,12 +59,13 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     if linear is None or not resolved(base.model, linear.candidates, fastest):
         return None
     ordinary = base.model.with_values(ordinary_values(base.model, records))
-    found: list[Fit] = []
+    best = base
     for model in (ordinary, base.model):
-        found.append(search(model, experiments, linear=linear.candidates, progress=progress).best)
-        if found[-1].cost < _AGAIN * len(found[-1].residuals):
-            break
-    best = min(found, key=lambda f: f.rms)
+        with suppress(PsaError):
+            own = search(model, experiments, linear=linear.candidates, progress=progress).best
+            best = min(best, own, key=lambda f: f.rms)
+            if own.cost < _AGAIN * len(own.residuals):
+                break
     return best if _short(base, best) > _CLEAR else None
 
 
@@ -82,7 +86,7 @@ def from_band(
     if found is None or found.rms > _MUCH * before.rms:
         return None
     resonant = _in_base(base, before, found, experiments)
-    return None if resonant is None else retuned(resonant, experiments, progress)
+    return None if resonant is None else _tuned(resonant, experiments, progress)
 
 
 def from_mode(
@@ -127,11 +131,16 @@ def instead_of(
     found = _with_masses(base, starts, experiments)
     if found is None or _short(found, extension.fit) >= _LIKE:
         return None
-    return retuned(found, experiments, progress)
+    return _tuned(found, experiments, progress)
+
+
+def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+    """Return the fit with its mechanics sought again; k_P is kept free where it is told."""
+    return without_blur(retuned(found, experiments, progress), experiments)
 
 
 def _short(found: Fit, other: Fit) -> float:
-    """Return the log-likelihood by which a fit falls short of another one."""
+    """Return n ln(rms of a fit / rms of another one)."""
     return len(other.residuals) * float(np.log(found.rms / other.rms))
 
 
@@ -181,9 +190,11 @@ def _with_masses(
             best = further
     if best is None:
         return None
-    final = refit(best, experiments, best.unknowns.names)
-    gained = len(before.residuals) * float(np.log(before.rms / final.rms))
-    return final if gained > _CLEAR else None
+    try:
+        final = refit(best, experiments, best.unknowns.names)
+    except PsaError:
+        return None
+    return final if _short(before, final) > _CLEAR else None
 
 
 def _try(

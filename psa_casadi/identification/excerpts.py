@@ -111,7 +111,7 @@ def _of_record(record: Record) -> list[Excerpt]:
     whole = _without_rests(_uniform(record))
     if whole.v.size <= MOST:
         return _excerpt(record.name, whole)
-    start = _fastest(whole.v, MOST)
+    start = fastest_part(whole.v, MOST)
     found = _excerpt(f"{record.name}, fastest part", whole.part(start, start + MOST))
     coarse = whole.part(0, whole.v.size, -(-whole.v.size // MOST))
     at = np.arange(whole.v.size) * whole.h
@@ -210,7 +210,7 @@ def _leading_rest(v: FloatArray) -> int:
     return 0 if rest == 1 and np.ptp(v[1:4]) > level and not slow else rest
 
 
-def _fastest(v: FloatArray, length: int) -> int:
+def fastest_part(v: FloatArray, length: int) -> int:
     """Return the start of the part with the largest jumps of voltage from sample to sample.
 
     Of equal parts the last, a little before.

@@ -4,29 +4,39 @@ Two resonances within the band, a lag and the zero between them give a fit many 
 rest, most of them far above the noise. There the force is nearly right: what it has of the
 voltage's history is quasi-static and hardly depends on the mechanics. So the fit's own force,
 simulated, takes the voltage's place in `linear_start`: poles by vector fitting, placed, refined
-with the ratio k_P/k_B free, and a full fit from each of the best. A better fit has a better force.
+with the ratio k_P/k_B free, and a full fit from each of the best. The play operators of
+`linear_fit` then stand for what is wrong with that force. A better fit has a better force.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from math import log
 
 import numpy as np
 
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.excerpts import Excerpt
+from psa_casadi.identification.excerpts import Excerpt, fastest_part
 from psa_casadi.identification.fit import Fit, fit
 from psa_casadi.identification.linear_fit import LinearFit, cost_of, fit_linear
 from psa_casadi.identification.linear_response import FloatArray
 from psa_casadi.identification.linear_start import arrangements, different
 from psa_casadi.identification.prediction import measured
-from psa_casadi.identification.refitting import Progress, quick_rtol, refit, residual_noise
+from psa_casadi.identification.refitting import (
+    Progress,
+    quick_rtol,
+    record_rms,
+    refit,
+    residual_noise,
+)
 from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.identification.vector_fitting import Response, contributions, vector_fit
 from psa_casadi.simulation.simulate import simulate_record
 
-#: Samples of a record that are used, and the share of them given to its transient.
-_MOST, _LEAD = 6_000, 0.01
+#: Samples that one record and all together may have, and the fewest that count.
+_MOST, _ALL, _FEWEST = 6_000, 12_000, 16
+#: Share of them that is given to the transient: from the record's start, and from amid it.
+_LEAD, _AMID = 0.01, 0.2
 #: Records sampled this much more slowly than the fastest add no dynamics.
 _SLOWER = 30.0
 #: Orders of vector fitting; poles that count are this share of the noise, or of the strongest.
@@ -35,9 +45,9 @@ _ORDERS, _COUNTS = (2, 3, 4, 5, 6), 0.2
 _ROUNDS = ((12, 6), (4, 25))
 #: How many full fits are begun, with how many evaluations, how many of them are ended, and rounds.
 _BEGUN, _QUICK, _ENDED, _REPEATS = 3, 15, 2, 4
-#: The fit misses something where its mean weighted square is above this; a better one lowers the
+#: The fit misses something where its rms is this much above the noise; a better one lowers the
 #: cost, twice the log-likelihood, by more than this.
-_MISSED, _BETTER = 1.02, 20.0
+_MISSED, _BETTER = 1.01, 20.0
 #: Share of the rms that is taken for noise at least.
 _FLOOR = 0.1
 _FREE = ("m_P", "m_B", "k_P")
@@ -47,19 +57,34 @@ _FORCES = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
 def retuned(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
     """Return a fit whose mechanics was sought again while that explains more; `best` if nothing.
 
-    Needs two resonators (k_P, k_B) and records on uniform instants.
+    Needs two resonators (k_P, k_B); records on instants that are not uniform do not contribute. A
+    keyboard interrupt ends it at the best fit so far.
     """
     if "k_P" not in best.model.values:
         return best
     for _ in range(_REPEATS):
-        if best.interrupted or best.cost < _MISSED * len(best.residuals):
+        if best.interrupted or not _misses(best, experiments):
             return best
         progress("base fit, mechanics again behind the force found")
-        better = _once(best, experiments)
+        try:
+            better = _once(best, experiments)
+        except KeyboardInterrupt:
+            return replace(best, interrupted=True)
+        except (PsaError, np.linalg.LinAlgError):
+            return best
         if better is None or better.cost > best.cost - _BETTER:
             return best
         best = better
     return best
+
+
+def _misses(best: Fit, experiments: Sequence[Experiment]) -> bool:
+    """Whether a record's residual is larger than its own fast part."""
+    levels = residual_noise(best, experiments)
+    return any(
+        record > _MISSED * level
+        for record, level in zip(record_rms(best, experiments), levels, strict=True)
+    )
 
 
 def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
@@ -73,20 +98,28 @@ def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
     ]
     found = sorted((f for f in begun if f is not None), key=lambda f: f.cost)[:_ENDED]
     ended = [refit(f, experiments, names, sigma=best.sigma) for f in found]
+    if any(f.interrupted for f in (*found, *ended)):
+        raise KeyboardInterrupt
     return min(ended, key=lambda f: f.cost, default=None)
 
 
 def _begun(
     best: Fit, experiments: Sequence[Experiment], names: Sequence[str], values: Mapping[str, float]
 ) -> Fit | None:
-    """Fit a little from other values; None where these cannot be simulated."""
+    """Fit a little from other values; None where these cannot be simulated.
+
+    The memories of forces change with the forces.
+    """
+    scale = values["k_L"] / best.model.values["k_L"]
+    forces = {s.name for s in best.model.structure.states if s.unit == "N"}
+    starts = [{n: v * (scale if n in forces else 1.0) for n, v in s.items()} for s in best.starts()]
     try:
         return fit(
             best.model.with_values(values),
             experiments,
             names,
             sigma=best.sigma,
-            start_states=best.starts(),
+            start_states=starts,
             evaluations=_QUICK,
             rtol=quick_rtol(best.sigma, experiments),
         )
@@ -97,30 +130,34 @@ def _begun(
 def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
     """Yield the records with the fit's force, in metres of static displacement, for a voltage."""
     fastest = min(e.record.sample_time for e in experiments)
-    values, levels = best.model.values, residual_noise(best, experiments)
+    values, levels, total = best.model.values, residual_noise(best, experiments), 0
     for k, e in enumerate(experiments):
         record, y = e.record, measured(e.record)
         steps, there = np.diff(record.time), np.isfinite(y)
         uneven = np.ptp(steps) > 0.01 * record.sample_time
-        if uneven or record.sample_time > _SLOWER * fastest or not e.used.any():
+        if uneven or record.sample_time > _SLOWER * fastest or total >= _ALL:
+            continue
+        first = fastest_part(record.voltage, _MOST) if y.size > _MOST else 0
+        cut = slice(first, first + _MOST)
+        valid = (e.used & there)[cut]
+        valid[: max(1, int((_AMID if first else _LEAD) * valid.size))] = False
+        if valid.sum() < _FEWEST or not np.ptp(record.voltage[cut][valid]):
             continue
         states = simulate_record(best.model, record, memory=best.start(k)).states
         force = values["k_L"] * states["u"] + states["f_H"]
         source = (force - force[0]) * static_compliance(values)
         filled = np.interp(np.arange(y.size), np.flatnonzero(there), y[there])
-        valid = e.used & there
-        valid[: max(1, int(_LEAD * min(y.size, _MOST)))] = False
         level = max(levels[k], _FLOOR * best.rms)
-        cut = slice(0, _MOST)
+        total += valid.size
         yield Excerpt(
             name=record.name,
             h=record.duration / steps.size,
             longest=record.duration,
-            v=source[cut],
-            y=(filled - filled[0])[cut],
-            valid=valid[cut],
+            v=source[cut] - source[cut][0],
+            y=filled[cut] - filled[cut][0],
+            valid=valid,
             sigma=level,
-            loop=source[cut],
+            loop=source[cut] - source[cut][0],
             static=best.rms,
         )
 

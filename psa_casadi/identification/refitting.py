@@ -3,12 +3,15 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.prediction import measured
+
+FloatArray = npt.NDArray[np.float64]
 
 #: Evaluations that a fit gets to its end.
 POLISH = 100
@@ -35,12 +38,23 @@ def noise_levels(experiments: Sequence[Experiment]) -> list[float]:
 
 
 def quick_rtol(sigma: Sequence[float], experiments: Sequence[Experiment]) -> float:
-    """Return the stepper's tolerance for quick fits: its error stays well below the noise [m]."""
-    parts = [measured(e.record)[e.used] for e in experiments]
+    """Return the stepper's tolerance for quick fits: its error stays well below the noise [m].
+
+    The error is a share of all that the voltage moves from 0, not only of the record's range.
+    """
+    parts = [_moved(e) for e in experiments]
     shares = [
         s / max(float(np.ptp(y)), 1e-300) for s, y in zip(sigma, parts, strict=True) if y.size
     ]
     return float(np.clip(_OF_NOISE * min(shares, default=1.0), FIT_RTOL, _QUICK_RTOL))
+
+
+def _moved(e: Experiment) -> FloatArray:
+    """Return the used displacement (n,) [m], as large as if the voltage's range began at 0."""
+    v = e.record.voltage
+    stretch = float(np.max(np.abs(v))) / max(float(np.ptp(v)), 1e-300)
+    moved: FloatArray = measured(e.record)[e.used] * max(1.0, stretch)
+    return moved
 
 
 def record_rms(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:

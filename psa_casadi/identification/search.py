@@ -111,7 +111,10 @@ def search(
     outcomes, not_unique = _outcomes(found, polished, best, experiments)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
-        best = retuned(best, experiments, progress) if told else best
+        tuned = retuned(best, experiments, progress) if told else best
+        if tuned is not best:
+            best = tuned
+            outcomes, not_unique = _outcomes(found, polished, best, experiments)
         best = without_blur(best, experiments)
     if thorough and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)

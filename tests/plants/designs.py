@@ -18,7 +18,6 @@ from tests.plants.stack import FloatArray
 DesignKind = Literal[
     "fast", "bipolar", "short", "long", "sines", "sweep", "staircase", "small"
 ]  # fmt: skip
-WITH_RESONANCES: tuple[DesignKind, ...] = ("fast", "sweep")
 STAIRCASE_SAMPLES = 12_000
 """Most samples of a staircase."""
 
@@ -48,7 +47,7 @@ def _fast(rng: np.random.Generator) -> Wave:
 
 
 def _bipolar(rng: np.random.Generator) -> Wave:
-    """Down to 15 to 100 % of the span below zero."""
+    """Levels from 15 to 100 % of the span below zero up to the span."""
     rate, wave = _blocks(rng, (1e3, 2e3), (3000, 6000), 3, 0)
     low = -float(rng.uniform(0.15, 1.0))
     return rate, np.concatenate([np.zeros(60), low + (1.0 - low) * wave])
