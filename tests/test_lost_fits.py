@@ -106,10 +106,14 @@ def _also(step: Round, task: Task, name: str) -> None:
 
 
 def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
-    """Others lead the screening and do not explain the data: an amplifier of 0.9 ms does."""
+    """Four effects lead the screening, none explains the data: an amplifier of 0.9 ms does."""
     path = tmp_path / "record.csv"
     truth = make_record("drive_lag", 52001, path, visible=(0.3, 3.0))
     record = read_record(path)
+    names = ("rate_dependent_hysteresis", "voltage_saturation", "preload_loss", "load_stiffness")
+    found = diagnose([record], effects=[EFFECTS[n] for n in (*names, "drive_lag")])
+    assert found.verdict == "cause_named"
+    assert [c.effect for c in found.causes] == ["drive_lag"]
     rounds, task = _begun(record, ("rate_dependent_hysteresis", "preload_loss", "drive_lag"))
     screening = rounds[0].screening
     scores = list(screening.best_by_effect().values())

@@ -9,11 +9,11 @@ import numpy as np
 from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.linear_start import linear_start
 from psa_casadi.identification.refinement import without_blur
-from psa_casadi.identification.refitting import Progress, quick_rtol, refit
+from psa_casadi.identification.refitting import Progress, quick_from, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.starting import ordinary_values
 from psa_casadi.identification.starting_points import resolved
@@ -180,12 +180,19 @@ def _with_masses(
     found: list[Fit] = []
     for start in starts:
         free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
-        tried = _try(before, free, start, before.starts(), _FIRST, experiments)
+        states = before.starts()
+        tried = quick_from(
+            before, before.model, experiments, free,
+            start_states=states, evaluations=_FIRST, start=start,
+        )  # fmt: skip
         if tried is not None:
             found.append(tried)
     best: Fit | None = None
     for quick in sorted(found, key=lambda f: f.cost)[:_BEST]:
-        further = _try(quick, quick.unknowns.names, {}, quick.starts(), _QUICK, experiments)
+        names, states = quick.unknowns.names, quick.starts()
+        further = quick_from(
+            quick, quick.model, experiments, names, start_states=states, evaluations=_QUICK
+        )
         if further is not None and (best is None or further.cost < best.cost):
             best = further
     if best is None:
@@ -195,26 +202,3 @@ def _with_masses(
     except PsaError:
         return None
     return final if _short(before, final) > _CLEAR else None
-
-
-def _try(
-    before: Fit,
-    free: Sequence[str],
-    start: Mapping[str, float],
-    states: Sequence[Mapping[str, float]],
-    evaluations: int,
-    experiments: Sequence[Experiment],
-) -> Fit | None:
-    try:
-        return fit(
-            before.model,
-            experiments,
-            free,
-            sigma=before.sigma,
-            start=start,
-            start_states=states,
-            evaluations=evaluations,
-            rtol=quick_rtol(before.sigma, experiments),
-        )
-    except PsaError:
-        return None

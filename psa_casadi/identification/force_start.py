@@ -17,14 +17,14 @@ import numpy as np
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.excerpts import Excerpt, fastest_part
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.linear_fit import LinearFit, cost_of, fit_linear
 from psa_casadi.identification.linear_response import FloatArray
 from psa_casadi.identification.linear_start import arrangements, different
 from psa_casadi.identification.prediction import measured
 from psa_casadi.identification.refitting import (
     Progress,
-    quick_rtol,
+    quick_from,
     record_rms,
     refit,
     residual_noise,
@@ -113,18 +113,8 @@ def _begun(
     scale = values["k_L"] / best.model.values["k_L"]
     forces = {s.name for s in best.model.structure.states if s.unit == "N"}
     starts = [{n: v * (scale if n in forces else 1.0) for n, v in s.items()} for s in best.starts()]
-    try:
-        return fit(
-            best.model.with_values(values),
-            experiments,
-            names,
-            sigma=best.sigma,
-            start_states=starts,
-            evaluations=_QUICK,
-            rtol=quick_rtol(best.sigma, experiments),
-        )
-    except PsaError:
-        return None
+    model = best.model.with_values(values)
+    return quick_from(best, model, experiments, names, start_states=starts, evaluations=_QUICK)
 
 
 def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
@@ -145,7 +135,7 @@ def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
             continue
         states = simulate_record(best.model, record, memory=best.start(k)).states
         force = values["k_L"] * states["u"] + states["f_H"]
-        source = (force - force[0]) * static_compliance(values)
+        source = (force[cut] - force[cut][0]) * static_compliance(values)
         filled = np.interp(np.arange(y.size), np.flatnonzero(there), y[there])
         level = max(levels[k], _FLOOR * best.rms)
         total += valid.size
@@ -153,11 +143,11 @@ def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
             name=record.name,
             h=record.duration / steps.size,
             longest=record.duration,
-            v=source[cut] - source[cut][0],
+            v=source,
             y=filled[cut] - filled[cut][0],
             valid=valid,
             sigma=level,
-            loop=source[cut] - source[cut][0],
+            loop=source,
             static=best.rms,
         )
 

@@ -11,7 +11,7 @@ from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.prediction import predict
-from psa_casadi.identification.refitting import Progress, differing, equal, quick_rtol, refit
+from psa_casadi.identification.refitting import Progress, differing, equal, quick_from, refit
 from psa_casadi.identification.unknowns import unknowns_of
 
 #: Parameters that only fast records determine: each is freed when the data can tell it.
@@ -88,18 +88,11 @@ def _from(
     states = best.starts()
     low_high = {n: best.model.parameter(n).bounds for n in values}
     moved = {n: min(max(v, low_high[n][0]), low_high[n][1]) for n, v in values.items()}
+    model = best.model.with_values(moved)
+    quick = quick_from(best, model, experiments, free, start_states=states, evaluations=_FIRST)
+    if quick is None or quick.interrupted or quick.cost > _HOPEFUL * best.cost:
+        return None
     try:
-        quick = fit(
-            best.model.with_values(moved),
-            experiments,
-            free,
-            sigma=best.sigma,
-            start_states=states,
-            evaluations=_FIRST,
-            rtol=quick_rtol(best.sigma, experiments),
-        )
-        if quick.interrupted or quick.cost > _HOPEFUL * best.cost:
-            return None
         return fit(
             quick.model,
             experiments,

@@ -1,15 +1,17 @@
 """Continuing a fit: refits, noise levels, and whether two fits are equally good."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.errors import PsaError
 from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.prediction import measured
+from psa_casadi.model.compose import Model
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -85,6 +87,32 @@ def refit(
         start_states=previous.starts(),
         evaluations=POLISH,
     )
+
+
+def quick_from(
+    previous: Fit,
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    *,
+    start_states: Sequence[Mapping[str, float]],
+    evaluations: int,
+    start: Mapping[str, float] | None = None,
+) -> Fit | None:
+    """Fit a little from other values, weighted as before; None if these cannot be simulated."""
+    try:
+        return fit(
+            model,
+            experiments,
+            free,
+            sigma=previous.sigma,
+            start=start,
+            start_states=start_states,
+            evaluations=evaluations,
+            rtol=quick_rtol(previous.sigma, experiments),
+        )
+    except PsaError:
+        return None
 
 
 def equal(one: Fit, other: Fit) -> bool:
