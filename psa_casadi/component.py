@@ -94,7 +94,9 @@ class Component:
     drive it cannot be told from distortion. `belongs_to` is plant, drive, sensor or environment;
     the last two stay out of exported plants. `needs` names components without which this one
     means nothing. `trial_starts` are starts of its memory states at which it is looked for, where
-    it does nothing at their ordinary start.
+    it does nothing at their ordinary start. `curve` names the quantity over which an effect bends
+    a static curve, in a form of its own: effects with the same one differ, below the resonances,
+    by these forms only.
 
     `sampled` are states that change at sample instants only: at every time that is a multiple of
     the parameter `sample_period` [s], whoever declares it, each takes the value in
@@ -119,5 +121,6 @@ class Component:
     belongs_to: str = "plant"
     needs: tuple[str, ...] = ()
     trial_starts: tuple[Mapping[str, float], ...] = ()
+    curve: str | None = None
     sampled: tuple[State, ...] = ()
     sample_period: str | None = None

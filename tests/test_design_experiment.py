@@ -36,12 +36,12 @@ NOISE = SensorNoise(20e-9)
 BRIEF = Effort(draws=2, starts=1, steps=3)
 
 
-def rivals() -> list[Rival]:
-    """A bent sensor and creep, each of a fifth of its ordinary size."""
+def rivals(share: float = 0.2, bent: str = "sensor_nonlinearity") -> list[Rival]:
+    """A bent sensor (or another effect) and creep, each of a share of its ordinary size."""
     found = []
-    for effect in (EFFECTS[n] for n in ("sensor_nonlinearity", "slow_creep")):
+    for effect in (EFFECTS[n] for n in (bent, "slow_creep")):
         model = stack_model(STACK).with_effect(effect)
-        size = 0.2 * model.parameter(effect.gain or "").typical(model.values)
+        size = share * model.parameter(effect.gain or "").typical(model.values)
         found.append(rival_of_effect(model.with_values({effect.gain or "": size}), effect, FREE))
     return found
 
@@ -90,7 +90,9 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
     criterion: Criterion
     if which == "separation":
         noise = NOISE.on_grid(LIMITS, LIMITS.samples)
-        criterion = Separation(tuple(rivals()), noise, evaluations=60)
+        # rivals whose fits again stay in one minimum while this voltage moves
+        bent = "rate_independent_asymmetry" if kind == "multisine" else "sensor_nonlinearity"
+        criterion = Separation(tuple(rivals(bent=bent)), noise, evaluations=60)
     else:
         optimality: Optimality = "D" if which == "D" else "E" if which == "E" else "A"
         colour = SensorNoise(20e-9, 0.4).on_grid(LIMITS, LIMITS.samples)
@@ -148,7 +150,7 @@ def _slope(model: Model, record: Record, name: str, step: float) -> FloatArray:
 
 
 def test_the_distance_is_what_an_independent_optimiser_leaves() -> None:
-    one, other = rivals()
+    other, one = rivals(1.0)
     record, noise = planned("steps"), NOISE.on_grid(LIMITS, LIMITS.samples)
     found = Separation((one, other), noise).distances(record)
     target = one.predict(record, np.zeros(one.size))
@@ -158,7 +160,7 @@ def test_the_distance_is_what_an_independent_optimiser_leaves() -> None:
         gap = (target - other.predict(record, delta)) / NOISE.rms
         return np.concatenate([gap, root @ delta])
 
-    best = least_squares(rest, np.zeros(other.size), diff_step=[1e-4], x_scale="jac", max_nfev=60)
+    best = least_squares(rest, np.zeros(other.size), x_scale="jac", method="lm")
     assert found[one.name, other.name] == pytest.approx(2.0 * best.cost, rel=0.05)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
+from numpy.polynomial import Legendre
 from numpy.typing import NDArray
 
 from psa_casadi.component import Component
@@ -160,17 +161,24 @@ def test_a_record_may_begin_before_the_leakage_has_settled() -> None:
     np.testing.assert_allclose(found["u"], 70.0 + 18.0 * np.exp(-t / 2.0), rtol=1e-4)
 
 
-@pytest.mark.parametrize("cubic", [0.0, -2 / 3])
-def test_a_bent_sensor_reads_a_function_of_the_displacement_alone(cubic: float) -> None:
-    model = with_effect(SENSOR_NONLINEARITY, nonlinearity_gain=0.05, nonlinearity_cubic=cubic)
+@pytest.mark.parametrize(("angle", "wave"), [(0.0, 0.0), (np.pi / 2, 0.0), (-1.0, 0.3)])
+def test_a_bent_sensor_reads_a_function_of_the_displacement_alone(
+    angle: float, wave: float
+) -> None:
+    """The bend is a Legendre series on 0 to 1 without its constant and its slope."""
+    model = with_effect(
+        SENSOR_NONLINEARITY, nonlinearity_gain=0.01, nonlinearity_angle=angle,
+        nonlinearity_wave=wave,
+    )  # fmt: skip
     t = np.linspace(0.0, 2.0, 2001)
     voltage = 60.0 * (1.0 - np.cos(4 * np.pi * t)) * (0.5 + 0.25 * t)
     found = simulated(model, t, voltage)
     x, size = found["displacement"], stroke(model)
     residual = found["measured_displacement"] - x
-    expected = 0.05 * ((x / size) ** 2 + cubic * (x / size) ** 3) * size
-    np.testing.assert_allclose(residual, expected, rtol=0, atol=1e-9 * size)
-    assert 0.01 * size < residual.max() < 0.05 * size
+    series = Legendre([0.0, 0.0, np.cos(angle), np.sin(angle), wave], domain=[0.0, 1.0])
+    bent = series(x / size) - series(0.0) - series.deriv()(0.0) * x / size
+    np.testing.assert_allclose(residual, 0.01 * bent * size, rtol=0, atol=1e-9 * size)
+    assert 0.01 * size < np.abs(residual).max() < 0.2 * size
     # the branches lie apart against the voltage, and on each other against the displacement
     rising = np.gradient(x) > 0
     at = np.linspace(0.2, 0.6, 9)

@@ -107,14 +107,17 @@ def test_load_hardens_with_displacement(
 ) -> None:
     """k x + h k_s x^3 / x_s^2 = the force that holds the linear stack there, whoever exerts it."""
     t = np.linspace(0.0, 1.0, 201)
-    model, plain = (linear(LOAD_STIFFNESS, h, base) for h in (1.0, 0.0))
+    angle, gain = np.arctan(0.2), 0.05  # a pure cubic
+    model, plain = (linear(LOAD_STIFFNESS, g, base, load_angle=angle) for g in (gain, 0.0))
     x, free = (
         driven(m, t, volt * np.minimum(t / 0.5, 1.0), force).y[-1, -1] for m in (model, plain)
     )
     p = model.values
     k = p["k_B"] if "k_B" in p else p["k"]
     k_s, x_s = stiffness_scale(p), stroke_scale(p)
-    assert k * x + k_s * x**3 / x_s**2 == pytest.approx(k * free, rel=1e-5)
+    h = 20.0 * gain * np.sin(angle)
+    levelled = x / (1.0 + (x / (1.5 * x_s)) ** 8) ** 0.125
+    assert k * x + h * k_s * levelled**3 / x_s**2 == pytest.approx(k * free, rel=1e-5)
     assert x < 0.97 * free
 
 

@@ -10,7 +10,9 @@ from psa_casadi.bench.hidden_cases import Case, Found
 from psa_casadi.bench.hidden_controls import CONTROLS, control_table
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.evidence import bic_probabilities
+from psa_casadi.diagnosis.extension import extend
 from psa_casadi.diagnosis.rounds import examine
+from psa_casadi.diagnosis.selection import LEAST, choose, starts_of
 from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment import Record
@@ -42,6 +44,21 @@ def _round(fitted: tuple[Fit, tuple[Experiment, ...]], method: Method) -> dict[s
     current = examine(found, tuple(found.predicted(experiments)), task)
     scores = {n: s.decrease for n, s in current.screening.best_by_effect().items()}
     return {**scores, "correlation": float(np.sum(current.screening.colour.autoregression[0]))}
+
+
+def test_an_effect_with_hardly_any_evidence_is_not_worth_a_name(
+    fitted: tuple[Fit, tuple[Experiment, ...]],
+) -> None:
+    """A clean record's threshold is passed by chance; an imitator at odds of 1.6 was named."""
+    found, experiments = fitted
+    predicted = tuple(found.predicted(experiments))
+    seen = examine(found, predicted, Task(experiments, (EFFECTS["slow_creep"],)))
+    colour = seen.screening.colour
+    extension = extend(found, experiments, starts_of(seen.screening, "slow_creep"), colour)
+    assert extension is not None
+    for evidence, count in ((extension.evidence, 1), (LEAST - 0.1, 0)):
+        one = replace(extension, evidence=evidence)
+        assert len(choose([one], experiments, found, predicted, colour, None)) == count
 
 
 def test_without_finite_steps_an_effect_with_a_threshold_is_not_seen(

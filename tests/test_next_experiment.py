@@ -17,6 +17,7 @@ from psa_casadi.input_design import experiment
 from psa_casadi.input_design.designs import Separated
 from psa_casadi.input_design.experiment import resolving_experiment
 from psa_casadi.input_design.limits import excess
+from psa_casadi.input_design.rivals import noise_of_fit, rival_of_fit
 from psa_casadi.input_design.search import Effort
 from psa_casadi.report.text import story
 from tests.plants.again import play_again
@@ -62,6 +63,24 @@ def test_the_first_record_leaves_two_causes_open(loop: Loop) -> None:
     for contender in d.contenders:
         assert contender.evidence == pytest.approx(known[contender.effect])
         assert contender.effect in {c.name for c in contender.fit.model.effects}
+
+
+def test_a_rival_that_is_the_truth_has_a_standard_error_less_of_its_effect(loop: Loop) -> None:
+    d = loop.ambiguous
+    best = min(d.contenders, key=lambda c: c.fit.rms).fit
+    _, colour = noise_of_fit(best, d.experiments)
+    for contender in d.contenders:
+        rival = rival_of_fit(contender.effect, contender.fit, colour)
+        gain = EFFECTS[contender.effect].gain or ""
+        model, start = rival.moved(rival.truth)
+        fitted = rival.model.values[gain]
+        assert 0.2 < model.values[gain] / fitted < 1.0
+        assert not any(start.values())
+        assert rival.less is not None
+        # as likely as the data at hand make one standard error
+        assert 0.0 < rival.less @ rival.known @ rival.less < 1.001
+    base = rival_of_fit("base", d.base_fit, colour)
+    assert not np.any(base.truth)
 
 
 def test_the_designed_record_is_like_the_first_and_tells_more_than_a_sine(loop: Loop) -> None:

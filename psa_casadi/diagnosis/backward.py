@@ -43,7 +43,7 @@ def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
             rounds = _rebuilt(rounds[0], causes, better.fit, task) or rounds
         weights.append((k, found))
     for k, found in weights if task.method.weights == "evidence" else ():
-        weigh_again(rounds[k], found)
+        weigh_again(rounds[k], found, task)
     return rounds
 
 

@@ -30,13 +30,15 @@ def contenders(
     """
     names = names or credible_set(r.probability, CREDIBLE)
     found = {e.effect.name: e for e in r.extensions}
+    evidence = dict(r.evidence)
     for name in names:
         if name not in found:
             scores = starts_of(r.screening, name)
             fitted = extend(r.fit, experiments, scores, r.screening.colour) if scores else None
             if fitted is not None:
                 found[name] = polish(r.fit, fitted, experiments, r.screening.colour)
-    return tuple(Contender(n, found[n].fit, found[n].evidence) for n in names if n in found)
+                evidence[name] = found[name].evidence
+    return tuple(Contender(n, found[n].fit, evidence[n]) for n in names if n in found)
 
 
 def fit_contenders(

@@ -18,6 +18,7 @@ from psa_casadi.diagnosis.retries import (
     from_mode,
     from_resonances,
     instead_of,
+    rings,
 )
 from psa_casadi.diagnosis.rounds import AFRESH, Round, decide, examine, search_cause
 from psa_casadi.diagnosis.selection import OF_FIRST
@@ -44,8 +45,6 @@ PROMISE, REMAINDER = 0.5, 0.35
 AS_GOOD = 1.005
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
-#: Sampling interval [s] below which a stack may ring within the record's band.
-FAST = 7e-4
 
 
 def diagnose(
@@ -104,7 +103,7 @@ def _search(base: Fit, task: Task) -> list[Round]:
     """Forward selection: add the best effect until nothing is seen or nothing helps."""
     rounds = _forward(base, task)
     tried = [rounds]
-    if _open(rounds) and not _fast(task):
+    if _open(rounds) and not task.fast:
         better = from_resonances(rounds[0].fit, task.experiments, task.progress)
         if better is not None:
             tried.append(rounds := _forward(better, task))
@@ -117,10 +116,6 @@ def _search(base: Fit, task: Task) -> list[Round]:
         if _open(rounds):
             rounds = min(rounds, _any(earlier, task), key=_left)
     return _settle(reconsidered(rounds, task), task)
-
-
-def _fast(task: Task) -> bool:
-    return min(e.record.sample_time for e in task.experiments) < FAST
 
 
 def _left(rounds: Sequence[Round]) -> float:
@@ -163,7 +158,7 @@ def _open(rounds: Sequence[Round]) -> bool:
 def _forward(base: Fit, task: Task) -> list[Round]:
     """Make sure of the base where something is missing, then add causes."""
     first = _round(base, task)
-    if _fast(task) and first.test.alarm:
+    if task.fast and first.test.alarm:
         resonant = from_resonances(first.fit, task.experiments, task.progress)
         first = first if resonant is None else _round(resonant, task)
     return _causes([first], task, retry=True)
@@ -198,8 +193,7 @@ def _retried(rounds: Sequence[Round], tried: set[str], task: Task) -> Fit | None
     chosen = current.chosen
     if chosen is None:
         return None
-    rings = chosen.effect.tone is not None and chosen.effect.belongs_to == "plant"
-    if rings and "mode" not in tried:
+    if rings(chosen) and "mode" not in tried:
         tried.add("mode")
         own = from_mode(base, current.fit, chosen, task.experiments, task.progress)
         if own is not None:
@@ -211,7 +205,7 @@ def _retried(rounds: Sequence[Round], tried: set[str], task: Task) -> Fit | None
     again = from_extension(base, chosen, task.experiments)
     if again is not None and again.rms < BETTER_BASE * base.rms:
         return again
-    return None if rings else instead_of(base, chosen, task.experiments, task.progress)
+    return instead_of(base, chosen, task.experiments, task.progress)
 
 
 def _round(base: Fit, task: Task) -> Round:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.diagnosis.extension import Extension
+from psa_casadi.diagnosis.task import FAST
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
@@ -118,20 +119,28 @@ def from_mode(
 def instead_of(
     base: Fit, extension: Extension, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit the base with a resonance near or above the band where an effect was found.
+    """Fit the base with resonances of its own where an effect was found.
 
-    None where no mass explains the data about as well as the effect: a resonance above the band
-    delays what is within it, as a lag would.
+    None where no masses explain the data about as well as the effect. A resonance above the band
+    delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
+    what looks like a further mode.
     """
     rate = 1.0 / min(e.record.sample_time for e in experiments)
-    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
+    if _NEAR_BAND[0] < rate < _NEAR_BAND[1] and not rings(extension):
+        progress(f"base fit, with resonances instead of {extension.effect.name}")
+        starts = list(_masses(base.model.values, [g * rate for g in _GRID], _DAMPING))
+        found = _with_masses(base, starts, experiments)
+        if found is not None and _short(found, extension.fit) < _LIKE:
+            return _tuned(found, experiments, progress)
+    if rate * FAST < 1.0:
         return None
-    progress(f"base fit, with resonances instead of {extension.effect.name}")
-    starts = list(_masses(base.model.values, [g * rate for g in _GRID], _DAMPING))
-    found = _with_masses(base, starts, experiments)
-    if found is None or _short(found, extension.fit) >= _LIKE:
-        return None
-    return _tuned(found, experiments, progress)
+    again = retuned(base, experiments, progress, reached=extension.fit.rms)
+    return without_blur(again, experiments) if _short(again, extension.fit) < _LIKE else None
+
+
+def rings(extension: Extension) -> bool:
+    """Whether an effect is a further resonance of the plant."""
+    return extension.effect.tone is not None and extension.effect.belongs_to == "plant"
 
 
 def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:

@@ -6,7 +6,7 @@ between those that are nearly as likely. Beside the second cause they show.
 
 from collections.abc import Mapping
 
-from psa_casadi.diagnosis.evidence import probabilities
+from psa_casadi.diagnosis.evidence import levelled, probabilities
 from psa_casadi.diagnosis.extension import Extension, extend_within, polish
 from psa_casadi.diagnosis.rounds import NEAR, RUNNER_UP, Round
 from psa_casadi.diagnosis.selection import MARGIN, out_of_character
@@ -42,13 +42,14 @@ def beside(
     return found, best if best is not None and best.evidence > own + MARGIN else None
 
 
-def weigh_again(step: Round, found: Mapping[str, float]) -> None:
+def weigh_again(step: Round, found: Mapping[str, float], task: Task) -> None:
     """Give a step the evidence beside the other causes; what was not fitted keeps its distance."""
     if step.chosen is None or step.chosen.effect.name not in found:
         return
     own = step.chosen.effect.name
     shift = found[own] - step.evidence[own]
-    step.evidence = {n: found.get(n, e + shift) for n, e in step.evidence.items()}
+    moved = {n: found.get(n, e + shift) for n, e in step.evidence.items()}
+    step.evidence = levelled(moved, task.alike)
     step.probability = probabilities({n: step.evidence[n] for n in step.probability})
 
 

@@ -8,7 +8,12 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms, residual_colour
-from psa_casadi.diagnosis.evidence import bic_probabilities, estimated, probabilities
+from psa_casadi.diagnosis.evidence import (
+    bic_probabilities,
+    estimated,
+    levelled,
+    probabilities,
+)
 from psa_casadi.diagnosis.extension import (
     Extension,
     extend,
@@ -79,7 +84,7 @@ def examine(
     time = np.concatenate([e.record.time[e.used] for e in task.experiments])
     floor = noise_rms(fit.residuals, screening.colour)
     test = omnibus(fit.residuals, voltage, time, screening.colour, floor, even=bool(known))
-    guess = estimated(fit, screening)
+    guess = levelled(estimated(fit, screening), task.alike)
     return Round(
         fit,
         predicted,
@@ -178,7 +183,7 @@ def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:
     """Give every effect its evidence and, unless a full fit showed it unfit, its probability."""
     fitted = {e.effect.name: e.evidence for e in current.extensions}
     refused = {name for name in fitted if name not in {e.effect.name for e in worth}}
-    current.evidence = {**current.evidence, **fitted}
+    current.evidence = levelled({**current.evidence, **fitted}, task.alike)
     if task.method.weights == "bic":
         current.probability = bic_probabilities(
             current.fit, {e.effect.name: e.fit for e in worth}, current.screening.colour

@@ -24,6 +24,8 @@ FULL_FITS, _MOST_FITS, _AS_NEAR = 4, 7, 0.4
 _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
+#: Evidence below which nothing is named: 7 to 1.
+LEAST = 2.0
 #: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
 MARGIN = 3.0
 #: Share of the excess power that an effect must remove to be added, and share of what the best one
@@ -85,18 +87,18 @@ def choose(
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
-    Worth having: evidence; the effect in character; a share of the training residual's power above
-    the noise removed, or nearly what another one removes that does; and held-out data predicted
-    better than by the model `before`, whose predictions are given. A further cause, beside the
-    `first`, must also remove a share of what that one did. The order is that of the evidence;
-    within the margin the better prediction leads.
+    Worth having: evidence above `LEAST`; the effect in character; a share of the training
+    residual's power above the noise removed, or nearly what another one removes that does; and
+    held-out data predicted better than by the model `before`, whose predictions are given. A
+    further cause, beside the `first`, must also remove a share of what that one did. The order is
+    that of the evidence; within the margin the better prediction leads.
     """
     least = WORTHWHILE * max(0.0, excess_power(before.residuals, colour))
     held = _HeldOut(experiments, predicted, colour)
     fit = [
         e
         for e in extensions
-        if e.evidence > 0
+        if e.evidence > LEAST
         and not out_of_character(e, experiments)
         and (first is None or e.removed > OF_FIRST * first.removed)
         and held.gained(e) > (held.promised(e) if first is None else HELD_OUT_FURTHER)

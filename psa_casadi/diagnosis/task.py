@@ -7,6 +7,9 @@ from typing import Literal
 from psa_casadi.component import Component
 from psa_casadi.experiment.split import Experiment
 
+#: Sampling interval [s] below which a stack may ring within the record's band.
+FAST = 7e-4
+
 
 @dataclass(frozen=True)
 class Method:
@@ -33,3 +36,14 @@ class Task:
     table: tuple[Component, ...]
     method: Method = field(default_factory=Method)
     progress: Callable[[str], None] = lambda _: None
+
+    @property
+    def fast(self) -> bool:
+        """Whether a stack may ring within a record's band."""
+        return min(e.record.sample_time for e in self.experiments) < FAST
+
+    @property
+    def alike(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of effects that these records cannot tell apart but by forms nobody knows."""
+        curves = () if self.fast else sorted({e.curve for e in self.table if e.curve is not None})
+        return tuple(tuple(e.name for e in self.table if e.curve == c) for c in curves)

@@ -1,21 +1,19 @@
 """Sensor nonlinearity: the reading is a bent function of the displacement.
 
 A constant and a slope are the sensor's offset and its sensitivity, which a fit takes for the
-stack's own; what remains of a smooth curve is its quadratic, its cubic and its quartic part. With
-the quadratic alone it is a bow; with nonlinearity_cubic = -2/3 it is an S about the middle of the
-stroke; an S about another place needs the quartic too.
+stack's own; what remains of a smooth curve is a bow, an S and a W.
 """
 
 from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.effects.bend import ANGLES, BEND_TEXT, bend, shape_parameters
 from psa_casadi.effects.sizes import stroke
 from psa_casadi.variables import Parameter
 
 
 def _equations(s: Symbols) -> Equations:
     full = stroke(s)
-    q = s.displacement / full
-    bend = q**2 * (1 + s.nonlinearity_cubic * q + s.nonlinearity_quartic * q**2)
-    return Equations(add={"measured_displacement": s.nonlinearity_gain * full * bend})
+    curve = bend(s.displacement / full, s.nonlinearity_angle, s.nonlinearity_wave)
+    return Equations(add={"measured_displacement": s.nonlinearity_gain * full * curve})
 
 
 SENSOR_NONLINEARITY = Component(
@@ -25,21 +23,22 @@ SENSOR_NONLINEARITY = Component(
     belongs_to="sensor",
     gain="nonlinearity_gain",
     equation_text=(
-        "x_m = x + nonlinearity_gain stroke (q^2 + nonlinearity_cubic q^3 + nonlinearity_quartic"
-        " q^4),  q = x/stroke,  stroke = k_L u_rated over the static stiffness"
+        "x_m = x + nonlinearity_gain stroke b(x/stroke),  stroke = k_L u_rated over the static"
+        " stiffness,  " + BEND_TEXT.format("nonlinearity")
     ),
     parameters=(
         Parameter(
-            "nonlinearity_gain", 0.0, "1", (-0.5, 0.5), "quadratic part over stroke", scale=0.01
+            "nonlinearity_gain",
+            0.0,
+            "1",
+            (-0.1, 0.1),
+            "bow and S over the stroke, beyond the best straight line",
+            scale=0.002,
         ),
-        Parameter(
-            "nonlinearity_cubic", 0.0, "1", (-10.0, 10.0), "cubic over quadratic part", scale=0.5
-        ),
-        Parameter(
-            "nonlinearity_quartic", 0.0, "1", (-10.0, 10.0), "quartic over quadratic", scale=0.5
-        ),
+        *shape_parameters("nonlinearity"),
     ),
     equations=_equations,
-    probe={"nonlinearity_cubic": (-0.7, 0.0)},
+    curve="displacement",
+    probe={"nonlinearity_angle": ANGLES},
     looks_like="the residual is a function of the displacement alone, the same on both branches",
 )

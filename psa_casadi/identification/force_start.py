@@ -54,16 +54,20 @@ _FREE = ("m_P", "m_B", "k_P")
 _FORCES = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
 
 
-def retuned(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+def retuned(
+    best: Fit, experiments: Sequence[Experiment], progress: Progress, *, reached: float = np.inf
+) -> Fit:
     """Return a fit whose mechanics was sought again while that explains more; `best` if nothing.
 
-    Needs two resonators (k_P, k_B); records on instants that are not uniform do not contribute. A
-    keyboard interrupt ends it at the best fit so far.
+    It is sought while records miss more than their own fast part, which holds some of a misfit's
+    ringing, or than the rms [m] that another model has `reached`. Needs two resonators (k_P, k_B);
+    records on instants that are not uniform do not contribute. A keyboard interrupt ends it at the
+    best fit so far.
     """
     if "k_P" not in best.model.values:
         return best
     for _ in range(_REPEATS):
-        if best.interrupted or not _misses(best, experiments):
+        if best.interrupted or not (best.rms > reached or _misses(best, experiments)):
             return best
         progress("base fit, mechanics again behind the force found")
         try:

@@ -25,6 +25,8 @@ from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 
+#: Standard errors by which the cautious truth has less of its effect, and the most that it loses.
+_CAUTION, _LOSS = 1.0, 0.75
 #: Tolerance of trajectories: far below what a step of the gradient changes.
 RTOL = 1e-6
 _STEPS = 4000
@@ -58,7 +60,8 @@ class Rival:
     """A model with the coordinates `theta` (k,) of its free parameters and what is known of them.
 
     `known` (k, k) is the information of the records at hand and the priors; `evidence` is ln of the
-    Bayes factor over the base that those records give.
+    Bayes factor over the base that those records give. `less` (k,) is the way from `theta` to what
+    the rival is taken for where it is the truth.
     """
 
     name: str
@@ -67,6 +70,14 @@ class Rival:
     theta: FloatArray
     known: FloatArray
     evidence: float = 0.0
+    less: FloatArray | None = None
+
+    @property
+    def truth(self) -> FloatArray:
+        """Return the coordinates (size,) at which it is the truth that a record shall show."""
+        own = np.zeros(len(self.theta)) if self.less is None else self.less
+        low, high = self.bounds()
+        return np.clip(np.append(own, np.zeros(self.size - len(own))), low, high)
 
     @property
     def size(self) -> int:
@@ -137,7 +148,26 @@ def rival_of_fit(name: str, fit: Fit, colour: Colour, evidence: float = 0.0) -> 
     full = white.T @ white + np.diag(1.0 / fit.unknowns.prior**2)
     inner, cross = full[count:, count:], full[:count, count:]
     known = full[:count, :count] - cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T
-    return Rival(name, fit.model, fit.unknowns, fit.theta[:count].copy(), known, evidence)
+    less = _less(name, fit, known)
+    return Rival(name, fit.model, fit.unknowns, fit.theta[:count].copy(), known, evidence, less)
+
+
+def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
+    """Return the way (k,) to the likeliest values with a standard error less of an effect's gain.
+
+    Where a record hardly tells how strong an effect is, its fit may be far too strong, and what
+    would tell that from a rival may not tell the truth. theta moves by C_g / C_gg of the gain's.
+    """
+    gain = next((c.gain for c in fit.model.components if c.name == name), None)
+    names = fit.unknowns.names
+    if gain is None or gain not in names:
+        return np.zeros(len(names))
+    k = names.index(gain)
+    own = np.linalg.pinv(known, hermitian=True)[:, k]
+    size = fit.model.values[gain] / fit.unknowns.scale[k]
+    shift = min(_CAUTION * float(np.sqrt(max(own[k], 0.0))), _LOSS * abs(size))
+    less: FloatArray = -float(np.sign(size)) * shift * own / max(own[k], 1e-300)
+    return less
 
 
 def rival_of_model(name: str, model: Model, free: Sequence[str]) -> Rival:

@@ -2,12 +2,13 @@
 
     T(a, b) = min over delta of |W (y_a(v) - y_b(v, delta))|^2 + delta^T H_b delta
 
-y_a is what rival a predicts for the voltage v, y_b what rival b does at coordinates delta away from
-its fit (parameters, initial states, offset), W whitens the noise, and H_b is what the data at hand
-know of b: it may move only where they let it. If a is true, ln of the Bayes factor of a over b is
-expected to grow by T/2 with variance T. The value is the logarithm of the harmonic mean of all
-T(a, b). Sources: Atkinson and Fedorov, Biometrika 62 (1975), 57 (T-optimality); for Gaussian noise
-T/2 is the Kullback-Leibler distance (Lopez-Fidalgo, Tommasi and Trandafir 2007).
+y_a is what rival a predicts for the voltage v, its effect a standard error weaker than fitted, y_b
+what rival b does at coordinates delta away from its fit (parameters, initial states, offset), W
+whitens the noise, and H_b is what the data at hand know of b: it may move only where they let it.
+If a is true, ln of the Bayes factor of a over b is expected to grow by T/2 with variance T. The
+value is the logarithm of the harmonic mean of all T(a, b). Sources: Atkinson and Fedorov,
+Biometrika 62 (1975), 57 (T-optimality); for Gaussian noise T/2 is the Kullback-Leibler distance
+(Lopez-Fidalgo, Tommasi and Trandafir 2007).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -64,7 +65,7 @@ class Separation:
         value = overall([r.distance for r in found.values()])
 
         def frozen(other: Record) -> float:
-            plain = [r.predict(other, np.zeros(r.size)) for r in self.rivals]
+            plain = [r.predict(other, r.truth) for r in self.rivals]
             moved = 0.0
             for (a, b), r in found.items():
                 gap = plain[a] - self.rivals[b].predict(other, r.delta)
@@ -82,11 +83,11 @@ class Separation:
 
     def distance(self, truth: Rival, other: Rival, record: Record) -> float:
         """Return T of one pair, fitted to the end."""
-        target = truth.predict(record, np.zeros(truth.size))
+        target = truth.predict(record, truth.truth)
         return self._refit(target, other, record, FINAL).distance
 
     def _refits(self, record: Record, steps: int) -> dict[tuple[int, int], _Refit]:
-        plain = [r.predict(record, np.zeros(r.size)) for r in self.rivals]
+        plain = [r.predict(record, r.truth) for r in self.rivals]
         return {
             (a, b): self._refit(plain[a], self.rivals[b], record, steps)
             for a in range(len(self.rivals))

@@ -1,0 +1,55 @@
+"""Effects that records cannot tell apart but by a form nobody knows stay together in a set."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.evidence import levelled
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment.reading import read_record
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import split
+from tests.plants.make import make_record
+
+TABLE = tuple(EFFECTS.values())
+BENDS = ("load_stiffness", "sensor_nonlinearity")
+
+
+def test_the_best_evidence_counts_for_all_of_a_group() -> None:
+    given = {"a": 3.0, "b": 7.0, "c": 5.0}
+    assert levelled(given, [("a", "b"), ("d",)]) == {"a": 7.0, "b": 7.0, "c": 5.0}
+    assert levelled(given, []) == given
+
+
+@pytest.mark.parametrize(("rate", "alike"), [(1e3, (BENDS,)), (2e4, ())])
+def test_bends_are_alike_where_no_resonance_can_show(
+    rate: float, alike: tuple[tuple[str, ...], ...]
+) -> None:
+    time = np.arange(200) / rate
+    record = Record("r", time, np.sin(0.2 * rate * time), np.sin(0.2 * rate * time))
+    task = Task((split(record),), TABLE)
+    assert tuple(tuple(sorted(group)) for group in task.alike) == alike
+
+
+@pytest.mark.parametrize(
+    ("hidden", "seed", "rho"),
+    [
+        ("preload_loss", 61007, (0.3, 3.0)),  # its own entry is left out
+        ("guide_stiffness", 93278, (0.3, 3.0)),  # a foreign one
+        ("sensor_nonlinearity", 1, (2.0, 2.5)),  # an arc tangent is no polynomial
+    ],
+)
+def test_a_bend_is_not_blamed_on_the_sensor_alone(
+    hidden: str, seed: int, rho: tuple[float, float], tmp_path: Path
+) -> None:
+    path = tmp_path / "a.csv"
+    make_record(hidden, seed, path, visible=rho)
+    record = read_record(path).slice(0, 3000)
+    found = diagnose([record], effects=[EFFECTS[n] for n in BENDS])
+    assert found.verdict == "ambiguous"
+    (cause,) = found.causes
+    assert {cause.effect, *cause.cannot_be_told_from} == set(BENDS)
+    assert cause.confidence == pytest.approx(0.5, abs=0.01)
