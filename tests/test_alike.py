@@ -5,13 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psa_casadi.cli import diagnose as command
+from psa_casadi.diagnosis.contenders import one_of_each
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.evidence import levelled
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
 from psa_casadi.experiment.reading import read_record
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import split
+from psa_casadi.input_design.experiment import resolving_experiment
 from tests.plants.make import make_record
 
 TABLE = tuple(EFFECTS.values())
@@ -53,3 +57,9 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(
     (cause,) = found.causes
     assert {cause.effect, *cause.cannot_be_told_from} == set(BENDS)
     assert cause.confidence == pytest.approx(0.5, abs=0.01)
+    assert "no voltage below the resonances tells" in found.next_experiment.why
+    told, _ = one_of_each(found.contenders, found.experiments)
+    assert len(told) == 1
+    with pytest.raises(InputError, match="bend the same curve"):
+        resolving_experiment(found)
+    assert command._with_next(found, tmp_path / "next.csv", lambda _: None) is found

@@ -15,6 +15,7 @@ import numpy as np
 
 from psa_casadi.bench.hidden_cases import plants
 from psa_casadi.bench.outcome import Progress, TitledTable
+from psa_casadi.diagnosis.contenders import one_of_each
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.rounds import examine
@@ -115,6 +116,10 @@ def resolve(seed: int) -> Resolved | None:
         d = diagnose([first], effects=pair)
         if d.verdict != "ambiguous" or len(d.contenders) < 2:
             return None
+        if len(one_of_each(d.contenders, d.experiments)[0]) < 2:
+            nothing = dict.fromkeys(_PLAYED, 0.0)
+            left = dict.fromkeys(_PLAYED, "open")
+            return Resolved(seed, effect, rival, voltage, "none", left, nothing, 0.0, None, 0.0)
         designed = resolving_experiment(d)
     except PsaError:
         return None

@@ -102,12 +102,16 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     from dataclasses import replace
 
+    from psa_casadi.diagnosis.contenders import one_of_each
     from psa_casadi.diagnosis.result import NextExperiment
     from psa_casadi.errors import PsaError
     from psa_casadi.input_design.experiment import resolving_experiment
     from psa_casadi.report.experiment_part import sentences, write_voltage
 
     if path is None or d.verdict != "ambiguous":
+        return d
+    told, same = one_of_each(d.contenders, d.experiments)
+    if same and len(told) < 2:
         return d
     try:
         design = resolving_experiment(d, progress=progress)
@@ -116,7 +120,7 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
         return replace(d, next_experiment=replace(d.next_experiment, why=why))
     write_voltage(path, design.record)
     said = " ".join(sentences(design, d.model.values.get("C_p")))
-    why = f"Play {path} and diagnose all records together. {said}"
+    why = f"Play {path} and diagnose all records together. {said} {same}".rstrip()
     following = NextExperiment(str(path), design.names, why, dict(design.chance))
     return replace(d, next_experiment=following)
 

@@ -8,7 +8,7 @@ from psa_casadi.diagnosis.extension import extend, polish
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.rounds import Round, examine
 from psa_casadi.diagnosis.selection import starts_of
-from psa_casadi.diagnosis.task import Task
+from psa_casadi.diagnosis.task import Task, same_curves
 from psa_casadi.errors import InputError
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment, whole
@@ -39,6 +39,30 @@ def contenders(
                 found[name] = polish(r.fit, fitted, experiments, r.screening.colour)
                 evidence[name] = found[name].evidence
     return tuple(Contender(n, found[n].fit, evidence[n]) for n in names if n in found)
+
+
+def one_of_each(
+    found: Sequence[Contender], experiments: Sequence[Experiment]
+) -> tuple[tuple[Contender, ...], str]:
+    """Return contenders of which a voltage may tell one from another, and what none will tell.
+
+    Of effects that bend the same curve the first one stands for all; the sentence is empty where
+    there are none.
+    """
+    own = {c.effect: next(e for e in c.fit.model.components if e.name == c.effect) for c in found}
+    groups = same_curves(experiments, tuple(own.values()))
+    rest = {name for group in groups for name in group[1:]}
+    said = " ".join(same_curve_note(group) for group in groups)
+    return tuple(c for c in found if c.effect not in rest), said
+
+
+def same_curve_note(names: Sequence[str]) -> str:
+    """Return the sentence on effects that bend the same curve."""
+    return (
+        f"{' and '.join(names)} bend the same curve: no voltage below the resonances tells one from"
+        " another. Measure with another sensor or elsewhere in the range of this one, or without"
+        " the load; or sample fast enough to excite and see the resonances."
+    )
 
 
 def fit_contenders(

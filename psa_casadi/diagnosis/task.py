@@ -1,6 +1,6 @@
 """What a search for causes works on, and by which method."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -40,10 +40,22 @@ class Task:
     @property
     def fast(self) -> bool:
         """Whether a stack may ring within a record's band."""
-        return min(e.record.sample_time for e in self.experiments) < FAST
+        return _fast(self.experiments)
 
     @property
     def alike(self) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot tell apart but by forms nobody knows."""
-        curves = () if self.fast else sorted({e.curve for e in self.table if e.curve is not None})
-        return tuple(tuple(e.name for e in self.table if e.curve == c) for c in curves)
+        return same_curves(self.experiments, self.table)
+
+
+def same_curves(
+    experiments: Sequence[Experiment], effects: Sequence[Component]
+) -> tuple[tuple[str, ...], ...]:
+    """Return groups of effects that bend the same curve, if no record can show a resonance."""
+    curves = () if _fast(experiments) else sorted({e.curve for e in effects if e.curve is not None})
+    groups = (tuple(e.name for e in effects if e.curve == c) for c in curves)
+    return tuple(group for group in groups if len(group) > 1)
+
+
+def _fast(experiments: Sequence[Experiment]) -> bool:
+    return min(e.record.sample_time for e in experiments) < FAST

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.contenders import contenders
+from psa_casadi.diagnosis.contenders import contenders, same_curve_note
 from psa_casadi.diagnosis.errors_of import errors_of, explained_share, gain_of, whole_residuals
 from psa_casadi.diagnosis.evidence import CREDIBLE, credible_set
 from psa_casadi.diagnosis.extension import Extension
@@ -23,6 +23,7 @@ from psa_casadi.diagnosis.result import (
     Verdict,
 )
 from psa_casadi.diagnosis.rounds import Round
+from psa_casadi.diagnosis.task import same_curves
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fit import Fit
@@ -90,7 +91,7 @@ def conclude(
         gain=gain_of(experiments, first.predicted, final.predicted),
         blind_to=_blind_spots(final, table),
         remaining=Remaining(not final.test.alarm, final.test.p_value, _where(final)),
-        next_experiment=_next_experiment(causes, verdict),
+        next_experiment=_next_experiment(causes, verdict, same_curves(experiments, table)),
         notes=() if stiffness_given else (FORCE_NOTE,),
         experiments=tuple(experiments),
         base_fit=first.fit,
@@ -223,8 +224,13 @@ _ADVICE = (
 )
 
 
-def _next_experiment(causes: Sequence[Cause], verdict: Verdict) -> NextExperiment:
+def _next_experiment(
+    causes: Sequence[Cause], verdict: Verdict, alike: Sequence[Sequence[str]]
+) -> NextExperiment:
     rivals = tuple(dict.fromkeys(n for c in causes for n in (c.effect, *c.cannot_be_told_from)))
+    same = [group for group in alike if set(rivals) == set(group)]
+    if same:
+        return NextExperiment(None, rivals, same_curve_note(same[0]))
     if verdict == "ambiguous":
         return NextExperiment(None, rivals, _ADVICE)
     if verdict in ("unexplained", "partly_explained"):

@@ -19,7 +19,7 @@ _MOST = 1.5
 
 def _equations(s: Symbols) -> Equations:
     curve = bend(_levelled(s.x / stroke(s)), s.load_angle, s.load_wave)
-    return Equations(add={"tip_force": -s.load_hardening * static_stiffness(s) * stroke(s) * curve})
+    return Equations(add={"tip_force": -s.load_gain * static_stiffness(s) * stroke(s) * curve})
 
 
 def _levelled(z: Expression) -> Expression:
@@ -29,15 +29,15 @@ def _levelled(z: Expression) -> Expression:
 LOAD_STIFFNESS = Component(
     name="load_stiffness",
     description="an elastic load or guide whose stiffness changes with displacement",
-    source="Duffing's hardening spring; flexures that stretch as they bend: Howell 2001",
-    gain="load_hardening",
+    source="Duffing's spring; flexures that stretch: Howell 2001; contacts: Johnson 1985",
+    gain="load_gain",
     equation_text=(
-        "f_load gains -load_hardening k_s x_s b(q),  q = z/(1 + (z/1.5)^8)^(1/8),  z = x/x_s,"
+        "f_load gains -load_gain k_s x_s b(q),  q = z/(1 + (z/1.5)^8)^(1/8),  z = x/x_s,"
         "  x_s = k_L u_rated / k_s,  k_s = k_P k_B/(k_P + k_B) or k,  " + BEND_TEXT.format("load")
     ),
     parameters=(
         Parameter(
-            "load_hardening",
+            "load_gain",
             0.0,
             "1",
             (-0.05, 0.05),

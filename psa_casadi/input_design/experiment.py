@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.contenders import one_of_each
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.errors import InputError
 from psa_casadi.experiment.excitation import sine, triangle
@@ -153,17 +154,20 @@ def resolving_experiment(
     """Return the record that would tell which of an ambiguous diagnosis' effects is the cause.
 
     It has the voltages and the length of the records diagnosed unless `limits` say otherwise; the
-    search is brief by default.
-    Raises InputError where the diagnosis is not ambiguous.
+    search is brief by default. Of effects that bend the same curve one stands for all.
+    Raises InputError where the diagnosis is not ambiguous, or between such effects only.
     """
     if d.verdict != "ambiguous" or len(d.contenders) < 2:
         raise InputError(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
             " nothing to tell apart; name the effects with --separate instead."
         )
+    told, same = one_of_each(d.contenders, d.experiments)
+    if len(told) < 2:
+        raise InputError(same)
     best = min(d.contenders, key=lambda c: c.fit.rms).fit
     noise, colour = noise_of_fit(best, d.experiments)
-    rivals = [rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in d.contenders]
+    rivals = [rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in told]
     base = rival_of_fit("base", d.base_fit, colour)
     chosen = limits or limits_of([e.record for e in d.experiments])
     return separating_experiment(
