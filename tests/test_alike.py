@@ -26,6 +26,8 @@ def test_the_best_evidence_counts_for_all_of_a_group() -> None:
     given = {"a": 3.0, "b": 7.0, "c": 5.0}
     assert levelled(given, [("a", "b"), ("d",)]) == {"a": 7.0, "b": 7.0, "c": 5.0}
     assert levelled(given, []) == given
+    # of effects fitted in full the best one counts, whatever a linear estimate of another says
+    assert levelled(given, [("a", "b")], judged=["a"]) == {"a": 3.0, "b": 3.0, "c": 5.0}
 
 
 @pytest.mark.parametrize(("rate", "alike"), [(1e3, (BENDS,)), (2e4, ())])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.extension import extend, polish
+from psa_casadi.diagnosis.extension import Extension, extend, polish
 from psa_casadi.diagnosis.retries import from_resonances, instead_of
 from psa_casadi.diagnosis.rounds import examine
 from psa_casadi.diagnosis.selection import starts_of
@@ -32,6 +32,16 @@ def _fitted(
     record = whole.slice(0, samples or whole.n)
     experiments = (split(record),)
     return truth, experiments, fit_base(starting_model([record], None), experiments)
+
+
+def _extended(base: Fit, experiments: tuple[Experiment, ...], name: str) -> Extension:
+    """Fit one effect beside a base, to the end."""
+    task = Task(experiments, (EFFECTS[name],))
+    seen = examine(base, tuple(base.predicted(experiments)), task)
+    colour = seen.screening.colour
+    quick = extend(base, experiments, starts_of(seen.screening, name), colour)
+    assert quick is not None
+    return polish(base, quick, experiments, colour)
 
 
 def _quietly(_: str) -> None:
@@ -65,8 +75,13 @@ def test_mechanics_is_sought_again_where_another_model_is_nearer(tmp_path: Path)
     truth, experiments, base = _fitted(tmp_path / "a.csv", "fast", 95361)
     lost = from_resonances(base, experiments, _quietly) or base
     assert retuned(lost, experiments, _quietly) is lost
-    found = retuned(lost, experiments, _quietly, reached=1.015 * truth.sigma)
+    mode = _extended(lost, experiments, "structural_mode")
+    assert mode.evidence > 30.0
+    found = instead_of(lost, mode, experiments, _quietly)
+    assert found is not None
     assert found.rms < 1.017 * truth.sigma < lost.rms
+    # nothing is better than what is found, so that nothing stands for the mode beside it
+    assert instead_of(found, mode, experiments, _quietly) is None
 
 
 def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Path) -> None:
@@ -88,12 +103,7 @@ def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     record = read_record(tmp_path / "a.csv")
     experiments = (split(record),)
     base = fit_base(starting_model([record], None), experiments)
-    task = Task(experiments, (EFFECTS[like],))
-    seen = examine(base, tuple(base.predicted(experiments)), task)
-    colour = seen.screening.colour
-    quick = extend(base, experiments, starts_of(seen.screening, like), colour)
-    assert quick is not None
-    lag = polish(base, quick, experiments, colour)
+    lag = _extended(base, experiments, like)
     assert lag.evidence > 10.0
     found = instead_of(base, lag, experiments, _quietly)
     assert (found is not None) == own

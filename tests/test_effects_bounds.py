@@ -42,6 +42,8 @@ PLANT = (
     SELF_HEATING,
     AGEING,
 )
+#: Parameters of a curve's form.
+ANGLES, WAVES = ("load_angle",), ("load_wave",)
 every_effect = pytest.mark.parametrize("effect", PLANT, ids=lambda e: e.name)
 every_base = pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
 
@@ -90,9 +92,12 @@ def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> Non
     """Self-heating's bounds are wide for want of a common size of joule; it is linear in x."""
     t, voltage = sine_and_steps()
     bound = ordinary(effect).parameter(str(effect.gain)).bounds[end]
-    model = ordinary(effect).with_values({str(effect.gain): bound})
-    x = driven(model, t, voltage).y[:, -1]
-    assert np.abs(x).max() < 3.0 * stroke_scale(model.values)
+    grid = [{n: float(v)} for n, values in effect.probe.items() for v in values if n in ANGLES]
+    waves = [{n: v} for n in WAVES for v in (-5.0, 5.0) if n in ordinary(effect).values]
+    for shape in [{}, *grid, *waves]:
+        model = ordinary(effect).with_values({str(effect.gain): bound, **shape})
+        x = driven(model, t, voltage).y[:, -1]
+        assert np.abs(x).max() < 3.0 * stroke_scale(model.values), shape
 
 
 @pytest.mark.parametrize("effect", PLANT[:-1], ids=lambda e: e.name)

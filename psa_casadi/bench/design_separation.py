@@ -46,6 +46,7 @@ PAIRS, QUICK_PAIRS, FIRST = 20, 2, 8400
 #: Samples of a first record, of a class of voltage that users have, and the size of its effect.
 SAMPLES, CLASSES, RHO = 2000, ("sine", "triangle"), (0.3, 2.0)
 _PLAYED = ("designed", "sine", "triangle")
+_NAMED = ("right", "wrong", "open", "not played")
 _SIZES, _QUICK_SIZES = (250, 500, 1000, 2000, 4000), (250, 1000)
 
 
@@ -53,9 +54,9 @@ _SIZES, _QUICK_SIZES = (250, 500, 1000, 2000, 4000), (250, 1000)
 class Resolved:
     """One ambiguous pair: what is hidden, its rival, and what was named after each further record.
 
-    `named` holds for each voltage played "right", "wrong" or "open"; `growth` the predicted least
-    ln of the Bayes factor; `chance` the predicted probability to name the hidden effect; `plays`
-    how often the record must be played for 90 % of it, None if that is never reached.
+    `named` holds for each voltage "right", "wrong", "open" or "not played"; `growth` the predicted
+    least ln of the Bayes factor; `chance` the predicted probability to name the hidden effect;
+    `plays` how often the record must be played for 90 % of it, None if that is never reached.
     """
 
     seed: int
@@ -118,7 +119,7 @@ def resolve(seed: int) -> Resolved | None:
             return None
         if len(one_of_each(d.contenders, d.experiments)[0]) < 2:
             nothing = dict.fromkeys(_PLAYED, 0.0)
-            left = dict.fromkeys(_PLAYED, "open")
+            left = dict.fromkeys(_PLAYED, "not played")
             return Resolved(seed, effect, rival, voltage, "none", left, nothing, 0.0, None, 0.0)
         designed = resolving_experiment(d)
     except PsaError:
@@ -174,14 +175,15 @@ def _resolved(
 
 def _summary(found: Sequence[Resolved]) -> TitledTable:
     rows = []
+    played = [r for r in found if r.named["designed"] != "not played"]
     for name in _PLAYED:
-        counts = {v: sum(r.named[name] == v for r in found) for v in ("right", "wrong", "open")}
-        growth = float(np.median([r.growth[name] for r in found])) if found else float("nan")
+        counts = {v: sum(r.named[name] == v for r in found) for v in _NAMED}
+        growth = float(np.median([r.growth[name] for r in played])) if played else float("nan")
         asked = f"{round(0.9 * len(found))} of {len(found)} right" if name == "designed" else ""
         rows.append((name, asked, *(str(c) for c in counts.values()), f"{growth:.3g}"))
-    alike = [r for r in found if r.plays is None]
+    alike = [r for r in played if r.plays is None]
     open_ = sum(r.named["designed"] == "open" for r in alike)
-    head = ("further record", "asked", "right name", "wrong name", "open", "predicted ln B, median")
+    head = ("further record", "asked", *_NAMED, "predicted ln B, median")
     return TitledTable(
         "Ambiguous pairs on independent plants, after one further record",
         Table(head, tuple(rows)),
@@ -190,7 +192,8 @@ def _summary(found: Sequence[Resolved]) -> TitledTable:
         " of the two truths. Of "
         f"{len(alike)} pairs it was said beforehand that no record found, nor"
         f" {PLAYS[-1]} of them, would tell with {100.0 * ASKED:.0f} %; {open_} of them stayed open"
-        " with the designed one.",
+        " with the designed one. Not played: effects that bend the same curve, which no voltage of"
+        " such a record tells apart.",
     )
 
 
@@ -214,7 +217,7 @@ def _times(progress: Progress, quick: bool) -> TitledTable:
     """Measure the time of designs against their number of samples."""
     model = stack_model("P-885.51")
     free = [n for n in CORE if n in model.parameter_names]
-    effects = [EFFECTS["sensor_nonlinearity"], EFFECTS["load_stiffness"]]
+    effects = [EFFECTS["field_dependent_gain"], EFFECTS["rate_independent_asymmetry"]]
     rivals = [rival_of_effect(model, e, free) for e in effects]
     noise = SensorNoise(20e-9)
     rows = []

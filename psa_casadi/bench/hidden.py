@@ -17,11 +17,12 @@ from psa_casadi.diagnosis.task import Method
 from psa_casadi.report.tables import Table
 
 #: Seeds for each effect, and the first of them.
-SEEDS, QUICK_SEEDS, FIRST = 5, 1, 97003
+SEEDS, QUICK_SEEDS, FIRST = 5, 1, 98011
 #: A hidden effect counts from this share of the smallest rho that was asked for.
 REACHED = 0.9
-#: Below the resonances a load that hardens is the curve of a bent sensor: these stay a pair.
-ALIKE = "load_stiffness"
+#: Below the resonances a bent sensor and a load that bends are the same curve: these stay a pair.
+ALIKE = ("load_stiffness", "sensor_nonlinearity")
+_PAIR = " and ".join(ALIKE)
 _BINS: tuple[float, ...] = (0.0, 0.5, 0.8, 0.95, 1.0)
 
 
@@ -89,8 +90,8 @@ def _summary(found: Sequence[Found]) -> TitledTable:
     rows = [
         ("right name alone, rho 0.3 to 3", "92 %",
          _share(known, lambda f: f.right_alone)),
-        (f"the same, {ALIKE} not counted", "92 %",
-         _share([f for f in known if f.case.effect != ALIKE],
+        (f"the same, {_PAIR} not counted", "92 %",
+         _share([f for f in known if f.case.effect not in ALIKE],
                 lambda f: f.right_alone)),
         ("right name in the named set, rho 0.3 to 3", "97 %",
          _share(known, lambda f: f.case.effect in f.within)),
@@ -105,8 +106,8 @@ def _summary(found: Sequence[Found]) -> TitledTable:
         ("clean: any alarm", "at most 3 %", _share(clean, lambda f: f.verdict != "adequate")),
         ("own entry left out: not named alone", "97 %",
          _share(of_kind(found, "left out"), lambda f: f.alone is None)),
-        (f"the same, {ALIKE} not counted", "97 %",
-         _share([f for f in of_kind(found, "left out") if f.case.effect != ALIKE],
+        (f"the same, {_PAIR} not counted", "97 %",
+         _share([f for f in of_kind(found, "left out") if f.case.effect not in ALIKE],
                 lambda f: f.alone is None)),
         ("foreign plants: not named alone", "97 %",
          _share(of_kind(found, "foreign"), lambda f: f.alone is None)),
@@ -133,7 +134,7 @@ def _summary(found: Sequence[Found]) -> TitledTable:
         Table(("figure", "asked", "reached"), tuple(rows)),
         "rho: rms of the effect after the base's parameters are projected out, over the noise's."
         " Cases whose plant cannot reach the rho asked for within physical gains do not count. A"
-        " load that hardens is below the resonances the same curve as a bent sensor.",
+        " load that bends is below the resonances the same curve as a bent sensor.",
     )
 
 

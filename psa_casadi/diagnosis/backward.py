@@ -8,7 +8,7 @@ from psa_casadi.diagnosis.evidence import estimated, evidence
 from psa_casadi.diagnosis.extension import extend, extend_within, polish
 from psa_casadi.diagnosis.rivals_beside import beside, weigh_again
 from psa_casadi.diagnosis.rounds import Round, examine, settle_on
-from psa_casadi.diagnosis.selection import starts_of
+from psa_casadi.diagnosis.selection import LEAST, starts_of
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
@@ -19,7 +19,7 @@ from psa_casadi.identification.refitting import refit
 def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
     """Return the rounds with every cause but the last judged again beside the later ones.
 
-    Each is taken out in turn and the rest fitted again. Where there is no evidence for it then, it
+    Each is taken out in turn and the rest fitted again. Where there is hardly evidence for it, it
     is dropped; else what was nearly as likely in its step is fitted in its place, which gives the
     step's probabilities, and takes its place where there is more evidence for it. The rounds are
     then built anew.
@@ -33,7 +33,7 @@ def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
         if less is None:
             continue
         own = evidence(less, last.fit, last.screening.colour)
-        if own < 0.0:
+        if own < LEAST:
             rebuilt = _rebuilt(rounds[0], [*causes[:k], *causes[k + 1 :]], less, task)
             if rebuilt is not None:
                 return reconsidered(rebuilt, task)

@@ -46,11 +46,12 @@ def one_of_each(
 ) -> tuple[tuple[Contender, ...], str]:
     """Return contenders of which a voltage may tell one from another, and what none will tell.
 
-    Of effects that bend the same curve the first one stands for all; the sentence is empty where
+    Of effects that bend the same curve the best fit stands for all; the sentence is empty where
     there are none.
     """
-    own = {c.effect: next(e for e in c.fit.model.components if e.name == c.effect) for c in found}
-    groups = same_curves(experiments, tuple(own.values()))
+    best = sorted(found, key=lambda c: c.fit.cost)
+    own = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
+    groups = same_curves(experiments, own)
     rest = {name for group in groups for name in group[1:]}
     said = " ".join(same_curve_note(group) for group in groups)
     return tuple(c for c in found if c.effect not in rest), said

@@ -8,7 +8,7 @@ their prior standard deviations. An unknown that the data do not tell costs noth
 costs what its prior range is wider than its interval (MacKay, Neural Computation 4 (1992), 415).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -61,15 +61,21 @@ def estimated(before: Fit, screening: Screening) -> dict[str, float]:
     return {name: float(np.logaddexp.reduce(v) - np.log(len(v))) for name, v in found.items()}
 
 
-def levelled(evidences: Mapping[str, float], alike: Sequence[Sequence[str]]) -> dict[str, float]:
+def levelled(
+    evidences: Mapping[str, float],
+    alike: Sequence[Sequence[str]],
+    judged: Collection[str] = (),
+) -> dict[str, float]:
     """Return the evidence with that of the best one for all effects that are `alike`.
 
-    They are the same but for a form that none of them is known to have.
+    They are the same but for a form that none of them is known to have. Where some of a group are
+    `judged` by a full fit, the best one of those counts.
     """
     found = dict(evidences)
     for group in alike:
         present = [n for n in group if n in found]
-        found |= dict.fromkeys(present, max((found[n] for n in present), default=0.0))
+        known = [n for n in present if n in judged] or present
+        found |= dict.fromkeys(present, max((found[n] for n in known), default=0.0))
     return found
 
 

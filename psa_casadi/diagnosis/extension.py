@@ -1,7 +1,6 @@
 """Fits with one more effect: from its trial directions, from another effect's fit, afresh."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +18,7 @@ from psa_casadi.identification.fit import FIT_RTOL, Fit
 from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import FIXED
 from psa_casadi.identification.starting import ordinary_values
+from psa_casadi.simulation.side_by_side import side_by_side
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -127,11 +127,11 @@ def extend_any(
     colour: Colour,
 ) -> Extension | None:
     """Fit the effects of the scores afresh, as `extend_afresh` does, and return the best of all."""
-    fits: list[Fit] = []
-    for score in scores:
-        effect = score.direction.effect
-        fits += _from_ordinary(before, experiments, effect, score.direction.values)
-    final = _best_continued(fits, experiments, _CONTINUED_ANY)
+    found = side_by_side(
+        lambda d: _from_ordinary(before, experiments, d.effect, d.values),
+        [score.direction for score in scores],
+    )
+    final = _best_continued([f for own in found for f in own], experiments, _CONTINUED_ANY)
     if final is None:
         return None
     effect = next(e for e in final.model.components if e not in before.model.components)
@@ -156,7 +156,9 @@ def _from_ordinary(
     }
     ordinary = ordinary_values(before.model, [e.record for e in experiments])
     starts = [(values, s * size, tuple(before.starts())) for s in sizes]
-    found = [fit_from(before, experiments, effect, s, ordinary, QUICK) for s in starts]
+    found = side_by_side(
+        lambda s: fit_from(before, experiments, effect, s, ordinary, QUICK), starts
+    )
     return [f for f in found if f is not None]
 
 
@@ -164,12 +166,16 @@ def _best_continued(
     fits: Sequence[Fit], experiments: Sequence[Experiment], count: int
 ) -> Fit | None:
     """Go on with the best so many fits; return the best then."""
-    ended = list(fits)
-    for quick in sorted(fits, key=lambda f: f.cost)[:count]:
-        with suppress(PsaError):
+
+    def further(quick: Fit) -> Fit:
+        try:
             rtol = quick_rtol(quick.sigma, experiments)
-            ended.append(continued(quick, experiments, rtol, 1e-3, _AFRESH))
-    return min(ended, key=lambda f: f.cost, default=None)
+            return continued(quick, experiments, rtol, 1e-3, _AFRESH)
+        except PsaError:
+            return quick
+
+    best = sorted(fits, key=lambda f: f.cost)[:count]
+    return min([*fits, *side_by_side(further, best)], key=lambda f: f.cost, default=None)
 
 
 def polish(

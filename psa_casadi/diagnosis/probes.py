@@ -1,8 +1,6 @@
 """Trial directions: what each effect would add to the prediction at its trial values."""
 
-import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,6 +15,7 @@ from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit
 from psa_casadi.identification.prediction import measured, predict_record
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import memory_names
 
 FloatArray = npt.NDArray[np.float64]
@@ -54,7 +53,7 @@ def directions(
     """Return the directions of all effects over their probe values, at the fitted model.
 
     Without `finite_steps` only derivatives are taken, which some effects have not at their null.
-    They are simulated side by side: the stepper does not hold Python's lock.
+    They are simulated side by side.
     """
     peaks = residual_peaks(fit, experiments)
     tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
@@ -62,8 +61,7 @@ def directions(
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
         return list(_directions_at(fit, experiments, *task, finite_steps))
 
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        return [d for found in pool.map(one, tasks) for d in found]
+    return [d for found in side_by_side(one, tasks) for d in found]
 
 
 def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:

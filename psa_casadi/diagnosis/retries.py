@@ -18,6 +18,7 @@ from psa_casadi.identification.refitting import Progress, quick_from, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.starting import ordinary_values
 from psa_casadi.identification.starting_points import resolved
+from psa_casadi.simulation.side_by_side import side_by_side
 
 #: A base fit from an extension's parameters counts if its rms falls to this share.
 BETTER_BASE = 0.95
@@ -135,6 +136,8 @@ def instead_of(
     if rate * FAST < 1.0:
         return None
     again = retuned(base, experiments, progress, reached=extension.fit.rms)
+    if _short(base, again) <= _CLEAR:
+        return None
     return without_blur(again, experiments) if _short(again, extension.fit) < _LIKE else None
 
 
@@ -186,24 +189,23 @@ def _with_masses(
     before: Fit, starts: Sequence[Mapping[str, float]], experiments: Sequence[Experiment]
 ) -> Fit | None:
     """Fit with one mass free from several starts; None where none explains clearly more."""
-    found: list[Fit] = []
-    for start in starts:
+
+    def begun(start: Mapping[str, float]) -> Fit | None:
         free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
-        states = before.starts()
-        tried = quick_from(
+        return quick_from(
             before, before.model, experiments, free,
-            start_states=states, evaluations=_FIRST, start=start,
+            start_states=before.starts(), evaluations=_FIRST, start=start,
         )  # fmt: skip
-        if tried is not None:
-            found.append(tried)
-    best: Fit | None = None
-    for quick in sorted(found, key=lambda f: f.cost)[:_BEST]:
+
+    def further(quick: Fit) -> Fit | None:
         names, states = quick.unknowns.names, quick.starts()
-        further = quick_from(
+        return quick_from(
             quick, quick.model, experiments, names, start_states=states, evaluations=_QUICK
         )
-        if further is not None and (best is None or further.cost < best.cost):
-            best = further
+
+    found = [f for f in side_by_side(begun, starts) if f is not None]
+    ended = side_by_side(further, sorted(found, key=lambda f: f.cost)[:_BEST])
+    best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
     if best is None:
         return None
     try:

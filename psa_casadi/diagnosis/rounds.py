@@ -25,9 +25,10 @@ from psa_casadi.diagnosis.noise_floor import known_colour
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.probes import Direction, directions
 from psa_casadi.diagnosis.screening import Screening, copies, screen
-from psa_casadi.diagnosis.selection import choose, leading
+from psa_casadi.diagnosis.selection import choose, leading, out_of_character
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.identification.fit import Fit
+from psa_casadi.simulation.side_by_side import side_by_side
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -48,7 +49,8 @@ class Round:
     """One step of the search: the model so far, its screening and test, the extensions tried.
 
     `evidence` is ln B of every effect over the model so far, of a full fit where there was one, or
-    over all other causes where later ones were found; `probability` that of being the cause, given
+    over all other causes where later ones were found, and of effects that bend the same curve the
+    best one's; `probability` that of being the cause, given
     that one effect of the table is.
     """
 
@@ -114,11 +116,10 @@ def search_cause(current: Round, number: int, task: Task, first: Extension | Non
     `first` is the first cause where this is a further one.
     """
     colour, experiments = current.screening.colour, task.experiments
-    for name, scores in leading(current.screening):
-        task.progress(f"cause {number}: fitting {name}")
-        extension = extend(current.fit, experiments, scores, colour)
-        if extension is not None:
-            current.extensions.append(extension)
+    first_fits = leading(current.screening)
+    task.progress(f"cause {number}: fitting {', '.join(name for name, _ in first_fits)}")
+    found = side_by_side(lambda f: extend(current.fit, experiments, f[1], colour), first_fits)
+    current.extensions += [extension for extension in found if extension is not None]
     _sort(current)
     _afresh(current, number, task)
     decide(current, number, task, first)
@@ -180,10 +181,16 @@ def _ranked(current: Round, task: Task, first: Extension | None) -> list[Extensi
 
 
 def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:
-    """Give every effect its evidence and, unless a full fit showed it unfit, its probability."""
+    """Give every effect its evidence and, unless a full fit showed it unfit, its probability.
+
+    An effect that bends the same curve as one worth having is as good, whatever its own form.
+    """
     fitted = {e.effect.name: e.evidence for e in current.extensions}
-    refused = {name for name in fitted if name not in {e.effect.name for e in worth}}
-    current.evidence = levelled({**current.evidence, **fitted}, task.alike)
+    good = {e.effect.name for e in worth}
+    fit = {e.effect.name for e in current.extensions if not out_of_character(e, task.experiments)}
+    same = {n for group in task.alike if good & set(group) for n in group if n in fit}
+    refused = set(fitted) - good - same
+    current.evidence = levelled({**current.evidence, **fitted}, task.alike, good)
     if task.method.weights == "bic":
         current.probability = bic_probabilities(
             current.fit, {e.effect.name: e.fit for e in worth}, current.screening.colour
@@ -204,12 +211,14 @@ def _polish(current: Round, number: int, task: Task) -> None:
         return
     best = current.extensions[0].evidence
     limit = min(RUNNER_UP * best, best - NEAR)
-    for k, extension in enumerate(current.extensions[:FINALISTS]):
-        if extension.evidence > limit and not extension.final:
-            task.progress(f"cause {number}: {extension.effect.name} to the end")
-            current.extensions[k] = polish(
-                current.fit, extension, task.experiments, current.screening.colour
-            )
+    colour, leaders = current.screening.colour, current.extensions[:FINALISTS]
+    chosen = [e for e in leaders if e.evidence > limit and not e.final]
+    if chosen:
+        names = ", ".join(e.effect.name for e in chosen)
+        task.progress(f"cause {number}: {names} to the end")
+    ended = side_by_side(lambda e: polish(current.fit, e, task.experiments, colour), chosen)
+    rest = [e for e in current.extensions if e not in chosen]
+    current.extensions = [*ended, *rest]
     _sort(current)
 
 
@@ -232,9 +241,16 @@ def _imitators(current: Round, number: int, task: Task) -> None:
     left = {n: 0.5 * power * (1.0 - copy.share) for n, copy in found.items()}
     near = [n for n in left if n not in fitted and left[n] < NEAR]
     lost = [n for n in left if n in fitted and fitted[n].evidence < best.evidence - left[n] - NEAR]
-    for name in sorted([*near, *lost], key=lambda n: left[n])[:IMITATORS]:
-        task.progress(f"cause {number}: fitting {name}, which could look like {best.effect.name}")
-        extension = extend_like(current.fit, best, task.experiments, found[name], current.screening)
+    names = sorted([*near, *lost], key=lambda n: left[n])[:IMITATORS]
+    if not names:
+        return
+    said = ", ".join(names)
+    task.progress(f"cause {number}: fitting {said}, which could look like {best.effect.name}")
+    alike = side_by_side(
+        lambda n: extend_like(current.fit, best, task.experiments, found[n], current.screening),
+        names,
+    )
+    for name, extension in zip(names, alike, strict=True):
         if extension is None:
             continue
         if name not in fitted:

@@ -228,10 +228,10 @@ def _next_experiment(
     causes: Sequence[Cause], verdict: Verdict, alike: Sequence[Sequence[str]]
 ) -> NextExperiment:
     rivals = tuple(dict.fromkeys(n for c in causes for n in (c.effect, *c.cannot_be_told_from)))
-    same = [group for group in alike if set(rivals) == set(group)]
-    if same:
-        return NextExperiment(None, rivals, same_curve_note(same[0]))
     if verdict == "ambiguous":
+        own = (causes[0].effect, *causes[0].cannot_be_told_from)
+        if len(own) > 1 and any(set(own) <= set(group) for group in alike):
+            return NextExperiment(None, rivals, same_curve_note(own))
         return NextExperiment(None, rivals, _ADVICE)
     if verdict in ("unexplained", "partly_explained"):
         return NextExperiment(None, (), _ADVICE)

@@ -1,8 +1,6 @@
 """Which further record would determine what the records at hand leave open."""
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +20,7 @@ from psa_casadi.identification.information import (
 from psa_casadi.identification.plans import Plan, plans
 from psa_casadi.identification.scenarios import SEARCHABLE, scenarios
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.side_by_side import side_by_side
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -163,8 +162,7 @@ class _Adviser:
             return plan, np.array(found)
 
         records = [e.record for e in self._experiments]
-        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            found = list(pool.map(one, plans(self._scenarios, records)))
+        found = side_by_side(one, plans(self._scenarios, records))
         return [option for option in found if option is not None]
 
     def _gain(self, information: FloatArray, left: set[str]) -> tuple[str, ...]:

@@ -1,8 +1,6 @@
 """Predictions of a model for a set of experiments, and their exact derivatives."""
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +11,7 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.unknowns import Unknowns
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import (
     initial_slope,
@@ -128,7 +127,7 @@ def predict(
 ) -> list[Prediction]:
     """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
 
-    Records are simulated side by side: the stepper does not hold Python's lock.
+    Records are simulated side by side.
     """
     current = model.with_values(unknowns.values(theta))
     slopes = unknowns.slopes(theta)
@@ -150,7 +149,4 @@ def predict(
         jacobian += offset_slopes
         return Prediction(y + unknowns.offset(theta, index), jacobian)
 
-    if len(experiments) == 1:
-        return [one(0)]
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        return list(pool.map(one, range(len(experiments))))
+    return side_by_side(one, range(len(experiments)))

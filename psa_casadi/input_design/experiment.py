@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.contenders import one_of_each
+from psa_casadi.diagnosis.contenders import one_of_each, same_curve_note
 from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.task import FAST
 from psa_casadi.errors import InputError
 from psa_casadi.experiment.excitation import sine, triangle
 from psa_casadi.experiment.record import Record
@@ -65,9 +66,11 @@ def separating_experiment(
     """Return the voltage that best separates rivals, each fitted again to the others.
 
     `base` is the model without any of them, which scales the evidence that a diagnosis asks for.
-    Raises InputError and SimulationError.
+    Raises SimulationError, and InputError also where all rivals bend the same curve and the record
+    is too slow to show a resonance.
     """
     begin = clock.perf_counter()
+    _check_curves(rivals, limits)
     steepest = limits.steepest(_capacitance(rivals[0].model))
     samples = min(limits.samples, GRID)
     criterion = Separation(tuple(rivals), noise.on_grid(limits, samples))
@@ -162,9 +165,9 @@ def resolving_experiment(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
             " nothing to tell apart; name the effects with --separate instead."
         )
-    told, same = one_of_each(d.contenders, d.experiments)
-    if len(told) < 2:
-        raise InputError(same)
+    told, _ = one_of_each(d.contenders, d.experiments)
+    if len(told) < 2 or (limits is not None and limits.duration < FAST * limits.samples):
+        told = d.contenders  # a new record that shows resonances may tell
     best = min(d.contenders, key=lambda c: c.fit.rms).fit
     noise, colour = noise_of_fit(best, d.experiments)
     rivals = [rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in told]
@@ -187,6 +190,13 @@ def rival_of_effect(model: Model, effect: Component, free: Sequence[str]) -> Riv
         extended = extended.with_values({gain.name: float(np.clip(size, *gain.bounds))})
     own = [p.name for p in effect.parameters if p.name not in FIXED]
     return rival_of_model(effect.name, extended, [*free, *(n for n in own if n not in free)])
+
+
+def _check_curves(rivals: Sequence[Rival], limits: Limits) -> None:
+    curves = {c.curve for r in rivals for c in r.model.components if c.name == r.name}
+    slow = limits.duration >= FAST * limits.samples
+    if slow and len(rivals) > 1 and len(curves) == 1 and None not in curves:
+        raise InputError(same_curve_note([r.name for r in rivals]))
 
 
 def _pairs(found: Mapping[str, Mapping[tuple[str, str], float]]) -> tuple[Pair, ...]:

@@ -27,6 +27,8 @@ from psa_casadi.variables import nominal_value
 
 #: Standard errors by which the cautious truth has less of its effect, and the most that it loses.
 _CAUTION, _LOSS = 1.0, 0.75
+#: How far other parameters may move with it, in natural logarithms.
+_FARTHEST = 1.0
 #: Tolerance of trajectories: far below what a step of the gradient changes.
 RTOL = 1e-6
 _STEPS = 4000
@@ -167,7 +169,8 @@ def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
     size = fit.model.values[gain] / fit.unknowns.scale[k]
     shift = min(_CAUTION * float(np.sqrt(max(own[k], 0.0))), _LOSS * abs(size))
     less: FloatArray = -float(np.sign(size)) * shift * own / max(own[k], 1e-300)
-    return less
+    farthest = float(np.max(np.abs(less[fit.unknowns.log[: len(less)]]), initial=0.0))
+    return less * min(1.0, _FARTHEST / max(farthest, 1e-300))
 
 
 def rival_of_model(name: str, model: Model, free: Sequence[str]) -> Rival:

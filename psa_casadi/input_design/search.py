@@ -1,8 +1,6 @@
 """The search for the best voltage: many drawn waveforms, the best of them improved by SLSQP."""
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +11,7 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.input_design.candidates import KINDS, Kind, Waveform, draw
 from psa_casadi.input_design.criterion import Criterion, Point
 from psa_casadi.input_design.limits import Limits
+from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
@@ -152,8 +151,7 @@ class _Problem:
 
     def compare(self, pool: Sequence[Waveform]) -> FloatArray:
         """Return the value of every waveform as drawn."""
-        with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
-            return np.array(list(threads.map(lambda w: self.point(w, w.start).value, pool)))
+        return np.array(side_by_side(lambda w: self.point(w, w.start).value, pool))
 
     def gradient(self, wave: Waveform, p: FloatArray, point: Point) -> FloatArray:
         """Return d value / d p (k,) by steps of the frozen function, into the bounds."""
@@ -170,8 +168,7 @@ class _Problem:
             except PsaError:
                 return 0.0
 
-        with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
-            return np.array(list(threads.map(along, range(len(p)))))
+        return np.array(side_by_side(along, range(len(p))))
 
     def improve(self, wave: Waveform, steps: int) -> tuple[FloatArray, float]:
         """Return the best allowed coordinates that SLSQP comes to, and their value."""
