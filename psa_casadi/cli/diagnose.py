@@ -51,7 +51,7 @@ def diagnose(
         Path | None,
         typer.Option(
             "--next",
-            help="VOLTAGE.csv to write if the verdict is ambiguous: the record that would tell;"
+            help="VOLTAGE.csv to write if the verdict is ambiguous and a voltage would tell;"
             " without it, beside the JSON or the page.",
         ),
     ] = None,

@@ -51,7 +51,7 @@ def one_of_each(
     """
     best = sorted(found, key=lambda c: c.fit.cost)
     own = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
-    groups = same_curves(experiments, own)
+    groups = same_curves(experiments, own, best[0].fit) if best else ()
     rest = {name for group in groups for name in group[1:]}
     said = " ".join(same_curve_note(group) for group in groups)
     return tuple(c for c in found if c.effect not in rest), said

@@ -49,7 +49,7 @@ def weigh_again(step: Round, found: Mapping[str, float], task: Task) -> None:
     own = step.chosen.effect.name
     shift = found[own] - step.evidence[own]
     moved = {n: found.get(n, e + shift) for n, e in step.evidence.items()}
-    step.evidence = levelled(moved, task.alike, found)
+    step.evidence = levelled(moved, task.alike(step.fit), found)
     step.probability = probabilities({n: step.evidence[n] for n in step.probability})
 
 

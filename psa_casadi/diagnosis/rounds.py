@@ -86,7 +86,7 @@ def examine(
     time = np.concatenate([e.record.time[e.used] for e in task.experiments])
     floor = noise_rms(fit.residuals, screening.colour)
     test = omnibus(fit.residuals, voltage, time, screening.colour, floor, even=bool(known))
-    guess = levelled(estimated(fit, screening), task.alike)
+    guess = levelled(estimated(fit, screening), task.alike(fit))
     return Round(
         fit,
         predicted,
@@ -188,9 +188,10 @@ def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:
     fitted = {e.effect.name: e.evidence for e in current.extensions}
     good = {e.effect.name for e in worth}
     fit = {e.effect.name for e in current.extensions if not out_of_character(e, task.experiments)}
-    same = {n for group in task.alike if good & set(group) for n in group if n in fit}
+    alike = task.alike(current.fit)
+    same = {n for group in alike if good & set(group) for n in group if n in fit}
     refused = set(fitted) - good - same
-    current.evidence = levelled({**current.evidence, **fitted}, task.alike, good)
+    current.evidence = levelled({**current.evidence, **fitted}, alike, good)
     if task.method.weights == "bic":
         current.probability = bic_probabilities(
             current.fit, {e.effect.name: e.fit for e in worth}, current.screening.colour

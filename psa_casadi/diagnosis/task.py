@@ -6,9 +6,11 @@ from typing import Literal
 
 from psa_casadi.component import Component
 from psa_casadi.experiment.split import Experiment
+from psa_casadi.identification.fit import Fit
 
 #: Sampling interval [s] below which a stack may ring within the record's band.
 FAST = 7e-4
+_MASSES = ("m_P", "m_B", "m")
 
 
 @dataclass(frozen=True)
@@ -42,17 +44,20 @@ class Task:
         """Whether a stack may ring within a record's band."""
         return _fast(self.experiments)
 
-    @property
-    def alike(self) -> tuple[tuple[str, ...], ...]:
+    def alike(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot tell apart but by forms nobody knows."""
-        return same_curves(self.experiments, self.table)
+        return same_curves(self.experiments, self.table, fit)
 
 
 def same_curves(
-    experiments: Sequence[Experiment], effects: Sequence[Component]
+    experiments: Sequence[Experiment], effects: Sequence[Component], fit: Fit
 ) -> tuple[tuple[str, ...], ...]:
-    """Return groups of effects that bend the same curve, if no record can show a resonance."""
-    curves = () if _fast(experiments) else sorted({e.curve for e in effects if e.curve is not None})
+    """Return groups of effects that bend the same curve, where the records show no resonance.
+
+    They show one if a `fit` of them needed a mass and a record is fast enough to see it ring.
+    """
+    rings = _fast(experiments) and any(n in fit.unknowns.names for n in _MASSES)
+    curves = () if rings else sorted({e.curve for e in effects if e.curve is not None})
     groups = (tuple(e.name for e in effects if e.curve == c) for c in curves)
     return tuple(group for group in groups if len(group) > 1)
 

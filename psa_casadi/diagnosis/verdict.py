@@ -91,7 +91,9 @@ def conclude(
         gain=gain_of(experiments, first.predicted, final.predicted),
         blind_to=_blind_spots(final, table),
         remaining=Remaining(not final.test.alarm, final.test.p_value, _where(final)),
-        next_experiment=_next_experiment(causes, verdict, same_curves(experiments, table)),
+        next_experiment=_next_experiment(
+            causes, verdict, same_curves(experiments, table, first.fit)
+        ),
         notes=() if stiffness_given else (FORCE_NOTE,),
         experiments=tuple(experiments),
         base_fit=first.fit,

@@ -64,7 +64,7 @@ def write_experiment_page(
     """Write the page of a designed experiment; raises InputError where it cannot be written."""
     several = isinstance(design, Separated)
     title = "Experiment that tells effects apart" if several else "Experiment for the parameters"
-    responses = {n: r.predict(design.record, np.zeros(r.size)) for n, r in rivals.items()}
+    responses = {n: r.predict(design.record, r.truth) for n, r in rivals.items()}
     write_design_page(
         path,
         title=title,
@@ -105,7 +105,10 @@ def design_tables(design: Separated | Informative, model: Model) -> tuple[Shown,
     if isinstance(design, Informative):
         note = "The model's values are taken as true; the sensor's offset and the start are free."
         return (Shown("Predicted intervals", interval_table(design, model), note),)
-    note = "Each other effect is fitted again, as far as the data at hand let it."
+    note = (
+        "Each other effect is fitted again, as far as the data at hand let it; the true one is"
+        " taken a standard error weaker than it was fitted."
+    )
     growth = Shown("Growth of ln of the Bayes factor", pair_table(design), note)
     return growth, Shown("Probability of being named", chance_table(design))
 
