@@ -139,11 +139,10 @@ def _any(rounds: list[Round], task: Task) -> list[Round]:
     decide(first, 1, task)
     if first.chosen is None:
         return rounds
-    other = _causes(
-        [first, examine(first.chosen.fit, first.chosen.predicted, task, first.trials)],
-        task,
-        retry=True,
-    )
+    other = _with_better_base([first], set(), task)
+    if other is None:
+        after = examine(first.chosen.fit, first.chosen.predicted, task, first.trials)
+        other = _causes([first, after], task, retry=True)
     return min(rounds, other, key=_left)
 
 
@@ -165,11 +164,7 @@ def _forward(base: Fit, task: Task) -> list[Round]:
 
 
 def _causes(rounds: list[Round], task: Task, *, retry: bool) -> list[Round]:
-    """Add the best effect to the rounds so far until nothing is seen or nothing helps.
-
-    With `retry` the base is fitted again from where an effect led; that base replaces the effect,
-    unless it leaves structure that the effect would have explained.
-    """
+    """Add the best effect until nothing is seen or helps; `retry` the base from where it led."""
     tried = set[str]()
     while len(rounds) <= MOST_CAUSES and _worth_searching(rounds):
         current = rounds[-1]
@@ -178,13 +173,22 @@ def _causes(rounds: list[Round], task: Task, *, retry: bool) -> list[Round]:
         chosen = current.chosen
         if chosen is None:
             break
-        better = _retried(rounds, tried, task) if retry else None
-        if better is not None:
-            other = _causes([_round(better, task)], task, retry=False)
-            if not other[-1].test.alarm or other[-1].fit.rms < AS_GOOD * chosen.fit.rms:
-                return other
+        other = _with_better_base(rounds, tried, task) if retry else None
+        if other is not None:
+            return other
         rounds.append(examine(chosen.fit, chosen.predicted, task, current.trials))
     return rounds
+
+
+def _with_better_base(rounds: Sequence[Round], tried: set[str], task: Task) -> list[Round] | None:
+    """Search from a better base, if one leaves no structure or hardly more than the last cause."""
+    chosen = rounds[-1].chosen
+    better = _retried(rounds, tried, task)
+    if better is None or chosen is None:
+        return None
+    other = _causes([_round(better, task)], task, retry=False)
+    good = not other[-1].test.alarm or other[-1].fit.rms < AS_GOOD * chosen.fit.rms
+    return other if good else None
 
 
 def _retried(rounds: Sequence[Round], tried: set[str], task: Task) -> Fit | None:
