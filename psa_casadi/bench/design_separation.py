@@ -45,8 +45,8 @@ from psa_casadi.report.tables import Table
 PAIRS, QUICK_PAIRS, FIRST = 20, 2, 8400
 #: Samples of a first record, of a class of voltage that users have, and the size of its effect.
 SAMPLES, CLASSES, RHO = 2000, ("sine", "triangle"), (0.3, 2.0)
-_PLAYED = ("designed", "sine", "triangle")
-_NAMED = ("right", "wrong", "open", "not played")
+_FURTHER = ("designed", "sine", "triangle")
+_NAMED = ("right", "wrong", "open")
 _SIZES, _QUICK_SIZES = (250, 500, 1000, 2000, 4000), (250, 1000)
 
 
@@ -78,23 +78,31 @@ def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
 
 
 def resolve_pairs(count: int, first: int, progress: Progress) -> list[Resolved]:
-    """Draw records until `count` ambiguous pairs are found, in the order of their seeds."""
+    """Draw records until so many ambiguous pairs are found that a voltage may tell apart.
+
+    They come in the order of their seeds, with those among them that no voltage tells.
+    """
     found: list[Resolved] = []
     workers = os.cpu_count() or 1
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         seed = first
-        while len(found) < count:
+        while len(_played(found)) < count:
             batch = range(seed, seed + 2 * workers)
             for number, one in zip(batch, pool.map(resolve, batch), strict=True):
-                if one is not None and len(found) < count:
+                if one is not None and len(_played(found)) < count:
                     found.append(one)
                     said = ", ".join(f"{n} {v}" for n, v in one.named.items())
+                    so_far = len(_played(found))
                     progress(
-                        f"{len(found)} of {count} (seed {number}): {one.effect} or {one.rival}"
+                        f"{so_far} of {count} (seed {number}): {one.effect} or {one.rival}"
                         f" after a {one.voltage}; {said} [{one.seconds:.0f} s to design]"
                     )
             seed = batch.stop
     return found
+
+
+def _played(found: Sequence[Resolved]) -> list[Resolved]:
+    return [r for r in found if r.named["designed"] != "not played"]
 
 
 def resolve(seed: int) -> Resolved | None:
@@ -118,8 +126,8 @@ def resolve(seed: int) -> Resolved | None:
         if d.verdict != "ambiguous" or len(d.contenders) < 2:
             return None
         if len(one_of_each(d.contenders, d.experiments)[0]) < 2:
-            nothing = dict.fromkeys(_PLAYED, 0.0)
-            left = dict.fromkeys(_PLAYED, "not played")
+            nothing = dict.fromkeys(_FURTHER, 0.0)
+            left = dict.fromkeys(_FURTHER, "not played")
             return Resolved(seed, effect, rival, voltage, "none", left, nothing, 0.0, None, 0.0)
         designed = resolving_experiment(d)
     except PsaError:
@@ -167,7 +175,7 @@ def _resolved(
     seed: int, effect: str, rival: str, voltage: str, named: dict[str, str], s: Separated
 ) -> Resolved:
     growth = {"designed": min(p.designed for p in s.pairs)}
-    growth |= {n: min(p.usual[n] for p in s.pairs) for n in _PLAYED[1:]}
+    growth |= {n: min(p.usual[n] for p in s.pairs) for n in _FURTHER[1:]}
     return Resolved(
         seed, effect, rival, voltage, s.kind, named, growth, s.chance[effect], s.plays, s.seconds
     )
@@ -175,25 +183,26 @@ def _resolved(
 
 def _summary(found: Sequence[Resolved]) -> TitledTable:
     rows = []
-    played = [r for r in found if r.named["designed"] != "not played"]
-    for name in _PLAYED:
-        counts = {v: sum(r.named[name] == v for r in found) for v in _NAMED}
+    played = _played(found)
+    for name in _FURTHER:
+        counts = {v: sum(r.named[name] == v for r in played) for v in _NAMED}
         growth = float(np.median([r.growth[name] for r in played])) if played else float("nan")
-        asked = f"{round(0.9 * len(found))} of {len(found)} right" if name == "designed" else ""
+        asked = f"{round(0.9 * len(played))} of {len(played)} right" if name == "designed" else ""
         rows.append((name, asked, *(str(c) for c in counts.values()), f"{growth:.3g}"))
     alike = [r for r in played if r.plays is None]
     open_ = sum(r.named["designed"] == "open" for r in alike)
-    head = ("further record", "asked", *_NAMED, "predicted ln B, median")
+    head = ("further record", "asked", "right name", "wrong name", "open", "predicted ln B, median")
     return TitledTable(
         "Ambiguous pairs on independent plants, after one further record",
         Table(head, tuple(rows)),
-        "All further records have the length, the sampling and the voltage range of the first. The"
+        f"{len(found)} pairs were ambiguous; {len(found) - len(played)} of them are effects that"
+        " bend the same curve, which no voltage of such a record tells apart: nothing was played."
+        " All further records have the length, the sampling and the voltage range of the first. The"
         " predicted ln B is the growth of the logarithm of the Bayes factor for the less favourable"
         " of the two truths. Of "
         f"{len(alike)} pairs it was said beforehand that no record found, nor"
         f" {PLAYS[-1]} of them, would tell with {100.0 * ASKED:.0f} %; {open_} of them stayed open"
-        " with the designed one. Not played: effects that bend the same curve, which no voltage of"
-        " such a record tells apart.",
+        " with the designed one.",
     )
 
 
@@ -201,7 +210,7 @@ def _by_pair(found: Sequence[Resolved]) -> TitledTable:
     rows = [
         (
             str(r.seed), r.effect, r.rival, r.voltage, r.kind,
-            *(f"{r.named[n]} ({r.growth[n]:.3g})" for n in _PLAYED),
+            *(f"{r.named[n]} ({r.growth[n]:.3g})" for n in _FURTHER),
             f"{100.0 * r.chance:.0f} %", "never" if r.plays is None else f"{r.plays}",
             f"{r.seconds:.0f} s",
         )
