@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.bench.creeping_reference import creeping_displacement
-from psa_casadi.bench.design_tracking import LIMITS, scan, scanner, wrong_values
+from psa_casadi.bench.design_tracking import LIMITS, own_bang_bang, scan, scanner, wrong_values
 from psa_casadi.bench.linear_bound import bang_bang_bound
 from psa_casadi.cli.app import app
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
@@ -94,6 +94,17 @@ def test_a_quickest_move_is_near_the_bound_of_the_linear_part(payload: float) ->
     voltage = found.response.voltage
     assert voltage.min() >= -20.0 - 1e-6
     assert voltage.max() <= 120.0 + 1e-6
+
+
+@pytest.mark.parametrize(("begin", "end"), [(2e-6, 10e-6), (10e-6, 2e-6)])
+def test_a_quickest_move_is_near_what_hysteresis_and_creep_allow(begin: float, end: float) -> None:
+    """Downward that is 21 % over the bound of the linear part; a bang-bang move has no ramps."""
+    model = scanner(0.0)
+    found = quickest_move(model, begin, end, LIMITS)
+    own = own_bang_bang(model, found)
+    assert own is not None
+    assert bang_bang_bound(model.values, begin, end, -20.0, 120.0) < own
+    assert own < found.move_time < 1.02 * own
 
 
 def test_a_move_obeys_rate_and_current() -> None:

@@ -26,7 +26,11 @@ def creeping_displacement(
         values, reference.from_samples(time, voltage), time,
         breakpoints=[float(t) for t in time[1:-1]], rtol=rtol,
     )  # fmt: skip
-    x = found.displacement
+    return crept(values, time, found.displacement)
+
+
+def crept(values: Mapping[str, float], time: FloatArray, x: FloatArray) -> FloatArray:
+    """Return the displacement (n,) [m] with creep behind an x (n,) [m] that began at rest."""
     gain, first = values.get("creep_gain", 0.0), values.get("creep_time", 1.0)
     return np.asarray(x + gain * sum(_relaxed(time, x, first * r) for r in _RATIOS))
 
