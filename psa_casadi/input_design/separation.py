@@ -13,6 +13,7 @@ Biometrika 62 (1975), 57 (T-optimality); for Gaussian noise T/2 is the Kullback-
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 from scipy.stats import norm
@@ -24,6 +25,7 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.identification.levenberg_marquardt import minimise
 from psa_casadi.input_design.criterion import Point
 from psa_casadi.input_design.rivals import Rival
+from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
@@ -87,13 +89,12 @@ class Separation:
         return self._refit(target, other, record, FINAL).distance
 
     def _refits(self, record: Record, steps: int) -> dict[tuple[int, int], _Refit]:
-        plain = [r.predict(record, r.truth) for r in self.rivals]
-        return {
-            (a, b): self._refit(plain[a], self.rivals[b], record, steps)
-            for a in range(len(self.rivals))
-            for b in range(len(self.rivals))
-            if a != b
-        }
+        plain = side_by_side(lambda r: r.predict(record, r.truth), self.rivals)
+        pairs = list(permutations(range(len(self.rivals)), 2))
+        found = side_by_side(
+            lambda ab: self._refit(plain[ab[0]], self.rivals[ab[1]], record, steps), pairs
+        )
+        return dict(zip(pairs, found, strict=True))
 
     def _refit(self, target: FloatArray, rival: Rival, record: Record, evaluations: int) -> _Refit:
         """Fit a rival again to a target (n,) [m], held by what is known of it."""
