@@ -93,7 +93,7 @@ def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> Non
     t, voltage = sine_and_steps()
     bound = ordinary(effect).parameter(str(effect.gain)).bounds[end]
     grid = [{n: float(v)} for n, values in effect.probe.items() for v in values if n in ANGLES]
-    waves = [{n: v} for n in WAVES for v in (-5.0, 5.0) if n in ordinary(effect).values]
+    waves = [{n: v} for n in WAVES for v in (-20.0, 20.0) if n in ordinary(effect).values]
     for shape in [{}, *grid, *waves]:
         model = ordinary(effect).with_values({str(effect.gain): bound, **shape})
         x = driven(model, t, voltage).y[:, -1]

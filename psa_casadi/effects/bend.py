@@ -44,6 +44,6 @@ def shape_parameters(prefix: str) -> tuple[Parameter, Parameter]:
             scale=0.3,
         ),
         Parameter(
-            f"{prefix}_wave", 0.0, "1", (-5.0, 5.0), "quartic (W) part over bow and S", scale=0.1
+            f"{prefix}_wave", 0.0, "1", (-20.0, 20.0), "quartic (W) part over bow and S", scale=0.1
         ),
     )

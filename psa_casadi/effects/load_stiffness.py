@@ -40,7 +40,7 @@ LOAD_STIFFNESS = Component(
             "load_gain",
             0.0,
             "1",
-            (-0.2, 0.2),
+            (-0.5, 0.5),
             "bow and S of the load's force over the stack's stiffness times the stroke",
             scale=0.002,
         ),

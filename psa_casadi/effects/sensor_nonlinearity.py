@@ -31,7 +31,7 @@ SENSOR_NONLINEARITY = Component(
             "nonlinearity_gain",
             0.0,
             "1",
-            (-0.1, 0.1),
+            (-0.5, 0.5),
             "bow and S over the stroke, beyond the best straight line",
             scale=0.002,
         ),

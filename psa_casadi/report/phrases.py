@@ -155,11 +155,12 @@ def verdict_sentence(d: Diagnosis) -> str:
         )
     causes = listing([_cause(c) for c in d.causes])
     if d.verdict == "ambiguous":
-        rivals = dict.fromkeys(n for c in d.causes for n in (c.effect, *c.cannot_be_told_from))
+        first = d.causes[0]
+        rivals = [plain(n) for n in (first.effect, *first.cannot_be_told_from)]
+        together = listing([plain(c.effect) for c in d.causes])
         return (
             f"Something is missing, and these data cannot tell whether it is"
-            f" {listing([plain(n) for n in rivals], 'or')}; with {plain(d.causes[0].effect)},"
-            f" {gain_sentence(d)}."
+            f" {listing(rivals, 'or')}; with {together}, {gain_sentence(d)}."
         )
     are = "cause is" if len(d.causes) == 1 else "causes are"
     if d.verdict == "partly_explained":
