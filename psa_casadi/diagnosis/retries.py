@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.diagnosis.extension import Extension
-from psa_casadi.diagnosis.task import FAST
+from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
@@ -133,7 +133,7 @@ def instead_of(
         found = _with_masses(base, starts, experiments)
         if found is not None and _short(found, extension.fit) < _LIKE:
             return _tuned(found, experiments, progress)
-    if rate * FAST < 1.0:
+    if not shows_ringing(experiments):
         return None
     again = retuned(base, experiments, progress, reached=extension.fit.rms)
     if _short(base, again) <= _CLEAR:

@@ -50,8 +50,7 @@ class Round:
 
     `evidence` is ln B of every effect over the model so far, of a full fit where there was one, or
     over all other causes where later ones were found, and of effects that bend the same curve the
-    best one's; `probability` that of being the cause, given
-    that one effect of the table is.
+    best one's; `probability` that of being the cause, given that one effect of the table is.
     """
 
     fit: Fit

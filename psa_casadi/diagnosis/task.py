@@ -42,7 +42,7 @@ class Task:
     @property
     def fast(self) -> bool:
         """Whether a stack may ring within a record's band."""
-        return _fast(self.experiments)
+        return shows_ringing(self.experiments)
 
     def alike(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot tell apart but by forms nobody knows."""
@@ -56,11 +56,12 @@ def same_curves(
 
     They show one if a `fit` of them needed a mass and a record is fast enough to see it ring.
     """
-    rings = _fast(experiments) and any(n in fit.unknowns.names for n in _MASSES)
+    rings = shows_ringing(experiments) and any(n in fit.unknowns.names for n in _MASSES)
     curves = () if rings else sorted({e.curve for e in effects if e.curve is not None})
     groups = (tuple(e.name for e in effects if e.curve == c) for c in curves)
     return tuple(group for group in groups if len(group) > 1)
 
 
-def _fast(experiments: Sequence[Experiment]) -> bool:
+def shows_ringing(experiments: Sequence[Experiment]) -> bool:
+    """Whether a record is sampled fast enough for a stack to ring within its band."""
     return min(e.record.sample_time for e in experiments) < FAST

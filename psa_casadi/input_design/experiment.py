@@ -166,7 +166,7 @@ def resolving_experiment(
             " nothing to tell apart; name the effects with --separate instead."
         )
     told, _ = one_of_each(d.contenders, d.experiments)
-    if len(told) < 2 or (limits is not None and limits.duration < FAST * limits.samples):
+    if len(told) < 2 or (limits is not None and not _slow(limits)):
         told = d.contenders  # a new record that shows resonances may tell
     best = min(d.contenders, key=lambda c: c.fit.rms).fit
     noise, colour = noise_of_fit(best, d.experiments)
@@ -192,10 +192,13 @@ def rival_of_effect(model: Model, effect: Component, free: Sequence[str]) -> Riv
     return rival_of_model(effect.name, extended, [*free, *(n for n in own if n not in free)])
 
 
+def _slow(limits: Limits) -> bool:
+    return limits.duration >= FAST * limits.samples
+
+
 def _check_curves(rivals: Sequence[Rival], limits: Limits) -> None:
     curves = {c.curve for r in rivals for c in r.model.components if c.name == r.name}
-    slow = limits.duration >= FAST * limits.samples
-    if slow and len(rivals) > 1 and len(curves) == 1 and None not in curves:
+    if _slow(limits) and len(rivals) > 1 and len(curves) == 1 and None not in curves:
         raise InputError(same_curve_note([r.name for r in rivals]))
 
 
