@@ -110,6 +110,16 @@ def test_white_noise_on_a_motion_is_found(seed: int, quantum: float) -> None:
     assert high_frequency_noise(y) == pytest.approx(true, rel=0.05)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_shows_in_coarse_levels_at_rest(seed: int) -> None:
+    """Third differences of a few levels are a few numbers, whose median says nothing (40 % off)."""
+    rng = np.random.default_rng(seed)
+    y = np.repeat(rng.uniform(0.0, 500.0, 12), 500) + rng.standard_normal(6000)
+    read = 2.5 * np.round(y / 2.5)
+    true = float(np.std(read - y + (y - np.repeat(np.median(y.reshape(12, 500), axis=1), 500))))
+    assert high_frequency_noise(read) == pytest.approx(true, rel=0.05)
+
+
 def test_steps_do_not_count_as_noise() -> None:
     rng = np.random.default_rng(1)
     y = rng.standard_normal(6000) + np.repeat(rng.uniform(0.0, 500.0, 60), 100)

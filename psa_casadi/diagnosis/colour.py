@@ -107,8 +107,13 @@ def excess_power(residual: FloatArray, colour: Colour, floor: float | None = Non
 
 
 def uncertain(samples: int, colour: Colour) -> float:
-    """Return the relative standard error of the noise's power from its fast part, 2/sqrt(n)."""
-    return 2.0 * float(np.sqrt(colour.inflation / max(samples, 1)))
+    """Return the relative standard error of the noise's power from its fast part.
+
+    About 2/sqrt(n) of white noise. The power of a first-order autoregression hangs on what its fast
+    part tells of the correlation: (1 + q^1.5)/sqrt(n) with the inflation q = (1 + r)/(1 - r),
+    within a factor of 1.5 of what 200 draws of r = 0.4 to 0.75 and n = 2,000 to 5,000 showed.
+    """
+    return float((1.0 + colour.inflation**1.5) / np.sqrt(max(samples, 1)))
 
 
 def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:

@@ -11,10 +11,10 @@ from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.evidence import evidence
 from psa_casadi.diagnosis.quick_fits import QUICK, continued, fit_from, quick_fit
-from psa_casadi.diagnosis.screening import Copy, Score, Screening
+from psa_casadi.diagnosis.screening import Copy, Score
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import FIT_RTOL, Fit
+from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import FIXED
 from psa_casadi.identification.starting import ordinary_values
@@ -65,7 +65,7 @@ def extend_like(
     best: Extension,
     experiments: Sequence[Experiment],
     copy: Copy,
-    screening: Screening,
+    colour: Colour,
 ) -> Extension | None:
     """Fit an effect from where the best one has led the base, with the gain that copies that one.
 
@@ -79,7 +79,7 @@ def extend_like(
     quick = quick_fit(before, experiments, effect, [start], base, _COPY)
     if quick is None:
         return None
-    return _extension(before, quick, effect, experiments, screening.colour)
+    return _extension(before, quick, effect, experiments, colour)
 
 
 def extend_within(
@@ -176,6 +176,19 @@ def _best_continued(
 
     best = sorted(fits, key=lambda f: f.cost)[:count]
     return min([*fits, *side_by_side(further, best)], key=lambda f: f.cost, default=None)
+
+
+def stripped(extension: Extension, experiments: Sequence[Experiment]) -> Fit:
+    """Return an extension's fit without its effect, all other values as they are, none fitted.
+
+    Raises PsaError where that cannot be simulated.
+    """
+    whole = extension.fit
+    model = whole.model.without([extension.effect.name])
+    names = [n for n in whole.unknowns.names if n in model.values]
+    return fit(
+        model, experiments, names, sigma=whole.sigma, start_states=whole.starts(), evaluations=1
+    )
 
 
 def polish(

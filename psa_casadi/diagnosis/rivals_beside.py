@@ -8,7 +8,8 @@ from collections.abc import Mapping
 
 from psa_casadi.diagnosis.evidence import levelled, probabilities
 from psa_casadi.diagnosis.extension import Extension, extend_within, polish
-from psa_casadi.diagnosis.rounds import NEAR, RUNNER_UP, Round
+from psa_casadi.diagnosis.imitators import NEAR
+from psa_casadi.diagnosis.rounds import RUNNER_UP, Round
 from psa_casadi.diagnosis.selection import MARGIN, out_of_character
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.identification.fit import Fit

@@ -18,13 +18,13 @@ from psa_casadi.diagnosis.extension import (
     Extension,
     extend,
     extend_afresh,
-    extend_like,
     polish,
 )
+from psa_casadi.diagnosis.imitators import NEAR, imitations
 from psa_casadi.diagnosis.noise_floor import known_colour
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.probes import Direction, directions
-from psa_casadi.diagnosis.screening import Screening, copies, screen
+from psa_casadi.diagnosis.screening import Screening, screen
 from psa_casadi.diagnosis.selection import choose, leading, out_of_character
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.identification.fit import Fit
@@ -35,13 +35,11 @@ FloatArray = npt.NDArray[np.float64]
 #: An extension whose residual is within this factor of the noise needs no further starts.
 SETTLED = 1.02
 #: How many extensions are fitted to the end, if their evidence is this share of the best one's or
-#: this close to it.
-FINALISTS, RUNNER_UP, NEAR = 3, 0.8, 30.0
+#: `NEAR` it.
+FINALISTS, RUNNER_UP = 3, 0.8
 #: How many extensions are fitted afresh, of a first and of a further cause: the best one and, while
 #: none removes this share of the excess power, the next ones.
 AFRESH, AFRESH_FURTHER, MOST = 4, 2, 0.95
-#: How many effects that could stand in the best one's place are fitted besides, at most.
-IMITATORS = 3
 
 
 @dataclass(eq=False)
@@ -173,10 +171,9 @@ def settle_on(
 
 
 def _ranked(current: Round, task: Task, first: Extension | None) -> list[Extension]:
-    colour = current.screening.colour
-    return choose(
-        current.extensions, task.experiments, current.fit, current.predicted, colour, first
-    )
+    fit, predicted, colour = current.fit, current.predicted, current.screening.colour
+    extensions, alarm = current.extensions, current.test.alarm
+    return choose(extensions, task.experiments, fit, predicted, colour, first, alarm=alarm)
 
 
 def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:
@@ -223,38 +220,16 @@ def _polish(current: Round, number: int, task: Task) -> None:
 
 
 def _imitators(current: Round, number: int, task: Task) -> None:
-    """Fit the effects that could copy what the best one adds, the base being free to follow.
-
-    A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is below
-    `NEAR` might explain the data as well; a fit much worse than its copy was lost.
-    """
-    best = current.extensions[0]
-    added = np.concatenate(
-        [
-            (p - q)[e.used]
-            for p, q, e in zip(best.predicted, current.predicted, task.experiments, strict=True)
-        ]
+    """Fit the effects that could stand in the best one's place, and keep those fits."""
+    said = f"cause {number}: fitting {{}}, which could look like {{}}"
+    new = imitations(
+        current.fit, current.extensions, current.trials, current.screening.colour, task, said
     )
-    fitted = {e.effect.name: e for e in current.extensions}
-    others = [d for d in current.trials if d.effect is not best.effect]
-    power, found = copies(current.fit, added, others, current.screening.colour)
-    left = {n: 0.5 * power * (1.0 - copy.share) for n, copy in found.items()}
-    near = [n for n in left if n not in fitted and left[n] < NEAR]
-    lost = [n for n in left if n in fitted and fitted[n].evidence < best.evidence - left[n] - NEAR]
-    names = sorted([*near, *lost], key=lambda n: left[n])[:IMITATORS]
-    if not names:
-        return
-    said = ", ".join(names)
-    task.progress(f"cause {number}: fitting {said}, which could look like {best.effect.name}")
-    alike = side_by_side(
-        lambda n: extend_like(current.fit, best, task.experiments, found[n], current.screening),
-        names,
-    )
-    for name, extension in zip(names, alike, strict=True):
-        if extension is None:
-            continue
-        if name not in fitted:
+    for extension in new:
+        fitted = {e.effect.name: e for e in current.extensions}
+        own = fitted.get(extension.effect.name)
+        if own is None:
             current.extensions.append(extension)
-        elif extension.evidence > fitted[name].evidence:
-            current.extensions[current.extensions.index(fitted[name])] = extension
+        elif extension.evidence > own.evidence:
+            current.extensions[current.extensions.index(own)] = extension
     _sort(current)

@@ -24,8 +24,9 @@ FULL_FITS, _MOST_FITS, _AS_NEAR = 4, 7, 0.4
 _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
-#: Evidence below which nothing is named: 7 to 1.
-LEAST = 2.0
+#: Evidence below which nothing is named: 7 to 1, and where the omnibus test sees nothing 100 to 1
+#: after a prior of one in thirty, as many as there are effects.
+LEAST, UNSEEN = 2.0, 8.0
 #: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
 MARGIN = 3.0
 #: Share of the excess power that an effect must remove to be added, and share of what the best one
@@ -84,21 +85,24 @@ def choose(
     predicted: Sequence[FloatArray],
     colour: Colour,
     first: Extension | None,
+    *,
+    alarm: bool,
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
-    Worth having: evidence above `LEAST`; the effect in character; a share of the training
-    residual's power above the noise removed, or nearly what another one removes that does; and
-    held-out data predicted better than by the model `before`, whose predictions are given. A
-    further cause, beside the `first`, must also remove a share of what that one did. The order is
-    that of the evidence; within the margin the better prediction leads.
+    Worth having: evidence above `LEAST`, or above `UNSEEN` without the omnibus test's `alarm`; the
+    effect in character; a share of the training residual's power above the noise removed, or nearly
+    what another one removes that does; and held-out data predicted better than by the model
+    `before`, whose predictions are given. A further cause, beside the `first`, must also remove a
+    share of what that one did. The order is that of the evidence; within the margin the better
+    prediction leads.
     """
     least = WORTHWHILE * max(0.0, excess_power(before.residuals, colour))
     held = _HeldOut(experiments, predicted, colour)
     fit = [
         e
         for e in extensions
-        if e.evidence > LEAST
+        if e.evidence > (LEAST if alarm else UNSEEN)
         and not out_of_character(e, experiments)
         and (first is None or e.removed > OF_FIRST * first.removed)
         and held.gained(e) > (held.promised(e) if first is None else HELD_OUT_FURTHER)

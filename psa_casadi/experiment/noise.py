@@ -6,8 +6,14 @@ from scipy.signal import detrend
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Samples with less than which the signal itself is its noise; blocks of third differences, samples
+#: in a block at most, and how many third differences of white noise tell as much as one value that
+#: is independent: 1 + 2 (15^2 + 6^2 + 1)/20^2, from their autocorrelations.
+_FEWEST_SAMPLES, _BLOCKS, _BLOCK, _LIKE_ONE = 8, 16, 64, 2.31
+#: Third differences of this many standard deviations are steps.
+_STEP = 6.0
 #: Samples in a segment, the fewest segments, and the fast frequencies [cycles per sample].
-_SEGMENT, _FEWEST_SEGMENTS, _FAST = 128, 4, 0.06
+_SEGMENT, _FEWEST_SEGMENTS, _FAST = 128, 4, 0.045
 _CORRELATIONS = np.arange(0.0, 0.96, 0.01)
 #: A correlation counts from here on, and from so many times 1/sqrt(n): three standard errors.
 _LEAST, _SURE = 0.1, 6.0
@@ -17,14 +23,24 @@ def high_frequency_noise(signal: FloatArray) -> float:
     """Standard deviation of the white part of a signal, from its third differences.
 
     White noise of variance s^2 has third differences of variance 20 s^2, while anything smooth
-    over four samples has almost none. The median absolute value makes it robust against steps;
-    a smaller figure than the root mean square of the signal itself is returned in any case.
+    over four samples has almost none. Those of steps, far beyond their median absolute value, are
+    left out. The mean squares of the others over short blocks have nearly a chi-square
+    distribution, whose median (Wilson and Hilferty) gives s whatever a few blocks hold, and also
+    where the signal is rounded to coarse levels. The figure is at most the root mean square of the
+    signal itself.
     """
-    if len(signal) < 8:
+    if len(signal) < _FEWEST_SAMPLES:
         return float(np.std(signal))
-    differences = np.diff(signal, 3)
-    robust = float(np.median(np.abs(differences))) / 0.6744897501960817 / np.sqrt(20.0)
-    return min(robust, float(np.std(signal))) if robust > 0 else float(np.std(signal))
+    squares = np.diff(signal, 3) ** 2 / 20.0
+    typical = float(np.median(squares)) / 0.455  # the median of chi-square with one degree
+    if typical > 0:
+        squares = squares[squares < _STEP**2 * typical]
+    length = int(np.clip(len(squares) // _BLOCKS, 1, _BLOCK))
+    count = len(squares) // length
+    powers = np.mean(squares[: count * length].reshape(count, length), axis=1)
+    freedom = max(1.0, length / _LIKE_ONE)
+    power = float(np.median(powers)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    return min(float(np.sqrt(power)), float(np.std(signal))) if power > 0 else float(np.std(signal))
 
 
 def first_order_noise(signal: FloatArray) -> tuple[float, float]:
