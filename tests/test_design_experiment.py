@@ -11,9 +11,9 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.experiment import Record
 from psa_casadi.input_design.candidates import KINDS, Kind, draw, rest_of
-from psa_casadi.input_design.criterion import Criterion
+from psa_casadi.input_design.chances import naming_probability, plays_of
+from psa_casadi.input_design.criterion import Criterion, Point
 from psa_casadi.input_design.experiment import (
-    _plays,
     informative_experiment,
     rival_of_effect,
     separating_experiment,
@@ -22,8 +22,8 @@ from psa_casadi.input_design.experiment import (
 from psa_casadi.input_design.information import Information, Optimality
 from psa_casadi.input_design.limits import Limits, excess
 from psa_casadi.input_design.rivals import Rival, SensorNoise, rival_of_model
-from psa_casadi.input_design.search import Effort
-from psa_casadi.input_design.separation import Separation, naming_probability
+from psa_casadi.input_design.search import Effort, search
+from psa_casadi.input_design.separation import Separation
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.experiment_part import sentences
@@ -214,7 +214,38 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
         assert 0.0 < after < before
 
 
-def test_the_more_noise_the_more_plays() -> None:
+def test_a_record_that_is_enough_is_not_improved() -> None:
+    class Swing:
+        """The mean square of the voltage about its middle [V^2]: more is better."""
+
+        def at(self, record: Record) -> Point:
+            def swing(other: Record) -> float:
+                return float(np.mean((other.voltage - 50.0) ** 2))
+
+            return Point(swing(record), swing)
+
+    asked: list[float] = []
+
+    def enough(record: Record) -> bool:
+        asked.append(Swing().at(record).value)
+        return asked[-1] > least
+
+    limits = Limits(0.0, 100.0, 1.0, 200)
+    least = np.inf
+    further = search(Swing(), limits, 1e4, kinds=("triangles",), enough=enough)
+    drawn = further.drawn
+    assert asked[0] == drawn < further.value
+    least = drawn - 1.0
+    at_once = search(Swing(), limits, 1e4, kinds=("triangles",), enough=enough)
+    assert at_once.value == drawn
+    assert at_once.evaluations == Effort().draws
+    least = 0.5 * (drawn + asked[1])
+    after_one = search(Swing(), limits, 1e4, kinds=("triangles",), enough=enough)
+    assert drawn < after_one.value
+    assert at_once.evaluations < after_one.evaluations < further.evaluations
+
+
+def test_the_more_noise_the_moreplays_of() -> None:
     pair, record = tuple(rivals()), planned("triangles")
     found: list[float] = []
     for noise in (1e-10, 2e-9, 2e-6):
@@ -222,7 +253,7 @@ def test_the_more_noise_the_more_plays() -> None:
         distances = criterion.distances(record)
         chance = {r.name: naming_probability(r, [o], distances, 0.0)
                   for r, o in (pair, pair[::-1])}  # fmt: skip
-        found.append(_plays(criterion, None, record, chance) or np.inf)
+        found.append(plays_of(criterion, None, record, chance) or np.inf)
     assert found[0] == 1
     assert 1 < found[1] <= 5
     assert found[-1] == np.inf

@@ -2,7 +2,6 @@
 
 import time as clock
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +14,8 @@ from psa_casadi.experiment.excitation import sine, triangle
 from psa_casadi.experiment.record import Record
 from psa_casadi.identification.search import FIXED
 from psa_casadi.input_design.candidates import KINDS, Kind, rest_of
-from psa_casadi.input_design.designs import ASKED, PLAYS, Informative, Pair, Separated
+from psa_casadi.input_design.chances import chances_of, plays_of, tells
+from psa_casadi.input_design.designs import Informative, Pair, Separated
 from psa_casadi.input_design.information import Information, Optimality
 from psa_casadi.input_design.limits import Limits, limits_of
 from psa_casadi.input_design.rivals import (
@@ -26,7 +26,7 @@ from psa_casadi.input_design.rivals import (
     rival_of_model,
 )
 from psa_casadi.input_design.search import BRIEF, GRID, Best, Effort, Progress, coarse, search
-from psa_casadi.input_design.separation import Separation, naming_probability, overall
+from psa_casadi.input_design.separation import Separation, overall
 from psa_casadi.model.compose import Model
 
 #: Periods of the usual sine and triangle that a design is compared with.
@@ -73,11 +73,11 @@ def separating_experiment(
     _check_curves(rivals, limits)
     steepest = limits.steepest(_capacitance(rivals[0].model))
     samples = min(limits.samples, GRID)
-    criterion = Separation(tuple(rivals), noise.on_grid(limits, samples))
+    coarser = Separation(tuple(rivals), noise.on_grid(limits, samples))
     usual = usual_records(limits, steepest)
     best = search(
-        criterion, limits, steepest,
-        usual=tuple(usual.values()), kinds=kinds, effort=effort, progress=progress,
+        coarser, limits, steepest, usual=tuple(usual.values()), kinds=kinds, effort=effort,
+        enough=lambda record: tells(coarser, base, record), progress=progress,
     )  # fmt: skip
     progress("comparing with a sine and a triangle")
     samples = min(limits.samples, _FINE)
@@ -87,7 +87,7 @@ def separating_experiment(
     chosen = max(found, key=lambda n: overall(found[n].values()))
     if chosen != "designed":
         records["designed"], found["designed"] = records[chosen], found[chosen]
-    chances = {n: _chances(criterion, found[n], base, r) for n, r in records.items()}
+    chances = {n: chances_of(criterion, found[n], base, r) for n, r in records.items()}
     return Separated(
         record=usual.get(chosen, best.record),
         kind=chosen if chosen in usual else best.kind,
@@ -95,7 +95,7 @@ def separating_experiment(
         pairs=_pairs(found),
         chance=chances["designed"],
         usual_chance={n: c for n, c in chances.items() if n != "designed"},
-        plays=_plays(criterion, base, records["designed"], chances["designed"]),
+        plays=plays_of(criterion, base, records["designed"], chances["designed"]),
         evaluations=best.evaluations,
         seconds=clock.perf_counter() - begin,
     )
@@ -208,37 +208,6 @@ def _pairs(found: Mapping[str, Mapping[tuple[str, str], float]]) -> tuple[Pair, 
         Pair(a, b, 0.5 * t, {n: 0.5 * f[a, b] for n, f in found.items() if n != "designed"})
         for (a, b), t in found["designed"].items()
     )
-
-
-def _plays(
-    criterion: Separation, base: Rival | None, record: Record, chance: Mapping[str, float]
-) -> int | None:
-    """Return how often a record must be played until it tells; None if `PLAYS[-1]` do not.
-
-    k records of the same voltage are one whose noise has 1/k of the variance.
-    """
-    for plays in PLAYS:
-        if plays > 1:
-            colour = replace(criterion.noise, level=criterion.noise.level / np.sqrt(plays))
-            often = replace(criterion, noise=colour)
-            chance = _chances(often, often.distances(record), base, record)
-        if min(chance.values()) >= ASKED:
-            return plays
-    return None
-
-
-def _chances(
-    criterion: Separation,
-    distances: Mapping[tuple[str, str], float],
-    base: Rival | None,
-    record: Record,
-) -> dict[str, float]:
-    chances = {}
-    for truth in criterion.rivals:
-        others = [r for r in criterion.rivals if r is not truth]
-        over = 0.0 if base is None else criterion.distance(truth, base, record)
-        chances[truth.name] = naming_probability(truth, others, distances, over)
-    return chances
 
 
 def _intervals(rival: Rival, errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:

@@ -60,11 +60,13 @@ def search(
     usual: Sequence[Record] = (),
     kinds: Sequence[Kind] = KINDS,
     effort: Effort | None = None,
+    enough: Callable[[Record], bool] = lambda _: False,
     progress: Progress = lambda _: None,
 ) -> Best:
     """Draw waveforms of the families, improve the best ones, return the best of all.
 
     A `usual` record within the limits that is better than all of them is returned in their place.
+    Once the best record, on the comparison's grid, is `enough`, nothing is improved any more.
 
     Gradients are exact in the trajectories' derivatives by delta and differences by the waveform's
     coordinates, evaluated side by side. Raises SimulationError where no waveform can be simulated.
@@ -82,6 +84,8 @@ def search(
         )
     best, found = values[order[0]], (pool[order[0]], pool[order[0]].start)
     for number, k in enumerate(order[: effort.starts]):
+        if enough(problem.record(*found)):
+            break
         progress(f"improving {number + 1} of {effort.starts}: {pool[k].kind}")
         p, value = problem.improve(pool[k], effort.steps)
         if value > best:

@@ -11,15 +11,13 @@ Biometrika 62 (1975), 57 (T-optimality); for Gaussian noise T/2 is the Kullback-
 (Lopez-Fidalgo, Tommasi and Trandafir 2007).
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
-from scipy.stats import norm
 
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.evidence import CREDIBLE, FORM, TEMPERATURE
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.experiment.record import Record
 from psa_casadi.identification.levenberg_marquardt import minimise
@@ -32,7 +30,8 @@ from psa_casadi.units import FloatArray
 #: Evaluations of a re-fit at most, while voltages are compared and in the end; when it has settled.
 #: A re-fit that is cut off too soon shows a distance that is not there, which a search would find.
 QUICK, FINAL, _SETTLED = 30, 40, 1e-4
-_LEAST = 1e-6
+#: Distances below this are none.
+LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Separation:
     def at(self, record: Record) -> Point:
         """Return the value and a function of the voltage with its gradient."""
         found = self._refits(record, self.evaluations)
-        inverse = {pair: 1.0 / max(r.distance, _LEAST) for pair, r in found.items()}
+        inverse = {pair: 1.0 / max(r.distance, LEAST) for pair, r in found.items()}
         total = sum(inverse.values())
         value = overall([r.distance for r in found.values()])
 
@@ -129,26 +128,7 @@ class Separation:
 
 def overall(distances: Collection[float]) -> float:
     """Return the logarithm of the harmonic mean of distances: the least one counts most."""
-    return float(np.log(len(distances) / sum(1.0 / max(t, _LEAST) for t in distances)))
-
-
-def naming_probability(
-    truth: Rival, others: Sequence[Rival], distances: Mapping[tuple[str, str], float], over: float
-) -> float:
-    """Return the probability that a diagnosis names `truth` if it is the cause.
-
-    Against each other rival ln B is normal with mean (what the data at hand say) + T/2 and
-    variance T; to be named alone it must exceed temperature * ln(c/(1 - c)), c = 0.95, where the
-    temperature grows with the evidence over the base, of which the new record adds `over`/2.
-    """
-    temperature = max(TEMPERATURE, FORM * (truth.evidence + 0.5 * over))
-    needed = temperature * float(np.log(CREDIBLE / (1.0 - CREDIBLE)))
-    chances = []
-    for other in others:
-        t = distances[truth.name, other.name]
-        gained = truth.evidence - other.evidence + 0.5 * t - needed
-        chances.append(float(norm.cdf(gained / np.sqrt(max(t, _LEAST)))))
-    return min(chances, default=1.0)
+    return float(np.log(len(distances) / sum(1.0 / max(t, LEAST) for t in distances)))
 
 
 def _root(information: FloatArray) -> FloatArray:
