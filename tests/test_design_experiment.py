@@ -245,7 +245,7 @@ def test_a_record_that_is_enough_is_not_improved() -> None:
     assert at_once.evaluations < after_one.evaluations < further.evaluations
 
 
-def test_the_more_noise_the_moreplays_of() -> None:
+def test_the_more_noise_the_more_plays() -> None:
     pair, record = tuple(rivals()), planned("triangles")
     found: list[float] = []
     for noise in (1e-10, 2e-9, 2e-6):

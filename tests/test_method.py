@@ -91,8 +91,9 @@ def test_imitators_are_asked_for_where_the_best_effect_has_led_the_base() -> Non
     plain = stripped(drift, experiments)
     for name in free:
         assert plain.model.values[name] == drift.fit.model.values[name]
-    assert plain.rms > 1.5 * bent.rms
-    found = imitations(bent, [drift], seen.trials, colour, task, "{}: {}")
+    assert "drift_rate" not in plain.model.parameter_names
+    assert np.std(plain.residuals) > 1.5 * np.std(bent.residuals)
+    found = imitations(bent, [drift], seen.trials, colour, task, 1)
     assert [e.effect.name for e in found] == ["slow_creep"]
     assert found[0].evidence > 0.9 * drift.evidence
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.colour import Colour, colour_of, excess_power, noise_rms
+from psa_casadi.diagnosis.colour import Colour, colour_of, excess_power, noise_rms, uncertain
 from psa_casadi.diagnosis.omnibus import omnibus
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.noise import first_order_noise, high_frequency_noise
@@ -60,6 +60,15 @@ def test_what_is_above_coloured_noise_is_its_excess() -> None:
     more = e + np.sqrt(2.0) * np.sin(2.0 * np.pi * TIME)
     assert excess_power(more, colour) == pytest.approx(1.0, abs=0.25)
     assert noise_rms(more, colour) <= colour.rms
+
+
+@pytest.mark.parametrize(("correlation", "n"), [(0.0, 4000), (0.6, 5000), (0.75, 3000)])
+def test_the_power_of_noise_is_as_uncertain_as_draws_of_it_show(correlation: float, n: int) -> None:
+    rng = np.random.default_rng(8)
+    drawn = [coloured(rng.standard_normal(n + 200), correlation)[200:] for _ in range(60)]
+    powers = [first_order_noise(e)[0] ** 2 for e in drawn]  # capped by what the draw really has
+    said = float(np.median([uncertain(e) for e in drawn]))
+    assert 0.5 * said < float(np.std(powers)) < 1.5 * said
 
 
 def _size_test(

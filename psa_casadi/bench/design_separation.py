@@ -235,7 +235,7 @@ def _times(progress: Progress, quick: bool) -> TitledTable:
         limits = Limits(0.0, 100.0, 2.0, samples)
         clock = [time.perf_counter()]
         for rivals in pairs:
-            separating_experiment(rivals, noise, limits)
+            separating_experiment(rivals, noise, limits, base=base)
             clock.append(time.perf_counter())
         informative_experiment(base, noise, limits)
         clock.append(time.perf_counter())

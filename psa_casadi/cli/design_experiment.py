@@ -88,7 +88,7 @@ def experiment(
     correlation: Annotated[
         float, typer.Option(help="Correlation of the noise in neighbouring samples.")
     ] = 0.0,
-    starts: Annotated[int, typer.Option(help="Voltages that are improved to the end.")] = 2,
+    starts: Annotated[int, typer.Option(help="Voltages that are improved, at most.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the drawn voltages.")] = 1,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="CSV with the voltage to play.")

@@ -75,7 +75,7 @@ def explained_share(
     """
     errors = np.concatenate(whole_residuals(experiments, before))
     valid = errors[np.isfinite(errors)]
-    noise = floor**2 * (1.0 + uncertain(len(valid), colour))
+    noise = floor**2 * (1.0 + uncertain(valid))
     powers = (float(np.mean(valid**2)), held_out_rms(experiments, before) ** 2)
     excess = max(powers) - noise
     left = held_out_rms(experiments, after) ** 2 - noise

@@ -181,7 +181,7 @@ def _best_continued(
 def stripped(extension: Extension, experiments: Sequence[Experiment]) -> Fit:
     """Return an extension's fit without its effect, all other values as they are, none fitted.
 
-    Raises PsaError where that cannot be simulated.
+    Only the offset of a record is guessed anew. Raises PsaError where that cannot be simulated.
     """
     whole = extension.fit
     model = whole.model.without([extension.effect.name])

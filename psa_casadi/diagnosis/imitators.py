@@ -28,15 +28,16 @@ def imitations(
     trials: Sequence[Direction],
     colour: Colour,
     task: Task,
-    said: str,
+    number: int,
 ) -> list[Extension]:
     """Fit the effects that could copy what the best one adds, the base being free to follow.
 
-    `extensions` of the fit `before` come best first; `said` is how it is told, with places for the
-    effects' names and the best one's. That is asked where the best one has led the base: without it
-    the base is bent to imitate it, so that hardly anything of it is left to copy. A copy that
-    leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is below `NEAR` might
-    explain the data as well; a fit much worse than its copy was lost.
+    `extensions` of the fit `before` come best first, `trials` are directions there; `number` is the
+    cause's. What the best one adds is taken where it has led the base: without it the base is bent
+    to imitate it, so that hardly anything of it is left to copy. The trial directions hardly change
+    on the way. A copy that leaves so little of the contribution's sum of squares D that
+    D (1 - R^2)/2 is below `NEAR` might explain the data as well; a fit much worse than its copy was
+    lost.
     """
     best = extensions[0]
     try:
@@ -55,7 +56,8 @@ def imitations(
     names = sorted([*near, *lost], key=lambda n: left[n])[:IMITATORS]
     if not names:
         return []
-    task.progress(said.format(", ".join(names), best.effect.name))
+    said = ", ".join(names)
+    task.progress(f"cause {number}: fitting {said}, which could look like {best.effect.name}")
     alike = side_by_side(
         lambda n: extend_like(before, best, task.experiments, found[n], colour), names
     )

@@ -62,11 +62,13 @@ def pooled_level(
     """Return the rms of the noise over all records [m].
 
     Where no voltage was repeated that of the residual's fast part counts, at most that of noise of
-    the given colour: a hold may ring.
+    the given colour and at least that of rounding: a hold may ring.
     """
     counts = [np.count_nonzero(np.isfinite(e)) for e in residuals]
     powers = [
-        n.level**2 if n.source == "repeats" else noise_rms(e[np.isfinite(e)], colour) ** 2
+        n.level**2
+        if n.source == "repeats"
+        else max(noise_rms(e[np.isfinite(e)], colour) ** 2, (n.quantum or 0.0) ** 2 / 12.0)
         for n, e in zip(noise, residuals, strict=True)
     ]
     return float(np.sqrt(np.average(powers, weights=counts)))

@@ -1,7 +1,7 @@
 """One step of the search for causes: screen, fit the leading effects, ask for imitators, choose."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +35,7 @@ FloatArray = npt.NDArray[np.float64]
 #: An extension whose residual is within this factor of the noise needs no further starts.
 SETTLED = 1.02
 #: How many extensions are fitted to the end, if their evidence is this share of the best one's or
-#: `NEAR` it.
+#: within `NEAR` of it.
 FINALISTS, RUNNER_UP = 3, 0.8
 #: How many extensions are fitted afresh, of a first and of a further cause: the best one and, while
 #: none removes this share of the excess power, the next ones.
@@ -130,6 +130,13 @@ def decide(current: Round, number: int, task: Task, first: Extension | None = No
         _imitators(current, number, task)
         _polish(current, number, task)
     ranked = _ranked(current, task, first)
+    while ranked and not ranked[0].final:  # better ones were not worth having
+        k, colour = current.extensions.index(ranked[0]), current.screening.colour
+        current.extensions[k] = replace(
+            polish(current.fit, ranked[0], task.experiments, colour), final=True
+        )
+        _sort(current)
+        ranked = _ranked(current, task, first)
     _weigh(current, ranked, task)
     current.chosen = ranked[0] if ranked else None
 
@@ -221,10 +228,8 @@ def _polish(current: Round, number: int, task: Task) -> None:
 
 def _imitators(current: Round, number: int, task: Task) -> None:
     """Fit the effects that could stand in the best one's place, and keep those fits."""
-    said = f"cause {number}: fitting {{}}, which could look like {{}}"
-    new = imitations(
-        current.fit, current.extensions, current.trials, current.screening.colour, task, said
-    )
+    colour = current.screening.colour
+    new = imitations(current.fit, current.extensions, current.trials, colour, task, number)
     for extension in new:
         fitted = {e.effect.name: e for e in current.extensions}
         own = fitted.get(extension.effect.name)

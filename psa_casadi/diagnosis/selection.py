@@ -25,7 +25,7 @@ _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
 #: Evidence below which nothing is named: 7 to 1, and where the omnibus test sees nothing 100 to 1
-#: after a prior of one in thirty, as many as there are effects.
+#: after a prior of one in thirty for each of the effects.
 LEAST, UNSEEN = 2.0, 8.0
 #: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
 MARGIN = 3.0

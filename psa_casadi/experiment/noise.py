@@ -6,12 +6,13 @@ from scipy.signal import detrend
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Samples with less than which the signal itself is its noise; blocks of third differences, samples
-#: in a block at most, and how many third differences of white noise tell as much as one value that
-#: is independent: 1 + 2 (15^2 + 6^2 + 1)/20^2, from their autocorrelations.
-_FEWEST_SAMPLES, _BLOCKS, _BLOCK, _LIKE_ONE = 8, 16, 64, 2.31
-#: Third differences of this many standard deviations are steps.
-_STEP = 6.0
+#: Fewer samples than this are noise as a whole; third differences of this many standard deviations
+#: are steps, if their share is no larger.
+_FEWEST_SAMPLES, _STEP, _STEPS = 8, 5.0, 0.2
+#: Blocks of third differences at least, samples in one at most.
+_BLOCKS, _BLOCK = 16, 64
+#: Squares of the autocorrelations of white noise's third differences: -15, 6 and -1 over 20.
+_SQUARES = (0.5625, 0.09, 0.0025)
 #: Samples in a segment, the fewest segments, and the fast frequencies [cycles per sample].
 _SEGMENT, _FEWEST_SEGMENTS, _FAST = 128, 4, 0.045
 _CORRELATIONS = np.arange(0.0, 0.96, 0.01)
@@ -23,24 +24,29 @@ def high_frequency_noise(signal: FloatArray) -> float:
     """Standard deviation of the white part of a signal, from its third differences.
 
     White noise of variance s^2 has third differences of variance 20 s^2, while anything smooth
-    over four samples has almost none. Those of steps, far beyond their median absolute value, are
-    left out. The mean squares of the others over short blocks have nearly a chi-square
-    distribution, whose median (Wilson and Hilferty) gives s whatever a few blocks hold, and also
-    where the signal is rounded to coarse levels. The figure is at most the root mean square of the
-    signal itself.
+    over four samples has almost none. Those of steps, few and far beyond their median absolute
+    value, are left out; a kink every few dozen samples counts as noise. The mean squares of the
+    others over short blocks have nearly a chi-square distribution, whose median (Wilson and
+    Hilferty) gives s whatever a few blocks hold, and also where the signal is rounded to coarse
+    levels. The figure is at most the root mean square of the signal itself.
     """
     if len(signal) < _FEWEST_SAMPLES:
         return float(np.std(signal))
     squares = np.diff(signal, 3) ** 2 / 20.0
-    typical = float(np.median(squares)) / 0.455  # the median of chi-square with one degree
-    if typical > 0:
-        squares = squares[squares < _STEP**2 * typical]
+    usual = squares < _STEP**2 * float(np.median(squares)) / 0.455  # that of chi-square with one
+    if np.mean(usual) >= 1.0 - _STEPS:
+        squares = squares[usual]
     length = int(np.clip(len(squares) // _BLOCKS, 1, _BLOCK))
     count = len(squares) // length
     powers = np.mean(squares[: count * length].reshape(count, length), axis=1)
-    freedom = max(1.0, length / _LIKE_ONE)
-    power = float(np.median(powers)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    power = float(np.median(powers)) / (1.0 - 2.0 / (9.0 * _freedom(length))) ** 3
     return min(float(np.sqrt(power)), float(np.std(signal))) if power > 0 else float(np.std(signal))
+
+
+def _freedom(length: int) -> float:
+    """Degrees of freedom of the mean square of so many third differences of white noise."""
+    alike = sum((1.0 - k / length) * r for k, r in enumerate(_SQUARES, 1) if k < length)
+    return length / (1.0 + 2.0 * alike)
 
 
 def first_order_noise(signal: FloatArray) -> tuple[float, float]:

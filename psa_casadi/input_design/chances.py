@@ -7,6 +7,7 @@ import numpy as np
 from scipy.stats import norm
 
 from psa_casadi.diagnosis.evidence import CREDIBLE, FORM, TEMPERATURE
+from psa_casadi.errors import PsaError
 from psa_casadi.experiment.record import Record
 from psa_casadi.input_design.designs import ASKED, PLAYS
 from psa_casadi.input_design.rivals import Rival
@@ -38,8 +39,11 @@ def naming_probability(
 
 def tells(criterion: Separation, base: Rival | None, record: Record) -> bool:
     """Whether a record names every rival for sure, even with a fraction of its distances."""
-    less = {pair: t / _MARGIN for pair, t in criterion.distances(record).items()}
-    return min(chances_of(criterion, less, base, record).values()) > _CERTAIN
+    try:
+        less = {pair: t / _MARGIN for pair, t in criterion.distances(record).items()}
+        return min(chances_of(criterion, less, base, record).values()) > _CERTAIN
+    except PsaError:  # a base that cannot follow: another voltage may be better
+        return False
 
 
 def plays_of(

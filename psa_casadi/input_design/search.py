@@ -26,7 +26,7 @@ _POOR = -1e3
 
 @dataclass(frozen=True)
 class Effort:
-    """How long to search: waveforms drawn of each family, how many improved, steps for each."""
+    """How long to search: waveforms drawn of each family, how many improved (most), steps."""
 
     draws: int = 6
     starts: int = 2
