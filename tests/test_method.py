@@ -52,7 +52,7 @@ def test_an_effect_with_hardly_any_evidence_is_not_worth_a_name(
 ) -> None:
     """A clean record's threshold is passed by chance; an imitator at odds of 1.6 was named.
 
-    So was a current limit at 300 to 1 where the omnibus test saw nothing: of thirty one may.
+    So were a current limit and a mode at odds of e^6 and e^10 where the omnibus test saw nothing.
     """
     found, experiments = fitted
     predicted = tuple(found.predicted(experiments))
@@ -65,7 +65,7 @@ def test_an_effect_with_hardly_any_evidence_is_not_worth_a_name(
         (3.0, True, 1),
         (1.0, True, 0),
         (3.0, False, 0),
-        (9.0, False, 1),
+        (15.0, False, 1),
     ):
         one = replace(extension, evidence=evidence)
         given = (experiments, found, predicted, colour, None)

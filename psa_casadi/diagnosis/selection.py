@@ -24,9 +24,9 @@ FULL_FITS, _MOST_FITS, _AS_NEAR = 4, 7, 0.4
 _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
-#: Evidence below which nothing is named: 7 to 1, and where the omnibus test sees nothing 100 to 1
-#: after a prior of one in thirty for each of the effects.
-LEAST, UNSEEN = 2.0, 8.0
+#: Evidence below which nothing is named: 7 to 1, and where the omnibus test sees nothing as much as
+#: no base fit of a clean record that is a little off has given.
+LEAST, UNSEEN = 2.0, 12.0
 #: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
 MARGIN = 3.0
 #: Share of the excess power that an effect must remove to be added, and share of what the best one
