@@ -31,6 +31,9 @@ TOLERANCE = {"slope": 2e-3, "width": 5e-3, "asymmetry": 0.5, "n": 1e-2, "lag": 1
 
 pytestmark = pytest.mark.xdist_group("identification")
 
+#: What `psa identify` finds for a named stack with a record of its own.
+IDENTIFIED = ("k_L", "A", "beta", "gamma", "n", "tau", "delta", "R_s", "c_P", "c_B")
+
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
@@ -185,11 +188,17 @@ def test_the_stack_of_the_demonstration_is_what_its_record_gives() -> None:
 
 
 def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
-    """The named stack meets its record as well as the fit does: offset and memory are fitted."""
+    """The named stack meets its record as well as any values of what was identified for it.
+
+    So does the fit, hardly better where it frees masses besides, which the named stack leaves at
+    ordinary values. Offset and memory are fitted.
+    """
     model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
     y: FloatArray = np.asarray(record.displacement)
     found = fit(model, [whole(record)], [], sigma=[rms])
-    assert found.rms == pytest.approx(rms, rel=1e-3)
+    again = fit(model, [whole(record)], IDENTIFIED, sigma=[rms])
+    assert found.rms == pytest.approx(again.rms, rel=1e-3)
+    assert 0.995 * found.rms < rms < 1.001 * found.rms
     x, _, _ = predict_record(model, record, found.start(0), [],
                              stop=record.n, rtol=1e-8)  # fmt: skip
-    assert np.std(x - y) == pytest.approx(rms, rel=2e-3)
+    assert np.std(x - y) == pytest.approx(found.rms, rel=2e-3)
