@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from psa_casadi.diagnosis.colour import Colour, uncertain
+from psa_casadi.diagnosis.colour import uncertain
 from psa_casadi.diagnosis.result import Errors, Gain
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.prediction import measured
@@ -65,7 +65,6 @@ def explained_share(
     before: Sequence[FloatArray],
     after: Sequence[FloatArray],
     floor: float,
-    colour: Colour,
 ) -> float:
     """Share of the excess power that the predictions `after` remove from those `before`, 0 to 1.
 

@@ -1,7 +1,7 @@
 """Fits with one more effect: from its trial directions, from another effect's fit, afresh."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -201,7 +201,7 @@ def polish(
         try:
             current = continued(current, experiments, min(rtol, loosest), tolerance, evaluations)
         except PsaError:
-            return extension
+            return replace(extension, final=True)
     return _extension(before, current, extension.effect, experiments, colour, final=True)
 
 

@@ -68,7 +68,7 @@ def pooled_level(
     powers = [
         n.level**2
         if n.source == "repeats"
-        else max(noise_rms(e[np.isfinite(e)], colour) ** 2, (n.quantum or 0.0) ** 2 / 12.0)
+        else max(noise_rms(e[np.isfinite(e)], colour), _rounding(n.quantum)) ** 2
         for n, e in zip(noise, residuals, strict=True)
     ]
     return float(np.sqrt(np.average(powers, weights=counts)))
@@ -97,7 +97,7 @@ def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
         level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
         covariance = np.asarray(level**2 * r ** np.arange(_LAGS if r > 0 else 1), np.float64)
         found = MeasuredNoise(level, covariance, np.array([r] if r > 0 else []), valid.size)
-    rounding = (quantum or 0.0) / float(np.sqrt(12.0))
+    rounding = _rounding(quantum)
     level, covariance = found.level, found.autocovariance.copy()
     if level < rounding:
         covariance[0] += rounding**2 - level**2
@@ -116,6 +116,11 @@ def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
     return NoiseFloor(
         record.name, level, source, found.samples, covariance, found.autoregression, quantum, said
     )
+
+
+def _rounding(quantum: float | None) -> float:
+    """Rms of rounding to a quantum, 0 where there is none."""
+    return (quantum or 0.0) / float(np.sqrt(12.0))
 
 
 @lru_cache(maxsize=64)

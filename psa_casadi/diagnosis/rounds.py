@@ -1,7 +1,7 @@
 """One step of the search for causes: screen, fit the leading effects, ask for imitators, choose."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -131,11 +131,7 @@ def decide(current: Round, number: int, task: Task, first: Extension | None = No
         _polish(current, number, task)
     ranked = _ranked(current, task, first)
     while ranked and not ranked[0].final:  # better ones were not worth having
-        k, colour = current.extensions.index(ranked[0]), current.screening.colour
-        current.extensions[k] = replace(
-            polish(current.fit, ranked[0], task.experiments, colour), final=True
-        )
-        _sort(current)
+        _to_end(current, ranked[:1], number, task)
         ranked = _ranked(current, task, first)
     _weigh(current, ranked, task)
     current.chosen = ranked[0] if ranked else None
@@ -215,11 +211,16 @@ def _polish(current: Round, number: int, task: Task) -> None:
         return
     best = current.extensions[0].evidence
     limit = min(RUNNER_UP * best, best - NEAR)
-    colour, leaders = current.screening.colour, current.extensions[:FINALISTS]
-    chosen = [e for e in leaders if e.evidence > limit and not e.final]
+    leaders = current.extensions[:FINALISTS]
+    _to_end(current, [e for e in leaders if e.evidence > limit and not e.final], number, task)
+
+
+def _to_end(current: Round, chosen: Sequence[Extension], number: int, task: Task) -> None:
+    """Fit some of the extensions to the end, and sort all."""
     if chosen:
         names = ", ".join(e.effect.name for e in chosen)
         task.progress(f"cause {number}: {names} to the end")
+    colour = current.screening.colour
     ended = side_by_side(lambda e: polish(current.fit, e, task.experiments, colour), chosen)
     rest = [e for e in current.extensions if e not in chosen]
     current.extensions = [*ended, *rest]

@@ -48,9 +48,7 @@ def conclude(
     base_errors = whole_residuals(experiments, first.predicted)
     noise = noise_floor([e.record for e in experiments], errors)
     floor = pooled_level(noise, errors, last.screening.colour)
-    share = explained_share(
-        experiments, first.predicted, last.predicted, floor, last.screening.colour
-    )
+    share = explained_share(experiments, first.predicted, last.predicted, floor)
     missing = first.test.alarm or first.chosen is not None
     verdict: Verdict
     if not missing:
@@ -73,9 +71,7 @@ def conclude(
             r.chosen,
             last.fit,
             found,
-            explained_share(
-                experiments, r.predicted, after.predicted, floor, after.screening.colour
-            ),
+            explained_share(experiments, r.predicted, after.predicted, floor),
             partly=verdict == "partly_explained",
         )
         for r, after in zip(named, rounds[1:], strict=False)

@@ -82,13 +82,14 @@ def search(
             "None of the drawn voltages could be simulated with the models; parameter values far"
             " from physical ones are the likely cause: check them."
         )
-    best, found = values[order[0]], (pool[order[0]], pool[order[0]].start)
+    best, found, better = values[order[0]], (pool[order[0]], pool[order[0]].start), True
     for number, k in enumerate(order[: effort.starts]):
-        if enough(problem.record(*found)):
+        if better and enough(problem.record(*found)):
             break
         progress(f"improving {number + 1} of {effort.starts}: {pool[k].kind}")
         p, value = problem.improve(pool[k], effort.steps)
-        if value > best:
+        better = value > best
+        if better:
             best, found = value, (pool[k], p)
     record, kind = _in_full(*found, limits), str(found[0].kind)
     for other in usual:
