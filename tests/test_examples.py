@@ -78,8 +78,9 @@ FIGURES: dict[str, Callable[[Any], None]] = {
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_example_runs(name: str, tmp_path: Path) -> None:
-    found = run_example(name, tmp_path)
+def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path.parent)
+    found = run_example(name, Path(tmp_path.name))  # as `psa examples NAME -o FOLDER` is typed
     left = list(tmp_path.iterdir())
     assert left
     for path in left:

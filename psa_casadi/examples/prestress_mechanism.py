@@ -71,7 +71,7 @@ def _coupled(fmus: list[Path], folder: Path, voltage: float) -> tuple[FloatArray
         names.append({v.name: v.valueReference for v in description.modelVariables})
         part = FMU2Slave(
             guid=description.guid,
-            unzipDirectory=str(extract(str(path), str(folder / path.stem))),
+            unzipDirectory=str(extract(str(path), str((folder / path.stem).resolve()))),
             modelIdentifier=description.coSimulation.modelIdentifier,
         )
         part.instantiate()
