@@ -1,5 +1,6 @@
 """Stacks that ring within a record's band, or just above it: the base must find that itself."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.extension import Extension, extend, polish
-from psa_casadi.diagnosis.retries import from_resonances, instead_of
+from psa_casadi.diagnosis.retries import from_band, from_resonances, instead_of
+from psa_casadi.diagnosis.ringing import ringing
 from psa_casadi.diagnosis.rounds import examine
 from psa_casadi.diagnosis.selection import starts_of
 from psa_casadi.diagnosis.task import Task
@@ -20,12 +22,13 @@ from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import starting_model
 from psa_casadi.simulation.simulate import simulate_record
-from tests.plants.designs import DesignKind
+from tests.plants.excitations import ExcitationKind
 from tests.plants.make import Truth, make_record
+from tests.plants.noise import NoiseKind
 
 
 def _fitted(
-    path: Path, kind: DesignKind, seed: int, samples: int | None = None
+    path: Path, kind: ExcitationKind, seed: int, samples: int | None = None
 ) -> tuple[Truth, tuple[Experiment, ...], Fit]:
     truth = make_record(None, seed, path, excitation=kind)
     whole = read_record(path)
@@ -108,6 +111,44 @@ def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     found = instead_of(base, lag, experiments, _quietly)
     assert (found is not None) == own
     assert found is None or found.rms < 1.001 * lag.fit.rms
+
+
+@pytest.mark.parametrize(("noise", "seed"), [("white", 112316), ("ar", 112437), ("ar", 118254)])
+def test_ringing_above_the_band_shows_which_resonance_was_missed(
+    noise: NoiseKind, seed: int, tmp_path: Path
+) -> None:
+    """1.26 kHz sampled at 0.5 kHz, 1.11 and 1.21 kHz at 0.8 kHz; damping ratios 0.04 to 0.06."""
+    truth = make_record(None, seed, tmp_path / "a.csv", noise=noise)
+    record = read_record(tmp_path / "a.csv")
+    experiments = (split(record),)
+    base = fit_base(starting_model([record], None), experiments)
+    seen = ringing(base, experiments)
+    assert seen is not None
+    assert seen.decrease > 80.0
+    own = _lowest(truth.stack.as_dict(), "m_p", "m_b")
+    rate = 1.0 / record.sample_time
+    image = abs(own - rate * round(own / rate))
+    assert seen.tone == pytest.approx(image, abs=0.03 * rate)
+    assert min(abs(f - own) for f, _ in seen.resonances) < 0.03 * rate
+    found = from_band(base, base, experiments, _quietly)
+    assert found is not None
+    assert _lowest(found.model.values, "m_P", "m_B") == pytest.approx(own, rel=0.02)
+    left = ringing(found, experiments)
+    assert left is not None
+    assert left.decrease < 0.2 * seen.decrease
+
+
+def _lowest(p: Mapping[str, float], *masses: str) -> float:
+    return min(float(np.sqrt(p[m.replace("m", "k")] / p[m])) / (2.0 * np.pi) for m in masses)
+
+
+def test_a_base_that_misses_nothing_shows_no_ringing(tmp_path: Path) -> None:
+    for seed in (1, 2, 3):
+        _, experiments, base = _fitted(tmp_path / "a.csv", "rich", seed)
+        seen = ringing(base, experiments)
+        assert seen is not None
+        assert seen.decrease < 30.0
+        assert from_band(base, base, experiments, _quietly) is None
 
 
 def test_quick_fits_integrate_below_the_noise(tmp_path: Path) -> None:

@@ -7,7 +7,14 @@ import pytest
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.colour import Colour, colour_of, excess_power, noise_rms, uncertain
+from psa_casadi.diagnosis.colour import (
+    Colour,
+    colour_of,
+    excess_power,
+    left_correlation,
+    noise_rms,
+    uncertain,
+)
 from psa_casadi.diagnosis.omnibus import omnibus
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.noise import first_order_noise, high_frequency_noise
@@ -60,6 +67,24 @@ def test_what_is_above_coloured_noise_is_its_excess() -> None:
     more = e + np.sqrt(2.0) * np.sin(2.0 * np.pi * TIME)
     assert excess_power(more, colour) == pytest.approx(1.0, abs=0.25)
     assert noise_rms(more, colour) <= colour.rms
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.85])
+def test_a_colour_survives_the_projection_of_slow_directions(correlation: float) -> None:
+    """A hundred slow waves taken out of 3,000 samples leave 0.54 of a correlation of 0.6."""
+    n, rng = 3000, np.random.default_rng(6)
+    waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, n), np.arange(100)))
+    basis = np.linalg.qr(waves)[0]
+    found, plain = [], []
+    for _ in range(10):
+        e = coloured(rng.standard_normal(n + 200), correlation)[200:]
+        left = e - basis @ (basis.T @ e)
+        plain.append(float(left[1:] @ left[:-1] / (left @ left)))
+        found.append(float(np.sum(colour_of(left, [n // 2] * 2, None, basis).autoregression[0])))
+    assert np.mean(found) == pytest.approx(correlation, abs=0.015)
+    assert np.mean(plain) < correlation - 0.03
+    halves = list(np.split(basis, 2))
+    assert left_correlation(correlation, halves) == pytest.approx(np.mean(plain), abs=0.015)
 
 
 @pytest.mark.parametrize(("correlation", "n"), [(0.0, 4000), (0.6, 5000), (0.75, 3000)])

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import brentq
 from scipy.signal import lfilter
 
 from psa_casadi.experiment.noise import first_order_noise
@@ -65,8 +66,13 @@ def colour_of(
     remainder: FloatArray,
     lengths: Sequence[int],
     known: Sequence[FloatArray | None] | None = None,
+    removed: FloatArray | None = None,
 ) -> Colour:
     """Return colour and level of what no model and no candidate explains.
+
+    `removed` (samples, k) is an orthonormal basis of what was projected out of it: slow directions
+    for the most part, which take a colour's slow part along. The correlation is the one that leaves
+    what is seen (`left_correlation`).
 
     `known` holds the autoregression of records whose noise is known without a model (repeats). The
     others share one of first order, estimated from the remainder: it can describe the noise of a
@@ -83,9 +89,58 @@ def colour_of(
             bottom += float(part @ part)
         first += length
     correlation = float(np.clip(top / bottom, 0.0, _LARGEST)) if bottom > 0 else 0.0
+    if removed is not None and correlation > 0.0:
+        ends = np.cumsum(lengths)[:-1]
+        parts = [q for q, own in zip(np.split(removed, ends), given, strict=True) if own is None]
+        correlation = _before(correlation, parts)
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
     each = tuple(shared if own is None else own for own in given)
     return _with_level(each, remainder, lengths)
+
+
+def left_correlation(correlation: float, removed: Sequence[FloatArray]) -> float:
+    """Return the correlation of neighbours that a first-order autoregression shows after all.
+
+    `removed` are the rows, record by record, of the basis Q that was projected out of it. With the
+    covariance S_ij = r^|i-j| within records and the mean D of the shifts to either side the
+    expected products are tr(D P S P) of neighbours and tr(P S P) of the samples, P = I - Q Q^T.
+    """
+    q = np.vstack(removed)
+    covered = np.vstack([_correlated(correlation, part) for part in removed])
+    shifted = np.vstack([_beside(part) for part in removed])
+    inner, spread = q.T @ q, q.T @ covered
+    pairs = sum(len(part) - 1 for part in removed)
+    top = correlation * pairs - 2.0 * np.sum(shifted * covered)
+    top += np.sum((q.T @ shifted) * spread.T)
+    bottom = len(q) - 2.0 * np.trace(spread) + np.sum(inner * spread.T)
+    return float(top / bottom)
+
+
+def _correlated(r: float, columns: FloatArray) -> FloatArray:
+    """Return S q for columns q: their sum over all samples, weighted with r^|i-j|."""
+    ahead = np.asarray(lfilter([1.0], [1.0, -r], columns, axis=0))
+    behind = np.asarray(lfilter([1.0], [1.0, -r], columns[::-1], axis=0))[::-1]
+    both: FloatArray = ahead + behind - columns
+    return both
+
+
+def _beside(columns: FloatArray) -> FloatArray:
+    """Return half the sum of the neighbours on either side."""
+    found = np.zeros_like(columns)
+    found[1:] += 0.5 * columns[:-1]
+    found[:-1] += 0.5 * columns[1:]
+    return found
+
+
+def _before(seen: float, removed: Sequence[FloatArray]) -> float:
+    """Return the correlation of which `seen` is left after the projection."""
+
+    def short(r: float) -> float:
+        return left_correlation(r, removed) - seen
+
+    if short(_LARGEST) <= 0.0:
+        return _LARGEST
+    return float(brentq(short, 0.0, _LARGEST, xtol=1e-3)) if short(0.0) < 0.0 else 0.0
 
 
 def noise_rms(residual: FloatArray, colour: Colour) -> float:

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.backward import reconsidered
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
@@ -28,7 +26,7 @@ from psa_casadi.diagnosis.verdict import PARTLY, conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import Experiment, split, whole
+from psa_casadi.experiment.split import Experiment, divided
 from psa_casadi.experiment.suspects import cleaned
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.refitting import Progress, refit
@@ -60,12 +58,12 @@ def diagnose(
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
     Held-out data are the records `holdout`, else a quarter of every record in blocks (see
-    `split`); they choose nothing but whether an extension may stay. `model` is where the base fit
+    `divided`); they choose nothing but whether an extension may stay. `model` is where the base fit
     starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search; `method` can
     leave parts of the method out (for its negative controls). Raises InputError.
     """
     table = list(effects if effects is not None else EFFECTS.values())
-    experiments = _experiments([cleaned(r) for r in records], [cleaned(r) for r in holdout])
+    experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
     start, scale_given = chosen_start(records, model, stiffness)
     start = start.without(c.name for c in table if c.gain is not None)
     there = {c.name for c in start.components}
@@ -88,17 +86,6 @@ def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:
     )
 
 
-def _experiments(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Experiment, ...]:
-    if not holdout:
-        return tuple(split(r) for r in records)
-    held = []
-    for record in holdout:
-        # the first tenth of a held-out record only serves to find its offset and memory
-        lead = np.arange(record.n) < max(8, record.n // 10)
-        held.append(Experiment(record, record.mask & lead, record.mask & ~lead))
-    return (*(whole(r) for r in records), *held)
-
-
 def _search(base: Fit, task: Task) -> list[Round]:
     """Forward selection: add the best effect until nothing is seen or nothing helps."""
     rounds = _forward(base, task)
@@ -107,7 +94,7 @@ def _search(base: Fit, task: Task) -> list[Round]:
         better = from_resonances(rounds[0].fit, task.experiments, task.progress)
         if better is not None:
             tried.append(rounds := _forward(better, task))
-    if rounds[-1].test.alarm:
+    if rounds[-1].test.alarm or len(rounds) > 1:
         before = rounds[-1].fit
         resonant = from_band(rounds[0].fit, before, task.experiments, task.progress)
         if resonant is not None:
@@ -160,6 +147,11 @@ def _forward(base: Fit, task: Task) -> list[Round]:
     if task.fast and first.test.alarm:
         resonant = from_resonances(first.fit, task.experiments, task.progress)
         first = first if resonant is None else _round(resonant, task)
+    if first.test.alarm:
+        resonant = from_band(first.fit, first.fit, task.experiments, task.progress)
+        near = None if resonant is None else _round(resonant, task)
+        if near is not None and not near.test.alarm and not _worth_searching([near]):
+            first = near
     return _causes([first], task, retry=True)
 
 

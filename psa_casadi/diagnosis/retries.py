@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.diagnosis.extension import Extension
+from psa_casadi.diagnosis.ringing import ringing
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
@@ -34,9 +35,9 @@ _IMAGES = (0, 1, 2, 3)
 _QUICK, _FIRST, _BEST = 8, 4, 2
 #: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
 _AGAIN = 1.5
-#: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band, the
-#: resonances over the rate that are tried there, and their damping ratio.
-_NEAR_BAND, _GRID, _DAMPING = (300.0, 10_000.0), (0.4, 0.7, 1.0, 1.4, 2.0, 2.8), 0.15
+#: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band; the
+#: decrease of the whitened sum of squares from which ringing is seen, and resonances at most.
+_NEAR_BAND, _SEEN, _RESONANCES = (300.0, 10_000.0), 40.0, 2
 
 
 def from_extension(
@@ -74,18 +75,18 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
 def from_band(
     base: Fit, before: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit the base with a resonance near or above the band; None where none explains much more.
+    """Fit the base with resonances near or above the band; None where none explains much more.
 
     `before` is the model with the causes found so far. Steps excite such a resonance, and what a
     slow record shows of its ringing looks like noise after each step.
     """
-    rate = 1.0 / min(e.record.sample_time for e in experiments)
-    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
-        return None
-    progress("base fit, with resonances near the sampling rate")
-    starts = list(_masses(before.model.values, [g * rate for g in _GRID], _DAMPING))
-    found = _with_masses(before, starts, experiments)
-    if found is None or found.rms > _MUCH * before.rms:
+    found = before
+    for _ in range(_RESONANCES):
+        more = _with_ringing(found, experiments, progress, _SEEN)
+        if more is None:
+            break
+        found = more
+    if found.rms > _MUCH * before.rms:
         return None
     resonant = _in_base(base, before, found, experiments)
     return None if resonant is None else _tuned(resonant, experiments, progress)
@@ -126,11 +127,8 @@ def instead_of(
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
     what looks like a further mode.
     """
-    rate = 1.0 / min(e.record.sample_time for e in experiments)
-    if _NEAR_BAND[0] < rate < _NEAR_BAND[1] and not rings(extension):
-        progress(f"base fit, with resonances instead of {extension.effect.name}")
-        starts = list(_masses(base.model.values, [g * rate for g in _GRID], _DAMPING))
-        found = _with_masses(base, starts, experiments)
+    if not rings(extension):
+        found = _with_ringing(base, experiments, progress)
         if found is not None and _short(found, extension.fit) < _LIKE:
             return _tuned(found, experiments, progress)
     if not shows_ringing(experiments):
@@ -147,8 +145,11 @@ def rings(extension: Extension) -> bool:
 
 
 def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
-    """Return the fit with its mechanics sought again; k_P is kept free where it is told."""
-    return without_blur(retuned(found, experiments, progress), experiments)
+    """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
+    left = ringing(found, experiments)
+    if left is None or left.decrease >= _SEEN:
+        found = retuned(found, experiments, progress)
+    return without_blur(found, experiments)
 
 
 def _short(found: Fit, other: Fit) -> float:
@@ -172,6 +173,26 @@ def _moved(
         return refit(replace(base, model=base.model.with_values(values)), experiments, names)
     except PsaError:
         return None
+
+
+def _with_ringing(
+    fit: Fit, experiments: Sequence[Experiment], progress: Progress, seen: float = 0.0
+) -> Fit | None:
+    """Fit with one more mass, from the resonances that the residual's ringing may be of.
+
+    None where it shows less than `seen`, a decrease of the whitened sum of squares, or where none
+    explains clearly more.
+    """
+    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
+        return None
+    tone = ringing(fit, experiments)
+    if tone is None or tone.decrease < seen:
+        return None
+    progress(f"base fit, with a resonance that is seen at {tone.tone:.3g} Hz")
+    free = fit.unknowns.names
+    starts = (m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z))
+    return _with_masses(fit, [m for m in starts if not set(m) <= set(free)], experiments)
 
 
 def _masses(

@@ -73,13 +73,15 @@ def screen(
     `known` is the colour of the records' noise where it is known without a model; `colour` replaces
     the whole estimate.
     """
-    basis = _basis(fit.jacobian)
+    basis = independent(fit.jacobian)
     none: FloatArray = np.zeros((len(fit.residuals), 0))
     columns = np.hstack([none, *(d.column[:, None] for d in trials)])
-    colour = colour or colour_of(_remainder(fit.residuals, basis, columns), lengths, known)
-    white_basis = _basis(colour.whiten(fit.jacobian))
-    residual = _project(colour.whiten(fit.residuals), white_basis)
-    white = _project(colour.whiten(columns), white_basis)
+    if colour is None:
+        every = independent(np.hstack([basis, without(columns, basis)]))
+        colour = colour_of(without(fit.residuals, every), lengths, known, every)
+    white_basis = independent(colour.whiten(fit.jacobian))
+    residual = without(colour.whiten(fit.residuals), white_basis)
+    white = without(colour.whiten(columns), white_basis)
     raw = np.linalg.norm(colour.whiten(columns), axis=0)
     norm = np.linalg.norm(white, axis=0)
     usable = norm > 1e-6 * raw
@@ -122,19 +124,19 @@ def copies(
     `added` (samples,) [m] is what another effect adds to the prediction. The fitted parameters are
     projected out of it and of the trial directions.
     """
-    basis = _basis(colour.whiten(fit.jacobian))
-    target = _project(colour.whiten(added), basis)
+    basis = independent(colour.whiten(fit.jacobian))
+    target = without(colour.whiten(added), basis)
     power = float(target @ target)
     found: dict[str, Copy] = {}
     for name in dict.fromkeys(d.effect.name for d in trials):
         own = [d for d in trials if d.effect.name == name]
         columns = np.column_stack([d.column for d in own])
-        free = _project(colour.whiten(columns), basis)
+        free = without(colour.whiten(columns), basis)
         norms = np.linalg.norm(free, axis=0)
         large = np.flatnonzero(norms > 1e-6 * np.linalg.norm(columns, axis=0))
         if power <= 0 or not large.size:
             continue
-        share = float(np.sum((_basis(free[:, large]).T @ target) ** 2)) / power
+        share = float(np.sum((independent(free[:, large]).T @ target) ** 2)) / power
         along = free[:, large].T @ target / norms[large]
         best = int(np.argmax(np.abs(along)))
         direction, norm = own[int(large[best])], float(norms[large[best]])
@@ -142,24 +144,24 @@ def copies(
     return power / colour.level**2, found
 
 
-def _basis(columns: FloatArray) -> FloatArray:
-    """Orthonormal basis of the columns' span, scaled columns first; tiny directions dropped."""
+def independent(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the columns' span; tiny directions are dropped.
+
+    The columns are scaled first.
+    """
     norm = np.linalg.norm(columns, axis=0)
-    scaled = columns[:, norm > 0] / norm[norm > 0]
+    scaled: FloatArray = columns[:, norm > 0] / norm[norm > 0]
+    if not scaled.shape[1]:
+        return scaled
     u, s, _ = np.linalg.svd(scaled, full_matrices=False)
     basis: FloatArray = u[:, s > 1e-7 * s[0]]
     return basis
 
 
-def _project(vectors: FloatArray, basis: FloatArray) -> FloatArray:
+def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return vectors (samples,) or columns less what an orthonormal basis spans of them."""
     projected: FloatArray = vectors - basis @ (basis.T @ vectors)
     return projected
-
-
-def _remainder(residual: FloatArray, basis: FloatArray, columns: FloatArray) -> FloatArray:
-    """What neither the fitted parameters nor any candidate can explain."""
-    every = _basis(np.hstack([basis, _project(columns, basis)]))
-    return _project(residual, every)
 
 
 def _threshold(unit: FloatArray) -> float:

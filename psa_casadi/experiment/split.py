@@ -1,5 +1,6 @@
 """Training and held-out samples of a record: a quarter is held out, whole segments together."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,20 @@ def split(record: Record, blocks: int = BLOCKS) -> Experiment:
     index = np.searchsorted(np.array(edges[1:-1]), np.arange(record.n), side="right")
     held = index % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
     return Experiment(record, record.mask & ~held, record.mask & held)
+
+
+def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Experiment, ...]:
+    """Return the experiments of records and held-out ones; without these every record is `split`.
+
+    The first tenth of a held-out record only serves to find its offset and memory.
+    """
+    if not holdout:
+        return tuple(split(r) for r in records)
+    held = []
+    for record in holdout:
+        lead = np.arange(record.n) < max(8, record.n // 10)
+        held.append(Experiment(record, record.mask & lead, record.mask & ~lead))
+    return (*(whole(r) for r in records), *held)
 
 
 def reversals(voltage: FloatArray, threshold: float | None = None) -> npt.NDArray[np.int64]:
