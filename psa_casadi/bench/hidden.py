@@ -10,7 +10,7 @@ import numpy as np
 
 from psa_casadi.bench.hidden_cases import Case, Found, plants, run_case, study
 from psa_casadi.bench.hidden_controls import control_table
-from psa_casadi.bench.hidden_figure import picture
+from psa_casadi.bench.hidden_figure import BINS, RELIABILITY, in_class, picture
 from psa_casadi.bench.hidden_gain import gain_table
 from psa_casadi.bench.outcome import Outcome, Progress, TitledTable
 from psa_casadi.diagnosis.task import Method
@@ -18,12 +18,9 @@ from psa_casadi.report.tables import Table
 
 #: Seeds for each effect, and the first of them.
 SEEDS, QUICK_SEEDS, FIRST = 5, 1, 112217
-#: A hidden effect counts from this share of the smallest rho that was asked for.
-REACHED = 0.9
 #: Below the resonances a bent sensor and a load that bends are the same curve: these stay a pair.
 ALIKE = ("load_stiffness", "sensor_nonlinearity")
 _PAIR = " and ".join(ALIKE)
-_BINS: tuple[float, ...] = (0.0, 0.5, 0.8, 0.95, 1.0)
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -61,9 +58,7 @@ def of_kind(found: Sequence[Found], kind: str, noise: str | None = None) -> list
     return [
         f
         for f in found
-        if f.case.kind == kind
-        and (noise is None or f.case.noise == noise)
-        and (f.case.effect is None or f.rho >= REACHED * f.case.rho[0])
+        if f.case.kind == kind and f.reached and (noise is None or f.case.noise == noise)
     ]
 
 
@@ -167,28 +162,26 @@ def _said(f: Found) -> str:
 
 
 def _reliability(found: Sequence[Found]) -> TitledTable:
-    """Compare the confidence of the first cause with how often it is right."""
-    inside = [f for f in found if f.named and f.case.kind in ("known", "weak")]
-    every = [f for f in found if f.named and f.case.kind in ("known", "weak", "left out")]
+    """Compare the probability of being the cause with how often an effect is."""
     rows = []
-    for low, high in itertools.pairwise(_BINS):
-        cells = [c for group in (inside, every) for c in _right(group, low, high)]
-        if cells[-1] != "0":
+    for low, high in itertools.pairwise(BINS):
+        groups = [in_class(found, kinds, low, high) for kinds in RELIABILITY]
+        if groups[-1]:
+            cells = [c for own in groups for c in _right(own)]
             rows.append((f"{100 * low:.0f} to {100 * high:.0f} %", *cells))
-    head = ("stated confidence", "mean", "right", "cases", "mean", "right", "cases")
+    head = ("stated probability", "mean", "right", "effects", "mean", "right", "effects")
     return TitledTable(
-        "Confidence against frequency",
+        "Probability against frequency",
         Table(head, tuple(rows)),
-        "First where the hidden effect is in the table, which the probability takes for granted,"
-        " then with the cases whose own entry was left out.",
+        "Every effect of every case with a name, as judged in the first step. First where the"
+        " hidden effect is in the table, which the probability takes for granted, then with the"
+        " cases whose own entry was left out.",
     )
 
 
-def _right(found: Sequence[Found], low: float, high: float) -> tuple[str, str, str]:
-    """Return mean confidence, share of right first causes and number of cases in one class."""
-    own = [f for f in found if low < f.confidence <= high]
+def _right(own: Sequence[tuple[float, bool]]) -> tuple[str, str, str]:
+    """Return mean probability, share of true ones and number of effects of one class."""
     if not own:
         return ("", "", "0")
-    mean = 100.0 * float(np.mean([f.confidence for f in own]))
-    right = 100.0 * float(np.mean([f.named[0] == f.case.effect for f in own]))
-    return (f"{mean:.0f} %", f"{right:.0f} %", f"{len(own)}")
+    stated, true = (100.0 * float(np.mean(column)) for column in zip(*own, strict=True))
+    return (f"{stated:.0f} %", f"{true:.0f} %", f"{len(own)}")

@@ -28,6 +28,8 @@ Kind = Literal["known", "weak", "clean", "left out", "foreign", "two", "poor", "
 
 #: Ranges of rho, from which a case's is drawn evenly in its logarithm.
 ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
+#: A hidden effect counts from this share of the smallest rho that was asked for.
+REACHED = 0.9
 #: Classes of voltages that show less than a rich one.
 POOR = ("sine", "triangle", "steps", "slow", "loops")
 #: Other designs of record; and those with resonances in their band or near it, all clean: there
@@ -73,6 +75,11 @@ class Found:
     evidence: Mapping[str, float]
     ratio: float
     seconds: float
+
+    @property
+    def reached(self) -> bool:
+        """Whether what is hidden is as visible as was asked for; true where nothing is hidden."""
+        return self.case.effect is None or self.rho >= REACHED * self.case.rho[0]
 
     @property
     def alone(self) -> str | None:

@@ -55,7 +55,11 @@ class Ringing:
 
 
 def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
-    """Return the tone that explains most of a residual; None where no record can show one."""
+    """Return the tone that explains most of a residual; None where no record can show one.
+
+    The residual is whitened by its own autoregression, so that a tone has to follow the force to
+    count: one that is there all the time is taken for colour.
+    """
     interval = min(e.record.sample_time for e in experiments)
     forces = [_force(fit, k, e) if _even(e, interval) else None for k, e in enumerate(experiments)]
     if all(f is None for f in forces):
@@ -81,11 +85,11 @@ def _even(experiment: Experiment, interval: float) -> bool:
 
 
 def _force(fit: Fit, number: int, experiment: Experiment) -> FloatArray:
-    """Return a record's simulated force, all samples, over its range."""
+    """Return a record's simulated force, linear and hysteresis, from its first sample on [N]."""
     run = simulate_record(fit.model, experiment.record, memory=fit.start(number))
     force = fit.model.values["k_L"] * run.states["u"] + run.states["f_H"]
-    span: FloatArray = (force - force[0]) / max(float(np.ptp(force)), 1e-300)
-    return span
+    change: FloatArray = force - force[0]
+    return change
 
 
 def _response(
