@@ -27,7 +27,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     """Draw and diagnose all cases on all cores; the seeds are the same in every run."""
     _, known, foreign = plants()
     found = diagnose_all(study(known, foreign, QUICK_SEEDS if quick else SEEDS, FIRST), progress)
-    tables = [_summary(found), _by_effect(found), _reliability(found)]
+    tables = result_tables(found)
     if not quick:
         counted = [f for kind in ("known", "foreign") for f in of_kind(found, kind)]
         tables.append(gain_table(known, FIRST, progress))
@@ -51,6 +51,11 @@ def diagnose_all(
                 f" {one.rho:.2f}: {one.verdict} {', '.join(one.within)} [{one.seconds:.0f} s]"
             )
     return found
+
+
+def result_tables(found: Sequence[Found]) -> list[TitledTable]:
+    """Return the figures asked for, what was said of each effect, and the reliability."""
+    return [_summary(found), _by_effect(found), _reliability(found)]
 
 
 def of_kind(found: Sequence[Found], kind: str, noise: str | None = None) -> list[Found]:
