@@ -178,9 +178,9 @@ def _reliability(found: Sequence[Found]) -> TitledTable:
     return TitledTable(
         "Probability against frequency",
         Table(head, tuple(rows)),
-        "Every effect of every case with a name, as judged in the first step. First where the"
-        " hidden effect is in the table, which the probability takes for granted, then with the"
-        " cases whose own entry was left out.",
+        "Effects to which more than 2 % were given in the first step, where a cause was named."
+        " First where the hidden effect is in the table, which the probability takes for granted,"
+        " then with the cases whose own entry was left out.",
     )
 
 

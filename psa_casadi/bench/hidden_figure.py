@@ -81,7 +81,10 @@ def _confusion(
 
 
 def _reliability(axes: Axes, found: Sequence[Found]) -> None:
-    """Draw the share of right names against the stated confidence, with 95 % intervals."""
+    """Draw how often effects are the cause against their probability.
+
+    The 95 % intervals take them for independent, which those of one case are not.
+    """
     axes.plot([0.0, 100.0], [0.0, 100.0], color="0.7", linewidth=0.8, label="right as stated")
     for side, kinds, (marker, colour, label) in zip((-1, 1), RELIABILITY, _DRAWN, strict=True):
         for low, high in itertools.pairwise(BINS):

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
 from scipy.signal import lfilter
 
 from psa_casadi.experiment.noise import first_order_noise
@@ -16,6 +15,9 @@ FloatArray = npt.NDArray[np.float64]
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
 _WHITE = 0.05
 _LARGEST = 0.95
+#: Correlations at which it is asked what a projection leaves, the least share of a difference that
+#: must be left, and the share of directions up to which it is asked at all.
+_TRIED, _TOLD, _MANY = (0.15, 0.3, 0.45, 0.6, 0.7, 0.8, 0.88, _LARGEST), 0.5, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,7 @@ def colour_of(
 
     `removed` (samples, k) is an orthonormal basis of what was projected out of it: slow directions
     for the most part, which take a colour's slow part along. The correlation is the one that leaves
-    what is seen (`left_correlation`).
+    what is seen (`left_correlation`), where that can be told.
 
     `known` holds the autoregression of records whose noise is known without a model (repeats). The
     others share one of first order, estimated from the remainder: it can describe the noise of a
@@ -88,11 +90,12 @@ def colour_of(
             top += float(part[1:] @ part[:-1])
             bottom += float(part @ part)
         first += length
-    correlation = float(np.clip(top / bottom, 0.0, _LARGEST)) if bottom > 0 else 0.0
-    if removed is not None and correlation > 0.0:
+    seen = top / bottom if bottom > 0 else 0.0
+    if removed is not None and bottom > 0:
         ends = np.cumsum(lengths)[:-1]
         parts = [q for q, own in zip(np.split(removed, ends), given, strict=True) if own is None]
-        correlation = _before(correlation, parts)
+        seen = _before(seen, parts)
+    correlation = float(np.clip(seen, 0.0, _LARGEST))
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
     each = tuple(shared if own is None else own for own in given)
     return _with_level(each, remainder, lengths)
@@ -133,14 +136,22 @@ def _beside(columns: FloatArray) -> FloatArray:
 
 
 def _before(seen: float, removed: Sequence[FloatArray]) -> float:
-    """Return the correlation of which `seen` is left after the projection."""
+    """Return the correlation of which `seen` is left after the projection.
 
-    def short(r: float) -> float:
-        return left_correlation(r, removed) - seen
-
-    if short(_LARGEST) <= 0.0:
-        return _LARGEST
-    return float(brentq(short, 0.0, _LARGEST, xtol=1e-3)) if short(0.0) < 0.0 else 0.0
+    Where what is left hardly grows with it any more (`_TOLD`), the correction stays as it was at
+    the last place where it did; there is none where the directions are `_MANY` of the samples.
+    """
+    samples, directions = sum(len(part) for part in removed), removed[0].shape[1]
+    if directions > _MANY * samples:
+        return seen
+    own, left = [0.0], [left_correlation(0.0, removed)]
+    for r in _TRIED:
+        more = left_correlation(r, removed)
+        if more - left[-1] < _TOLD * (r - own[-1]):
+            break
+        own.append(r)
+        left.append(more)
+    return float(np.interp(seen, left, own)) + min(0.0, seen - left[0]) + max(0.0, seen - left[-1])
 
 
 def noise_rms(residual: FloatArray, colour: Colour) -> float:
@@ -176,7 +187,8 @@ def uncertain(residual: FloatArray) -> float:
 def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
     """Return the colour of the residual itself, whatever it holds, one autoregression per record.
 
-    A missing effect counts as colour then: a negative control, not a way to know the noise.
+    A missing effect counts as colour then: a negative control, and what a tone must stand out of
+    (`ringing`), but not a way to know the noise.
     """
     ends = np.cumsum(lengths)
     parts = np.split(residual, ends[:-1])

@@ -39,8 +39,9 @@ MOST_CAUSES = 3
 #: A further cause must promise this share of what it has to remove, linearly estimated, unless
 #: this share of the residual's power is still above the noise.
 PROMISE, REMAINDER = 0.5, 0.35
-#: A better base replaces an effect if it leaves at most this much more of the residual.
-AS_GOOD = 1.005
+#: A better base replaces an effect if it leaves at most this much more of the residual; what leaves
+#: structure must leave less by this factor.
+AS_GOOD, STRUCTURE = 1.005, 1.015
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
@@ -98,7 +99,7 @@ def _search(base: Fit, task: Task) -> list[Round]:
         before = rounds[-1].fit
         resonant = from_band(rounds[0].fit, before, task.experiments, task.progress)
         if resonant is not None:
-            rounds = min(rounds, _forward(resonant, task), key=_left)
+            rounds = min(rounds, _forward(resonant, task), key=_missed)
     for earlier in tried:
         if _open(rounds):
             rounds = min(rounds, _any(earlier, task), key=_left)
@@ -108,6 +109,11 @@ def _search(base: Fit, task: Task) -> list[Round]:
 def _left(rounds: Sequence[Round]) -> float:
     """What the last of the rounds leaves, rms [m]."""
     return rounds[-1].fit.rms
+
+
+def _missed(rounds: Sequence[Round]) -> float:
+    """What the last of the rounds leaves, rms [m]; structure in it counts as a little more."""
+    return _left(rounds) * (STRUCTURE if rounds[-1].test.alarm else 1.0)
 
 
 def _any(rounds: list[Round], task: Task) -> list[Round]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.diagnosis.extension import Extension
-from psa_casadi.diagnosis.ringing import ringing
+from psa_casadi.diagnosis.ringing import images, ringing
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
@@ -30,8 +30,8 @@ _AS_GOOD, _LIKE = 10.0, 3.0
 _MUCH = 0.985
 #: n ln(ratio of rms) by which a fit with resonances must be better to count.
 _CLEAR = 15.0
-#: Multiples of the sampling rate about which the images of a tone are tried.
-_IMAGES = (0, 1, 2, 3)
+#: Multiple of the sampling rate about which the images of a mode's tone are tried at most.
+_IMAGES = 3
 _QUICK, _FIRST, _BEST = 8, 4, 2
 #: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
 _AGAIN = 1.5
@@ -110,8 +110,8 @@ def from_mode(
     found, values = mode.fit.model.values, before.model.values
     tone, damping = found[mode.effect.tone or ""], found["mode_damping"]
     rate = 1.0 / min(e.record.sample_time for e in experiments)
-    images = {abs(k * rate + sign * tone) for k in _IMAGES for sign in (1.0, -1.0)}
-    starts = [m for f in sorted(images) for m in _masses(values, [f], damping * tone / f)]
+    near = images(tone, rate, _IMAGES)
+    starts = [m for f in near for m in _masses(values, [f], damping * tone / f)]
     final = _with_masses(before, starts, experiments)
     if final is None or _short(final, mode.fit) >= _AS_GOOD:
         return None
@@ -178,10 +178,10 @@ def _moved(
 def _with_ringing(
     fit: Fit, experiments: Sequence[Experiment], progress: Progress, seen: float = 0.0
 ) -> Fit | None:
-    """Fit with one more mass, from the resonances that the residual's ringing may be of.
+    """Fit with a mass free, from the resonances that the residual's ringing may be of.
 
     None where it shows less than `seen`, a decrease of the whitened sum of squares, or where none
-    explains clearly more.
+    explains clearly more. A mass that is free already is tried elsewhere, too.
     """
     rate = 1.0 / min(e.record.sample_time for e in experiments)
     if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
@@ -189,10 +189,9 @@ def _with_ringing(
     tone = ringing(fit, experiments)
     if tone is None or tone.decrease < seen:
         return None
-    progress(f"base fit, with a resonance that is seen at {tone.tone:.3g} Hz")
-    free = fit.unknowns.names
-    starts = (m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z))
-    return _with_masses(fit, [m for m in starts if not set(m) <= set(free)], experiments)
+    progress(f"base fit, with a resonance that may be seen at {tone.tone:.3g} Hz")
+    starts = [m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z)]
+    return _with_masses(fit, starts, experiments)
 
 
 def _masses(

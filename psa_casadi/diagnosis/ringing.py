@@ -20,6 +20,7 @@ from scipy.signal import lfilter
 
 from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening import independent, without
+from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
 from psa_casadi.simulation.simulate import simulate_record
@@ -28,10 +29,11 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Tones and decay rates that are tried, over the sampling rate.
 _TONES, _DECAYS = np.arange(0.04, 0.501, 0.02), (0.03, 0.06, 0.12, 0.25)
-#: Records whose sampling interval or whose steps differ by this share do not contribute.
-_SAME = 0.01
-#: Multiples of the sampling rate about which a tone's resonance may lie.
-_IMAGES = (0, 1, 2)
+#: Records whose sampling interval differs by this share do not contribute, nor those that gaps make
+#: this many times as long as their samples.
+_SAME, _LONGER = 0.01, 4.0
+#: Multiple of the sampling rate about which a tone's resonance may lie at most.
+_IMAGES = 2
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,13 @@ class Ringing:
     @property
     def resonances(self) -> tuple[tuple[float, float], ...]:
         """Frequencies [Hz] with damping ratios that are seen at this tone when sampled."""
-        images = {abs(k * self.rate + sign * self.tone) for k in _IMAGES for sign in (1.0, -1.0)}
-        return tuple((f, min(1.0, self.decay / f)) for f in sorted(images))
+        return tuple((f, min(1.0, self.decay / f)) for f in images(self.tone, self.rate, _IMAGES))
+
+
+def images(tone: float, rate: float, most: int) -> list[float]:
+    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz]."""
+    found = {abs(k * rate + sign * tone) for k in range(most + 1) for sign in (1.0, -1.0)}
+    return sorted(found)
 
 
 def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
@@ -61,7 +68,7 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     count: one that is there all the time is taken for colour.
     """
     interval = min(e.record.sample_time for e in experiments)
-    forces = [_force(fit, k, e) if _even(e, interval) else None for k, e in enumerate(experiments)]
+    forces = [_force(fit, k, e, interval) for k, e in enumerate(experiments)]
     if all(f is None for f in forces):
         return None
     colour = residual_colour(fit.residuals, [int(e.used.sum()) for e in experiments])
@@ -70,7 +77,7 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     best: Ringing | None = None
     for tone in _TONES:
         for decay in _DECAYS:
-            columns = colour.whiten(_response(forces, experiments, tone, decay))
+            columns = colour.whiten(_response(forces, experiments, interval, tone, decay))
             own = independent(without(columns, basis))
             decrease = float(np.sum((own.T @ residual) ** 2)) / colour.level**2
             if best is None or decrease > best.decrease:
@@ -78,23 +85,37 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     return best
 
 
-def _even(experiment: Experiment, interval: float) -> bool:
-    """Whether a record is sampled evenly at this interval [s]."""
-    steps = np.diff(experiment.record.time)
-    return bool(np.all(np.abs(steps - interval) < _SAME * interval))
+def _force(fit: Fit, number: int, experiment: Experiment, interval: float) -> FloatArray | None:
+    """Return a record's simulated force [N] from its first sample on, at even distances [s].
 
-
-def _force(fit: Fit, number: int, experiment: Experiment) -> FloatArray:
-    """Return a record's simulated force, linear and hysteresis, from its first sample on [N]."""
-    run = simulate_record(fit.model, experiment.record, memory=fit.start(number))
+    Both the linear part and the hysteresis. None where the record is sampled at another rate, is
+    mostly gaps, or cannot be simulated.
+    """
+    record = experiment.record
+    count = _places(experiment, interval)[-1] + 1
+    if abs(record.sample_time / interval - 1.0) > _SAME or count > _LONGER * record.n:
+        return None
+    try:
+        run = simulate_record(fit.model, record, memory=fit.start(number))
+    except PsaError:
+        return None
     force = fit.model.values["k_L"] * run.states["u"] + run.states["f_H"]
-    change: FloatArray = force - force[0]
+    even = record.time[0] + interval * np.arange(count)
+    change: FloatArray = np.interp(even, record.time, force - force[0])
     return change
+
+
+def _places(experiment: Experiment, interval: float) -> npt.NDArray[np.int64]:
+    """Return which of the even samples each sample of a record is, or is next to."""
+    time = experiment.record.time
+    found: npt.NDArray[np.int64] = np.rint((time - time[0]) / interval).astype(np.int64)
+    return found
 
 
 def _response(
     forces: Sequence[FloatArray | None],
     experiments: Sequence[Experiment],
+    interval: float,
     tone: float,
     decay: float,
 ) -> FloatArray:
@@ -105,7 +126,8 @@ def _response(
     for force, e in zip(forces, experiments, strict=True):
         own = np.zeros((int(e.used.sum()), 2))
         if force is not None:
+            where = _places(e, interval)[e.used]
             for column, zeros in enumerate(([1.0, -1.0], [0.0, 1.0, -1.0])):
-                own[:, column] = np.asarray(lfilter(zeros, poles, force))[e.used]
+                own[:, column] = np.asarray(lfilter(zeros, poles, force))[where]
         parts.append(own)
     return np.vstack(parts)
