@@ -200,6 +200,9 @@ def _retried(rounds: Sequence[Round], tried: set[str], task: Task) -> Fit | None
         own = from_mode(base, current.fit, chosen, task.experiments, task.progress)
         if own is not None:
             return own
+    if len(rounds) == 2 and "band" not in tried:
+        tried.add("band")
+        return from_band(base, current.fit, task.experiments, task.progress)
     if len(rounds) > 1 or "extension" in tried:
         return None
     tried.add("extension")
