@@ -40,6 +40,18 @@ def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
     assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
 
 
+def test_the_order_of_the_records_tells_nothing(tmp_path: Path) -> None:
+    truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
+    play_again(truth, 4, tmp_path / "b.csv")
+    ends = {"a": 900, "b": 1200}
+    records = [read_record(tmp_path / f"{n}.csv").slice(0, end) for n, end in ends.items()]
+    effects = [EFFECTS["offset_drift"]]
+    one, other = (diagnose(r, effects=effects) for r in (records, records[::-1]))
+    assert [e.record.n for e in one.experiments] == [e.record.n for e in other.experiments]
+    assert one.extended_errors == other.extended_errors
+    assert one.causes == other.causes
+
+
 def _begun(record: Record, names: tuple[str, ...]) -> tuple[list[Round], Task]:
     """A first round, with the base fitted and these effects screened, and its task."""
     table = tuple(EFFECTS[n] for n in names)

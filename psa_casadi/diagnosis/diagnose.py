@@ -64,6 +64,7 @@ def diagnose(
     leave parts of the method out (for its negative controls). Raises InputError.
     """
     table = list(effects if effects is not None else EFFECTS.values())
+    records = sorted(records, key=lambda r: (r.sample_time, r.n))  # given in any order
     experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
     start, scale_given = chosen_start(records, model, stiffness)
     start = start.without(c.name for c in table if c.gain is not None)
