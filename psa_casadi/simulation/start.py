@@ -105,7 +105,8 @@ def _settle(
     time, u, p, deviation = where
     for _ in range(_NEWTON_STEPS):
         new: FloatArray = np.array(rest(time, x, u, p, deviation)).ravel()
-        change = np.max(np.abs(new - x) / (np.abs(new) + nominal))
+        with np.errstate(invalid="ignore"):  # overflow ends in nan, which is no equilibrium
+            change = np.max(np.abs(new - x) / (np.abs(new) + nominal))
         x = new
         if not change > 1e-13:
             break
