@@ -26,11 +26,10 @@ def picture(found: Sequence[Found], known: Sequence[str], foreign: Sequence[str]
 
     Cases whose plant could not make the effect as visible as was asked for do not count.
     """
-    counted = [f for f in found if f.reached]
     figure = Figure(figsize=(11.0, 15.0), layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=(3.2, 1.0))
-    _confusion(above, counted, known, foreign)
-    _reliability(below, counted)
+    _confusion(above, [f for f in found if f.reached], known, foreign)
+    _reliability(below, found)
     return figure
 
 
@@ -39,7 +38,8 @@ def in_class(
 ) -> list[tuple[float, bool]]:
     """Return the probabilities in (low, high] that an effect is the cause, and whether it is.
 
-    Every effect of every case of these kinds in which a cause is named counts.
+    Every effect of every case of these kinds in which a cause is named counts, where what is hidden
+    is as visible as was asked for.
     """
     return [
         (p, effect == f.case.effect)

@@ -23,7 +23,7 @@ from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
-from psa_casadi.simulation.simulate import simulate_record
+from psa_casadi.identification.force_start import force_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -88,18 +88,16 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
 def _force(fit: Fit, number: int, experiment: Experiment, interval: float) -> FloatArray | None:
     """Return a record's simulated force [N] from its first sample on, at even distances [s].
 
-    Both the linear part and the hysteresis. None where the record is sampled at another rate, is
-    mostly gaps, or cannot be simulated.
+    None where the record is sampled at another rate, is mostly gaps, or cannot be simulated.
     """
     record = experiment.record
     count = _places(experiment, interval)[-1] + 1
     if abs(record.sample_time / interval - 1.0) > _SAME or count > _LONGER * record.n:
         return None
     try:
-        run = simulate_record(fit.model, record, memory=fit.start(number))
+        force = force_of(fit, number, record)
     except PsaError:
         return None
-    force = fit.model.values["k_L"] * run.states["u"] + run.states["f_H"]
     even = record.time[0] + interval * np.arange(count)
     change: FloatArray = np.interp(even, record.time, force - force[0])
     return change

@@ -15,6 +15,7 @@ from math import log
 import numpy as np
 
 from psa_casadi.errors import PsaError
+from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.excerpts import Excerpt, fastest_part
 from psa_casadi.identification.fit import Fit
@@ -137,8 +138,7 @@ def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
         valid[: max(1, int((_AMID if first else _LEAD) * valid.size))] = False
         if valid.sum() < _FEWEST or not np.ptp(record.voltage[cut][valid]):
             continue
-        states = simulate_record(best.model, record, memory=best.start(k)).states
-        force = values["k_L"] * states["u"] + states["f_H"]
+        force = force_of(best, k, record)
         source = (force[cut] - force[cut][0]) * static_compliance(values)
         filled = np.interp(np.arange(y.size), np.flatnonzero(there), y[there])
         level = max(levels[k], _FLOOR * best.rms)
@@ -154,6 +154,16 @@ def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
             loop=source,
             static=best.rms,
         )
+
+
+def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
+    """Return a record's simulated force, linear part and hysteresis (samples,) [N].
+
+    `number` is the record's place in the fit. Raises PsaError where it cannot be simulated.
+    """
+    states = simulate_record(fit.model, record, memory=fit.start(number)).states
+    force: FloatArray = fit.model.values["k_L"] * states["u"] + states["f_H"]
+    return force
 
 
 def _linear_fits(best: Fit, parts: Sequence[Excerpt]) -> list[LinearFit]:
