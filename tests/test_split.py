@@ -78,9 +78,40 @@ def test_every_fourth_block_is_held_out_and_no_segment_is_cut(period: int) -> No
 
 
 def test_without_a_reversal_nearby_the_blocks_are_cut_where_they_end() -> None:
+    """A ramp is highest at its end, which is fitted: the block before it is held out."""
     e = split(record(np.linspace(0.0, 5.0, 1600)))
-    np.testing.assert_array_equal(borders(e.held_out), 100 * np.array([3, 4, 7, 8, 11, 12, 15]))
-    assert (e.stop, int(e.held_out.sum())) == (1500, 400)
+    edges = 100 * np.array([3, 4, 7, 8, 11, 12, 14, 15])
+    np.testing.assert_array_equal(borders(e.held_out), edges)
+    assert (e.stop, int(e.held_out.sum())) == (1600, 400)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_extremes_of_voltage_and_rate_are_fitted(seed: int) -> None:
+    """Levels and ramps of any size: one block of every four is held out, none with an extreme."""
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(0.0, 80.0, 41)
+    voltage = np.interp(np.arange(4000.0), np.cumsum(rng.uniform(60.0, 140.0, 41)), levels)
+    e = split(record(voltage))
+    rate = np.diff(voltage, prepend=voltage[:1])
+    for signal in (voltage, -voltage, rate, -rate):
+        beyond = np.max(signal[e.held_out]) - np.max(signal[e.used])
+        assert beyond < 2e-3 * np.ptp(signal)  # blocks end on reversals: neighbours share them
+    quarters = np.array_split(e.held_out, 4)
+    assert all(0.1 < np.mean(q) < 0.4 for q in quarters)
+    assert e.used[:200].all()
+
+
+def test_a_single_fast_step_is_fitted_and_the_displacement_has_no_say() -> None:
+    """Steps of 10 V in the middle of every block; one of 60 V in the last."""
+    blocks = np.where(np.arange(1600) % 100 < 50, 0.0, 10.0)
+    e = split(record(blocks))
+    blocks[1570:1590] = 60.0
+    with_step = split(record(blocks))
+    assert e.held_out[1570]
+    assert with_step.used[1550:].all()
+    np.testing.assert_array_equal(e.held_out[:1100], with_step.held_out[:1100])
+    noisy = Record("r", with_step.record.time, blocks, np.random.default_rng(1).normal(size=1600))
+    np.testing.assert_array_equal(split(noisy).held_out, with_step.held_out)
 
 
 def test_missing_samples_are_neither_fitted_nor_held_out() -> None:

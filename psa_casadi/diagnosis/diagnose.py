@@ -26,7 +26,7 @@ from psa_casadi.diagnosis.verdict import PARTLY, conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import Experiment, divided
+from psa_casadi.experiment.split import Experiment, divided, in_one_order
 from psa_casadi.experiment.suspects import cleaned
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.refitting import Progress, refit
@@ -64,7 +64,7 @@ def diagnose(
     leave parts of the method out (for its negative controls). Raises InputError.
     """
     table = list(effects if effects is not None else EFFECTS.values())
-    records = sorted(records, key=lambda r: (r.sample_time, r.n))  # given in any order
+    records, holdout = in_one_order(records), in_one_order(holdout)
     experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
     start, scale_given = chosen_start(records, model, stiffness)
     start = start.without(c.name for c in table if c.gain is not None)

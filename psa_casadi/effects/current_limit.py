@@ -7,6 +7,9 @@ from psa_casadi.variables import Parameter, Values
 
 #: Even exponent of the smooth clip; the larger, the sharper the corner.
 _SHARPNESS = 8
+#: Limits that are tried, as shares of the gain's scale: so close that one of them cuts only the
+#: fastest steps, and leaves the others alone.
+_TRIED = tuple(0.1 * 1.5**k for k in range(15))
 
 
 def _equations(s: Symbols) -> Equations:
@@ -30,7 +33,7 @@ CURRENT_LIMIT = Component(
     source="amplifier data sheets; C_p u' = sat(i, i_max)",
     belongs_to="drive",
     gain="inverse_current_limit",
-    finite_step=(0.1, 0.3, 1.0, 3.0, 10.0, 30.0),
+    finite_step=_TRIED,
     equation_text="C_p u' = i / (1 + |i/i_max|^8)^(1/8),  inverse_current_limit = 1/i_max",
     parameters=(
         Parameter(

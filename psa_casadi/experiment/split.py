@@ -1,7 +1,8 @@
 """Training and held-out samples of a record: a quarter is held out, whole segments together."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +12,10 @@ from psa_casadi.experiment.record import Record
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Number of blocks a record is cut into, and which of them are held out when no record is named.
+#: Number of blocks a record is cut into, and of how many one is held out when no record is named.
 BLOCKS, HELD_OUT_EVERY = 16, 4
+#: Blocks that come this close to the record's highest or lowest value, over its range, reach it.
+_REACHED = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +37,12 @@ def whole(record: Record) -> Experiment:
     return Experiment(record, record.mask, np.zeros(record.n, dtype=bool))
 
 
-def split(record: Record, blocks: int = BLOCKS) -> Experiment:
-    """Hold out every fourth of a record's blocks, the last one included: a quarter of the record.
+def split(record: Record) -> Experiment:
+    """Hold out one of every four of a record's sixteen blocks: a quarter of the record.
+
+    It is the last one of each four, unless the voltage or its rate would then be highest or lowest
+    in held-out samples alone: what only shows there (a limited current, a clipped voltage) has to
+    be learnt before it can be judged. The displacement has no say in it.
 
     Blocks begin at voltage reversals, so that a segment between two reversals is never cut unless
     it is longer than a block. Taking the held-out quarter from all over the record, rather than
@@ -44,14 +51,38 @@ def split(record: Record, blocks: int = BLOCKS) -> Experiment:
     """
     turns = reversals(record.voltage)
     edges = []
-    for k in range(blocks + 1):
-        point = round(k * record.n / blocks)
-        near = turns[np.abs(turns - point) <= 0.5 * record.n / blocks]
-        inner = 0 < k < blocks and len(near) > 0
+    for k in range(BLOCKS + 1):
+        point = round(k * record.n / BLOCKS)
+        near = turns[np.abs(turns - point) <= 0.5 * record.n / BLOCKS]
+        inner = 0 < k < BLOCKS and len(near) > 0
         edges.append(int(near[np.argmin(np.abs(near - point))]) if inner else point)
     index = np.searchsorted(np.array(edges[1:-1]), np.arange(record.n), side="right")
-    held = index % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
+    held = np.isin(index, _held_out(record.voltage, index))
     return Experiment(record, record.mask & ~held, record.mask & held)
+
+
+def _held_out(voltage: FloatArray, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
+    """Return the blocks to hold out, one of every four; `index` (n,) is the block of each sample.
+
+    Of all choices that leave every extreme to a block that is fitted, the one nearest to the last
+    of each four. The first block is always fitted: the record's start is found there.
+    """
+    rate = np.diff(voltage, prepend=voltage[:1])
+    extremes = [_reaching(s, index) for v in (voltage, rate) for s in (v, -v)]
+    groups = [range(g, g + HELD_OUT_EVERY)[::-1] for g in range(0, BLOCKS, HELD_OUT_EVERY)]
+    choices = (c for c in product(*groups) if 0 not in c)
+    fair = (c for c in choices if not any(found <= set(c) for found in extremes))
+    return min(fair, key=lambda c: (-sum(c), c), default=tuple(g[0] for g in groups))
+
+
+def _reaching(values: FloatArray, index: npt.NDArray[np.int64]) -> set[int]:
+    """Return the blocks in which the values (n,) come up to their maximum."""
+    return set(index[values >= np.max(values) - _REACHED * np.ptp(values)].tolist())
+
+
+def in_one_order(records: Iterable[Record]) -> list[Record]:
+    """Return the records by sampling interval, length and content, however they are given."""
+    return sorted(records, key=lambda r: (r.sample_time, r.n, r.sha256, r.name))
 
 
 def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Experiment, ...]:

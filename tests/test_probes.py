@@ -1,0 +1,36 @@
+"""The trial sizes at which effects are looked for stand close enough to find every size."""
+
+import numpy as np
+import pytest
+
+from psa_casadi.components import BASE
+from psa_casadi.diagnosis.probes import directions
+from psa_casadi.effects import EFFECTS
+from psa_casadi.experiment.record import Record
+from psa_casadi.experiment.split import whole
+from psa_casadi.identification.fit import fit
+from psa_casadi.model.compose import compose
+from psa_casadi.simulation.simulate import simulate
+
+
+@pytest.mark.parametrize("share", [0.97, 0.9, 0.8, 0.65, 0.5, 0.3, 0.1])
+@pytest.mark.parametrize("size", [0.4, 0.55, 0.75, 1.0])
+def test_a_current_limit_of_any_height_is_near_one_that_is_tried(share: float, size: float) -> None:
+    """Steps of many sizes, all slewed in 1 ms; the limit is a share of the tallest one's current.
+
+    Of limits three times apart, one would cut no step and the next most of them.
+    """
+    effect = EFFECTS["current_limit"]
+    model = compose(BASE)
+    time = np.linspace(0.0, 1.199, 1200)
+    levels = np.array([0.0, 0.3, 0.1, 0.5, 0.2, 0.25, 0.7, 0.02, 0.95, 0.4])
+    voltage = size * model.values["u_rated"] * np.repeat(np.tile(levels, 2), 60)
+    clean = simulate(model, time, voltage).displacement
+    experiments = (whole(Record("r", time, voltage, clean)),)
+    base = fit(model, experiments, ["k_L"], sigma=[1e-8])
+    current = model.values["C_p"] * float(np.max(np.abs(np.diff(voltage)))) / 1e-3
+    limited = model.with_effect(effect, {"inverse_current_limit": 1.0 / (share * current)})
+    added = simulate(limited, time, voltage).displacement - clean
+    tried = [d.column for d in directions(base, experiments, [effect])]
+    alike = [c @ added / np.sqrt((c @ c) * (added @ added)) for c in tried]
+    assert max(alike) > 0.95
