@@ -25,15 +25,17 @@ _STARTS = 2
 #: An effect whose screening score is below this share of the best one is not worth a full fit.
 _WORTH = 0.1
 #: Evidence below which nothing is named: 7 to 1, and where the omnibus test sees nothing as much as
-#: no base fit of a clean record that is a little off has given.
-LEAST, UNSEEN = 2.0, 12.0
+#: no base fit of a clean record that is a little off has given. Such a base has missed a resonance,
+#: which nothing slow resembles: of what changes from sample to sample (the variance of that over
+#: twice its own) by less than `_BRISK`, no clean record has shown more than `UNSEEN_SLOW`.
+LEAST, UNSEEN, UNSEEN_SLOW, _BRISK = 2.0, 12.0, 7.0, 0.15
 #: Evidence (in units of the log-likelihood) within which the better held-out prediction leads.
 MARGIN = 3.0
 #: Share of the excess power that an effect must remove to be added, and share of what the best one
 #: removes that will do for its rivals.
 WORTHWHILE, _NEARLY = 0.25, 0.8
 #: Gain in log-likelihood of the held-out samples that a first effect, if these samples can show
-#: that, and a further effect must bring.
+#: that, and a further effect, or one that only evidence below `UNSEEN` tells of, must bring.
 HELD_OUT, HELD_OUT_FURTHER = 1.0, 4.0
 #: Evidence from which on held-out samples that hardly show an effect do not speak against it.
 _CLEAR = 8.0
@@ -90,22 +92,26 @@ def choose(
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
-    Worth having: evidence above `LEAST`, or above `UNSEEN` without the omnibus test's `alarm`; the
-    effect in character; a share of the training residual's power above the noise removed, or nearly
-    what another one removes that does; and held-out data predicted better than by the model
-    `before`, whose predictions are given. A further cause, beside the `first`, must also remove a
-    share of what that one did. The order is that of the evidence; within the margin the better
-    prediction leads.
+    Worth having: evidence above `LEAST`, or without the omnibus test's `alarm` above `UNSEEN`, of
+    slow effects above `UNSEEN_SLOW`; the effect in character; a share of the training residual's
+    power above the noise removed, or nearly what another one removes that does; and held-out data
+    predicted better than by the model `before`, whose predictions are given. A further cause,
+    beside the `first`, must also remove a share of what that one did. The order is that of the
+    evidence; within the margin the better prediction leads.
     """
     least = WORTHWHILE * max(0.0, excess_power(before.residuals, colour))
     held = _HeldOut(experiments, predicted, colour)
+
+    def sure(e: Extension) -> bool:
+        return first is None and (alarm or e.evidence > UNSEEN)
+
     fit = [
         e
         for e in extensions
-        if e.evidence > (LEAST if alarm else UNSEEN)
+        if e.evidence > (LEAST if alarm else UNSEEN_SLOW if held.slow(e) else UNSEEN)
         and not out_of_character(e, experiments)
         and (first is None or e.removed > OF_FIRST * first.removed)
-        and held.gained(e) > (held.promised(e) if first is None else HELD_OUT_FURTHER)
+        and held.gained(e) > (held.promised(e) if sure(e) else HELD_OUT_FURTHER)
     ]
     most = max((e.removed for e in fit), default=0.0)
     good = [e for e in fit if most > least and e.removed > min(least, _NEARLY * most)]
@@ -135,11 +141,23 @@ class _HeldOut:
         """
         if e.evidence < _CLEAR:
             return HELD_OUT
-        pairs = zip(e.predicted, self.predicted, self.experiments, strict=True)
-        change = np.concatenate([(new - old)[x.held_out] for new, old, x in pairs])
+        change = np.concatenate(
+            [c[x.held_out] for c, x in zip(self._changes(e), self.experiments, strict=True)]
+        )
         share = float(np.mean(change**2)) / e.holdout_rms**2 if change.size else 0.0
         promise = 0.5 * self._samples() * share
         return min(HELD_OUT, promise - 2.0 * float(np.sqrt(2.0 * promise)))
+
+    def slow(self, e: Extension) -> bool:
+        """Whether what an extension changes is alike in neighbouring samples."""
+        changes = self._changes(e)
+        steps = np.concatenate([np.diff(c) for c in changes])
+        spread = float(np.var(np.concatenate(changes)))
+        return float(np.mean(steps**2)) < 2.0 * _BRISK * spread
+
+    def _changes(self, e: Extension) -> list[FloatArray]:
+        """Change of the prediction of every record [m]."""
+        return [new - old for new, old in zip(e.predicted, self.predicted, strict=True)]
 
     @cached_property
     def _before(self) -> float:
