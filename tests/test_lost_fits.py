@@ -161,3 +161,28 @@ def test_each_form_of_an_effect_gets_a_start_and_near_ones_stay_rivals(tmp_path:
 
     assert set(chosen(0.98)) == {name, "another"}
     assert chosen(0.5) == [name]
+
+
+def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
+    tmp_path: Path,
+) -> None:
+    """Seven standard deviations of the noise off, two of what a hum leaves of the base fit."""
+    truth = make_record("mains_hum", 3, tmp_path / "a.csv", excitation="triangle", visible=3.0)
+    given = read_record(tmp_path / "a.csv").slice(0, 1200)
+    counts = 0.7 * truth.sigma
+    y = counts * np.round(measured(given) / counts)
+    moves = np.abs(np.diff(truth.displacement[:1200], prepend=0.0))
+    stuck = []
+    for k in range(100, 1100, 50):
+        length = max(1, round(7.0 * truth.sigma / max(moves[k], 1e-12)))
+        if length < 8:
+            y[k : k + length] = y[k - 1]
+            stuck.append(k + length - 1)
+    assert len(stuck) > 10
+    record = Record("a", given.time, given.voltage, y)
+    found = diagnose([record], effects=[EFFECTS["mains_hum"]])
+    used = found.experiments[0].record.mask
+    assert [c.effect for c in found.causes] == ["mains_hum"]
+    assert np.mean(used[stuck]) < 0.4
+    assert np.mean(used) > 0.95
+    assert "repeat the last one far from the model" in found.notes[-1]

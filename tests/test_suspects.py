@@ -224,3 +224,23 @@ def test_a_reading_repeated_shortly_while_the_stack_moves_is_masked() -> None:
     assert found.counts["stuck"] == len(expected)
     slow = np.repeat(y[::4], 4)[: y.size]  # a sensor that is read every fourth sample only
     assert suspects(replace(given, displacement=slow)).counts["stuck"] == 0
+
+
+@pytest.mark.parametrize("noise", ["white", "loud"])
+@pytest.mark.parametrize("digit", [0.0, 1e-6])
+def test_readings_repeated_to_the_last_digit_are_masked_where_noise_makes_none(
+    noise: str, digit: float
+) -> None:
+    """However slowly the stack moves; what the file's digits repeat by chance is left alone."""
+    given = record("sine", noise)
+    y = np.array(given.displacement)
+    y = np.round(y / (digit * RANGE)) * (digit * RANGE) if digit else y
+    assert not suspects(replace(given, displacement=y)).mask.any()
+    places = np.random.default_rng(2).choice(y.size - 9, 60, replace=False) + 5
+    for k in np.sort(places):
+        y[k] = y[k - 1]
+    found = suspects(replace(given, displacement=y))
+    assert set(places.tolist()) <= set(np.flatnonzero(found.mask).tolist())
+    assert found.counts["stuck"] == int(found.mask.sum()) < 1.1 * places.size + 10
+    coarse = np.round(y / (1e-3 * RANGE)) * (1e-3 * RANGE)
+    assert suspects(replace(given, displacement=coarse)).counts["stuck"] == 0

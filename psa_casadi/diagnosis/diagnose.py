@@ -5,7 +5,6 @@ from dataclasses import replace
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.backward import reconsidered
-from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.extension import extend_any
 from psa_casadi.diagnosis.result import Diagnosis
@@ -19,10 +18,10 @@ from psa_casadi.diagnosis.retries import (
     rings,
 )
 from psa_casadi.diagnosis.rounds import AFRESH, Round, decide, examine, search_cause
-from psa_casadi.diagnosis.selection import OF_FIRST
+from psa_casadi.diagnosis.standing import is_open, left, missed, worth_searching
 from psa_casadi.diagnosis.stuck_readings import without_stuck_readings
 from psa_casadi.diagnosis.task import Method, Task
-from psa_casadi.diagnosis.verdict import PARTLY, conclude
+from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.record import Record
@@ -36,12 +35,8 @@ from psa_casadi.model.compose import Model
 
 #: Most causes that are named for one set of records.
 MOST_CAUSES = 3
-#: A further cause must promise this share of what it has to remove, linearly estimated, unless
-#: this share of the residual's power is still above the noise.
-PROMISE, REMAINDER = 0.5, 0.35
-#: A better base replaces an effect if it leaves at most this much more of the residual; what leaves
-#: structure must leave less by this factor.
-AS_GOOD, STRUCTURE = 1.005, 1.015
+#: A better base replaces an effect if it leaves at most this much more of the residual.
+AS_GOOD = 1.005
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
@@ -76,6 +71,11 @@ def diagnose(
         base = fit_base(start, experiments, progress=progress)
     task = Task(experiments, tuple(table), method or Method(), progress)
     rounds = _search(base, task)
+    experiments, more = without_stuck_readings(experiments, rounds[-1].fit)
+    if more:  # which the misfit of the base had hidden
+        stuck += more
+        base = fit_base(start, experiments, progress=progress)
+        rounds = _search(base, replace(task, experiments=experiments))
     progress("judging")
     found = conclude(rounds, experiments, table, scale_given)
     return replace(found, notes=(*found.notes, STUCK_NOTE.format(stuck))) if stuck else found
@@ -92,7 +92,7 @@ def _search(base: Fit, task: Task) -> list[Round]:
     """Forward selection: add the best effect until nothing is seen or nothing helps."""
     rounds = _forward(base, task)
     tried = [rounds]
-    if _open(rounds) and not task.fast:
+    if is_open(rounds) and not task.fast:
         better = from_resonances(rounds[0].fit, task.experiments, task.progress)
         if better is not None:
             tried.append(rounds := _forward(better, task))
@@ -100,21 +100,11 @@ def _search(base: Fit, task: Task) -> list[Round]:
         before = rounds[-1].fit
         resonant = from_band(rounds[0].fit, before, task.experiments, task.progress)
         if resonant is not None:
-            rounds = min(rounds, _forward(resonant, task), key=_missed)
+            rounds = min(rounds, _forward(resonant, task), key=missed)
     for earlier in tried:
-        if _open(rounds):
-            rounds = min(rounds, _any(earlier, task), key=_left)
+        if is_open(rounds):
+            rounds = min(rounds, _any(earlier, task), key=left)
     return _settle(reconsidered(rounds, task), task)
-
-
-def _left(rounds: Sequence[Round]) -> float:
-    """What the last of the rounds leaves, rms [m]."""
-    return rounds[-1].fit.rms
-
-
-def _missed(rounds: Sequence[Round]) -> float:
-    """What the last of the rounds leaves, rms [m]; structure in it counts as a little more."""
-    return _left(rounds) * (STRUCTURE if rounds[-1].test.alarm else 1.0)
 
 
 def _any(rounds: list[Round], task: Task) -> list[Round]:
@@ -137,15 +127,7 @@ def _any(rounds: list[Round], task: Task) -> list[Round]:
     if other is None:
         after = examine(first.chosen.fit, first.chosen.predicted, task, first.trials)
         other = _causes([first, after], task, retry=True)
-    return min(rounds, other, key=_left)
-
-
-def _open(rounds: Sequence[Round]) -> bool:
-    """Whether structure remains and the causes found explain less than a partly one must."""
-    first, last = rounds[0], rounds[-1]
-    floor = noise_rms(last.fit.residuals, last.screening.colour)
-    excess = excess_power(first.fit.residuals, last.screening.colour, floor)
-    return last.test.alarm and first.fit.rms**2 - last.fit.rms**2 < PARTLY * excess
+    return min(rounds, other, key=left)
 
 
 def _forward(base: Fit, task: Task) -> list[Round]:
@@ -157,7 +139,7 @@ def _forward(base: Fit, task: Task) -> list[Round]:
     if first.test.alarm:
         resonant = from_band(first.fit, first.fit, task.experiments, task.progress)
         near = None if resonant is None else _round(resonant, task)
-        if near is not None and not near.test.alarm and not _worth_searching([near]):
+        if near is not None and not near.test.alarm and not worth_searching([near]):
             first = near
     return _causes([first], task, retry=True)
 
@@ -165,7 +147,7 @@ def _forward(base: Fit, task: Task) -> list[Round]:
 def _causes(rounds: list[Round], task: Task, *, retry: bool) -> list[Round]:
     """Add the best effect until nothing is seen or helps; `retry` the base from where it led."""
     tried = set[str]()
-    while len(rounds) <= MOST_CAUSES and _worth_searching(rounds):
+    while len(rounds) <= MOST_CAUSES and worth_searching(rounds):
         current = rounds[-1]
         first = rounds[0].chosen if len(rounds) > 1 else None
         search_cause(current, len(rounds), task, first)
@@ -233,18 +215,3 @@ def _settle(rounds: list[Round], task: Task) -> list[Round]:
     if held_out_rms(task.experiments, predicted) < before:
         rounds[-1] = replace(last, fit=again, predicted=predicted)
     return rounds
-
-
-def _worth_searching(rounds: Sequence[Round]) -> bool:
-    """Whether a direction is above the threshold.
-
-    For a further cause the test must alarm too, and much of the residual's power be above the noise
-    or the direction promise a share of what the first one removed.
-    """
-    current, first = rounds[-1], rounds[0].chosen
-    best = max((s.decrease for s in current.screening.scores), default=0.0)
-    if best < current.screening.threshold or first is None:
-        return best >= current.screening.threshold
-    promised = best * current.screening.colour.level**2 / len(current.fit.residuals)
-    enough = current.test.excess > REMAINDER or promised > PROMISE * OF_FIRST * first.removed
-    return current.test.alarm and enough

@@ -20,6 +20,10 @@ EQUAL, MISSED = 8, 0.05
 LATE = 0.3
 #: Runs of equal readings that chance may make where the voltage is fast, and that are none then.
 CHANCE = 0.05
+#: Share of readings that noise may repeat by chance, how many times that a failing sensor repeats,
+#: and which share at most; what noise is at least and at most, over the record's range and
+#: standard deviation.
+BY_NOISE, OFTENER, RARELY, NOISY = 2e-3, 3.0, 0.05, (1e-5, 0.5)
 
 
 def equal_runs(
@@ -80,6 +84,26 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
             found[start + 1 : stop + 1] = True
     late = fast.any() and float(np.mean(same[fast])) > LATE
     return np.zeros_like(found) if late else found
+
+
+def repeated_in_noise(y: FloatArray, quantum: float | None) -> BoolArray:
+    """Return where a reading is the last one to the last digit, which noise hardly ever makes.
+
+    Two readings with noise of standard deviation s are alike to a digit d with a chance of
+    d / (2 sqrt(pi) s). Whether the stack moves or rests, and however late it is, a sensor that
+    repeats more than that does not measure; one that repeats often is read more slowly than it is
+    sampled, or rests.
+    """
+    found = np.zeros(y.size, dtype=np.bool_)
+    span, noise, same = float(np.ptp(y)), high_frequency_noise(y), _repeated(y)
+    if not NOISY[0] * span < noise < NOISY[1] * float(np.std(y)):
+        return found
+    apart = np.diff(np.unique(y))
+    digit = quantum or float(np.min(apart[apart > 1e-12 * span], initial=span))
+    chance = digit / (2.0 * np.sqrt(np.pi) * noise)
+    if chance < BY_NOISE and OFTENER * chance < np.mean(same) < RARELY:
+        found[1:] = same
+    return found
 
 
 def _repeated(y: FloatArray) -> BoolArray:

@@ -14,7 +14,15 @@ from scipy.ndimage import maximum_filter1d
 from psa_casadi.experiment.quantum import quantum_of
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.runs import runs_of
-from psa_casadi.experiment.stuck import AFTER, BEFORE, LIMIT, SPIKE, equal_runs, missed_a_move
+from psa_casadi.experiment.stuck import (
+    AFTER,
+    BEFORE,
+    LIMIT,
+    SPIKE,
+    equal_runs,
+    missed_a_move,
+    repeated_in_noise,
+)
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -60,7 +68,7 @@ class Suspects:
 _WHAT: dict[Kind, str] = {
     "outlier": "stand out as spikes of at most three samples that return at once",
     "drop-out": "belong to drop-outs, where the sensor jumps to one value and back",
-    "stuck": "repeat one value while the voltage moves, as a stuck sensor does",
+    "stuck": "repeat the last one to the last digit, as a stuck sensor does",
 }
 
 
@@ -81,6 +89,7 @@ def suspects(record: Record) -> Suspects:
     quantum = quantum_of(y)
     stuck, dropped = equal_runs(y, record.voltage[valid], quantum)
     stuck |= missed_a_move(y, record.voltage[valid], quantum) & ~dropped
+    stuck |= repeated_in_noise(y, quantum) & ~dropped
     rest = ~(stuck | dropped)
     outlying = np.zeros(valid.size, dtype=np.bool_)
     outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
