@@ -12,10 +12,11 @@ from psa_casadi.components import BASE
 from psa_casadi.diagnosis.colour import colour_of
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.generalisation import held_out_excess
+from psa_casadi.diagnosis.noise_floor import noise_floor
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.reading import read_record
 from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import split
+from psa_casadi.experiment.split import divided, split
 from psa_casadi.identification.fit import Fit, fit
 from psa_casadi.model.compose import compose
 from psa_casadi.simulation.simulate import simulate
@@ -43,7 +44,9 @@ def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> fl
     experiments = (split(Record("r", TIME, voltage, clean + error)),)
     used = error[experiments[0].used]
     seen = replace(found, residuals=used)
-    return held_out_excess(seen, experiments, (clean,), colour_of(used, [len(used)]))
+    colour = colour_of(used, [len(used)])
+    noise = noise_floor([experiments[0].record], [error])
+    return held_out_excess(seen, experiments, (clean,), colour, noise).factor
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
@@ -67,6 +70,33 @@ def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
     stray = noise.copy()
     stray[np.flatnonzero(held)[[40, 300]]] = 60.0 * LEVEL
     assert _excess(fitted, stray) == 1.0
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+@pytest.mark.parametrize("samples", [200, 1000, SAMPLES])
+def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
+    fitted: tuple[Fit, FloatArray, FloatArray], samples: int, correlation: float
+) -> None:
+    """Its offset is found in a tenth of it; its noise is three times that of the fitted one."""
+    found, voltage, clean = fitted
+    rng = np.random.default_rng(3)
+    told = []
+    for _ in range(25):
+        draws = LEVEL * rng.standard_normal((2, SAMPLES)) * np.array([[1.0], [3.0]])
+        errors = lfilter([1.0], [1.0, -correlation], draws, axis=1)
+        records = [Record(f"r{k}", TIME, voltage, clean + e) for k, e in enumerate(errors)]
+        experiments = divided(records[:1], [records[1].slice(0, samples)])
+        lead = experiments[1].used
+        offset = float(np.mean(errors[1][:samples][lead]))
+        used = [errors[0], errors[1][:samples][lead] - offset]
+        sigma = tuple(float(np.std(u)) for u in used)
+        seen = replace(found, residuals=np.concatenate(used), sigma=sigma)
+        predicted = (clean, clean[:samples] + offset)
+        left = [errors[0], errors[1][:samples] - offset]
+        noise = noise_floor([e.record for e in experiments], left)
+        colour = colour_of(seen.residuals, [len(u) for u in used])
+        told.append(held_out_excess(seen, experiments, predicted, colour, noise).factor)
+    assert told == [1.0] * 25
 
 
 def test_a_model_that_fails_on_the_held_out_record_is_not_adequate(tmp_path: Path) -> None:

@@ -101,6 +101,28 @@ def test_the_extremes_of_voltage_and_rate_are_fitted(seed: int) -> None:
     assert e.used[:200].all()
 
 
+def test_where_not_every_extreme_can_be_fitted_most_are() -> None:
+    """A peak, a dip, the fastest rise and the fastest fall in one block of the first four each."""
+    voltage = np.tile(np.r_[np.linspace(0.0, 10.0, 50), np.linspace(10.0, 0.0, 50)], 16)
+    voltage[120:160], voltage[220:260] = 30.0, np.linspace(0.0, -30.0, 40)
+    voltage[320:322] = -25.0
+    e = split(record(voltage))
+    rate = np.diff(voltage, prepend=0.0)
+    signals = (voltage, -voltage, rate, -rate)
+    assert sum(np.max(s[e.held_out]) > np.max(s[e.used]) for s in signals) <= 1
+    assert np.mean(e.held_out) == pytest.approx(0.25, abs=0.05)
+
+
+def test_what_has_no_reading_is_no_extreme() -> None:
+    blocks = np.where(np.arange(1600) % 100 < 50, 0.0, 10.0)
+    blocks[1270:1290], blocks[1570:1590] = 60.0, 50.0
+    given = record(blocks)
+    y = np.array(given.displacement)
+    y[1200:1300] = np.nan
+    e = split(Record("r", given.time, blocks, y))
+    assert e.used[1560:].all()
+
+
 def test_a_single_fast_step_is_fitted_and_the_displacement_has_no_say() -> None:
     """Steps of 10 V in the middle of every block; one of 60 V in the last."""
     blocks = np.where(np.arange(1600) % 100 < 50, 0.0, 10.0)

@@ -244,3 +244,21 @@ def test_readings_repeated_to_the_last_digit_are_masked_where_noise_makes_none(
     assert found.counts["stuck"] == int(found.mask.sum()) < 1.1 * places.size + 10
     coarse = np.round(y / (1e-3 * RANGE)) * (1e-3 * RANGE)
     assert suspects(replace(given, displacement=coarse)).counts["stuck"] == 0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_what_chance_and_digits_repeat_is_not_stuck(seed: int) -> None:
+    """Short records; files with five significant digits; motion without noise and a rest."""
+    rng = np.random.default_rng(seed)
+    short, y = record("sine", "white", seed), np.array(record("sine", "white", seed).displacement)
+    digits = np.round(y[:300] / 2e-3 / RANGE * 1e3) * 2e-3 * RANGE / 1e3
+    given = replace(short.slice(0, 300), displacement=digits)
+    assert suspects(given).counts["stuck"] == 0
+    significant = np.array([float(f"{v:.5g}") for v in y])
+    assert suspects(replace(short, displacement=significant)).counts["stuck"] == 0
+    frequencies = rng.uniform(50.0, 900.0, 8)
+    voltage = np.sum(np.sin(2 * np.pi * np.outer(T, frequencies)), axis=1)
+    voltage -= voltage[300]
+    voltage[:301] = 0.0
+    smooth = Record("smooth", T, 10.0 * voltage, 1e-7 * voltage)
+    assert not suspects(smooth).mask.any()

@@ -38,7 +38,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
             TitledTable(
                 "Micromanipulator of Y. N. Aye, percent of range",
                 Table(head, tuple(rows)),
-                "Every fourth of 16 blocks between reversals is held out and never fitted.",
+                "One of every four of 16 blocks between reversals is held out and never fitted.",
             ),
         )
     )

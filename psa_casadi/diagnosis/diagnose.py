@@ -37,6 +37,8 @@ from psa_casadi.model.compose import Model
 MOST_CAUSES = 3
 #: A better base replaces an effect if it leaves at most this much more of the residual.
 AS_GOOD = 1.005
+#: So many further stuck readings are worth a second search.
+MORE = 3
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
@@ -71,9 +73,9 @@ def diagnose(
         base = fit_base(start, experiments, progress=progress)
     task = Task(experiments, tuple(table), method or Method(), progress)
     rounds = _search(base, task)
-    experiments, more = without_stuck_readings(experiments, rounds[-1].fit)
-    if more:  # which the misfit of the base had hidden
-        stuck += more
+    fewer, more = without_stuck_readings(experiments, rounds[-1].fit)
+    if more >= MORE and len(rounds) > 1:  # which the misfit of the base had hidden
+        experiments, stuck = fewer, stuck + more
         base = fit_base(start, experiments, progress=progress)
         rounds = _search(base, replace(task, experiments=experiments))
     progress("judging")

@@ -11,6 +11,7 @@ from psa_casadi.diagnosis.colour import Colour, excess_power
 from psa_casadi.diagnosis.errors_of import held_out_rms
 from psa_casadi.diagnosis.extension import Extension
 from psa_casadi.diagnosis.screening import Score, Screening
+from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.experiment.drive import among_harmonics
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
@@ -93,14 +94,20 @@ def choose(
     """Return the extensions that are worth having, best first.
 
     Worth having: evidence above `LEAST`, or without the omnibus test's `alarm` above `UNSEEN`, of
-    slow effects above `UNSEEN_SLOW`; the effect in character; a share of the training residual's
-    power above the noise removed, or nearly what another one removes that does; and held-out data
-    predicted better than by the model `before`, whose predictions are given. A further cause,
-    beside the `first`, must also remove a share of what that one did. The order is that of the
-    evidence; within the margin the better prediction leads.
+    slow effects above `UNSEEN_SLOW` unless a faster one has about as much; the effect in character;
+    a share of the training residual's power above the noise removed, or nearly what another one
+    removes that does; and held-out data predicted better than by the model `before`, whose
+    predictions are given. A further cause, beside the `first`, must also remove a share of what
+    that one did. The order is that of the evidence; within the margin the better prediction leads.
     """
     least = WORTHWHILE * max(0.0, excess_power(before.residuals, colour))
     held = _HeldOut(experiments, predicted, colour)
+
+    brisk = max((e.evidence for e in extensions if not held.slow(e)), default=-np.inf)
+
+    def least_evidence(e: Extension) -> float:
+        slow = held.slow(e) and e.evidence > brisk + MARGIN
+        return LEAST if alarm else UNSEEN_SLOW if slow else UNSEEN
 
     def sure(e: Extension) -> bool:
         return first is None and (alarm or e.evidence > UNSEEN)
@@ -108,7 +115,7 @@ def choose(
     fit = [
         e
         for e in extensions
-        if e.evidence > (LEAST if alarm else UNSEEN_SLOW if held.slow(e) else UNSEEN)
+        if e.evidence > least_evidence(e)
         and not out_of_character(e, experiments)
         and (first is None or e.removed > OF_FIRST * first.removed)
         and held.gained(e) > (held.promised(e) if sure(e) else HELD_OUT_FURTHER)
@@ -149,11 +156,15 @@ class _HeldOut:
         return min(HELD_OUT, promise - 2.0 * float(np.sqrt(2.0 * promise)))
 
     def slow(self, e: Extension) -> bool:
-        """Whether what an extension changes is alike in neighbouring samples."""
-        changes = self._changes(e)
+        """Whether what an extension changes is alike in neighbouring samples.
+
+        Never of records so fast that a stack may ring within their band.
+        """
+        changes = [c - np.mean(c) for c in self._changes(e)]
         steps = np.concatenate([np.diff(c) for c in changes])
-        spread = float(np.var(np.concatenate(changes)))
-        return float(np.mean(steps**2)) < 2.0 * _BRISK * spread
+        spread = float(np.mean(np.concatenate(changes) ** 2))
+        alike = float(np.mean(steps**2)) < 2.0 * _BRISK * spread
+        return alike and not shows_ringing(self.experiments)
 
     def _changes(self, e: Extension) -> list[FloatArray]:
         """Change of the prediction of every record [m]."""

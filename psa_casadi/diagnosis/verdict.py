@@ -10,7 +10,7 @@ from psa_casadi.diagnosis.contenders import contenders, same_curve_note
 from psa_casadi.diagnosis.errors_of import errors_of, explained_share, gain_of, whole_residuals
 from psa_casadi.diagnosis.evidence import CREDIBLE, credible_set
 from psa_casadi.diagnosis.extension import Extension
-from psa_casadi.diagnosis.generalisation import held_out_excess
+from psa_casadi.diagnosis.generalisation import Excess, held_out_excess
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.result import (
@@ -35,8 +35,8 @@ FloatArray = npt.NDArray[np.float64]
 #: Share of the held-out excess error that a closest known cause must remove.
 PARTLY = 0.8
 _HELD_OUT = (
-    "The held-out samples' error is {:.2f} times that of the fitted ones, which do not show"
-    " everything that matters there: fit samples of that kind too."
+    "The held-out samples' error is {:.2f} times what the fitted ones let expect: something matters"
+    " there that these do not show."
 )
 
 
@@ -54,7 +54,8 @@ def conclude(
     noise = noise_floor([e.record for e in experiments], errors)
     floor = pooled_level(noise, errors, last.screening.colour)
     share = explained_share(experiments, first.predicted, last.predicted, floor)
-    missing = first.test.alarm or first.chosen is not None or _beyond(first, experiments) > 1.0
+    beyond = _beyond(first, experiments, noise)
+    missing = first.test.alarm or first.chosen is not None or bool(beyond)
     verdict: Verdict
     if not missing:
         verdict = "adequate"
@@ -91,7 +92,7 @@ def conclude(
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain_of(experiments, first.predicted, final.predicted),
         blind_to=_blind_spots(final, table),
-        remaining=_remaining(final, _beyond(final, experiments)),
+        remaining=_remaining(final, Excess() if named else beyond),
         next_experiment=_next_experiment(
             causes, verdict, same_curves(experiments, table, first.fit)
         ),
@@ -214,18 +215,18 @@ def _blind_spots(final: Round, table: Sequence[Component]) -> tuple[BlindSpot, .
     return tuple(spots)
 
 
-def _beyond(r: Round, experiments: Sequence[Experiment]) -> float:
-    return held_out_excess(r.fit, experiments, r.predicted, r.screening.colour)
+def _beyond(r: Round, experiments: Sequence[Experiment], noise: Sequence[NoiseFloor]) -> Excess:
+    return held_out_excess(r.fit, experiments, r.predicted, r.screening.colour, noise)
 
 
-def _remaining(r: Round, beyond: float) -> Remaining:
-    """Describe what is left; held-out errors are larger by the factor `beyond`."""
+def _remaining(r: Round, beyond: Excess) -> Remaining:
+    """Describe what is left; where nothing is named also in held-out samples."""
     seen = f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
     told = [seen] if r.test.alarm else []
-    if beyond > 1.0:
-        told.append(_HELD_OUT.format(beyond))
+    if beyond:
+        told.append(_HELD_OUT.format(beyond.factor))
     where = " ".join(told) or "What remains cannot be told from noise."
-    return Remaining(not told, r.test.p_value, where)
+    return Remaining(not told, min(r.test.p_value, beyond.p_value), where)
 
 
 _ADVICE = (

@@ -42,7 +42,7 @@ def split(record: Record) -> Experiment:
 
     It is the last one of each four, unless the voltage or its rate would then be highest or lowest
     in held-out samples alone: what only shows there (a limited current, a clipped voltage) has to
-    be learnt before it can be judged. The displacement has no say in it.
+    be learnt before it can be judged. What the displacement is has no say in it.
 
     Blocks begin at voltage reversals, so that a segment between two reversals is never cut unless
     it is longer than a block. Taking the held-out quarter from all over the record, rather than
@@ -57,27 +57,35 @@ def split(record: Record) -> Experiment:
         inner = 0 < k < BLOCKS and len(near) > 0
         edges.append(int(near[np.argmin(np.abs(near - point))]) if inner else point)
     index = np.searchsorted(np.array(edges[1:-1]), np.arange(record.n), side="right")
-    held = np.isin(index, _held_out(record.voltage, index))
+    held = np.isin(index, _held_out(record, index))
     return Experiment(record, record.mask & ~held, record.mask & held)
 
 
-def _held_out(voltage: FloatArray, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
+def _held_out(record: Record, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
     """Return the blocks to hold out, one of every four; `index` (n,) is the block of each sample.
 
-    Of all choices that leave every extreme to a block that is fitted, the one nearest to the last
-    of each four. The first block is always fitted: the record's start is found there.
+    Of all choices, the one that holds the fewest extremes of voltage and rate out, among the
+    samples that have a reading; of these the one nearest to the last of each four. The first block
+    is always fitted: the record's start is found there.
     """
-    rate = np.diff(voltage, prepend=voltage[:1])
-    extremes = [_reaching(s, index) for v in (voltage, rate) for s in (v, -v)]
-    groups = [range(g, g + HELD_OUT_EVERY)[::-1] for g in range(0, BLOCKS, HELD_OUT_EVERY)]
+    voltage = record.voltage
+    rate = np.r_[0.0, np.diff(voltage) / np.diff(record.time)]
+    extremes = [_reaching(s, record.mask, index) for v in (voltage, rate) for s in (v, -v)]
+    groups = [range(g, g + HELD_OUT_EVERY) for g in range(0, BLOCKS, HELD_OUT_EVERY)]
+
+    def missed(choice: tuple[int, ...]) -> int:
+        return sum(found <= set(choice) for found in extremes if found)
+
     choices = (c for c in product(*groups) if 0 not in c)
-    fair = (c for c in choices if not any(found <= set(c) for found in extremes))
-    return min(fair, key=lambda c: (-sum(c), c), default=tuple(g[0] for g in groups))
+    return min(choices, key=lambda c: (missed(c), -sum(c), c))
 
 
-def _reaching(values: FloatArray, index: npt.NDArray[np.int64]) -> set[int]:
-    """Return the blocks in which the values (n,) come up to their maximum."""
-    return set(index[values >= np.max(values) - _REACHED * np.ptp(values)].tolist())
+def _reaching(values: FloatArray, valid: BoolArray, index: npt.NDArray[np.int64]) -> set[int]:
+    """Return the blocks in which the valid values come up to the largest of them."""
+    if not valid.any():
+        return set()
+    top, span = float(np.max(values[valid])), float(np.ptp(values[valid]))
+    return set(index[valid & (values >= top - _REACHED * span)].tolist())
 
 
 def in_one_order(records: Iterable[Record]) -> list[Record]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import poisson
 
 from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.runs import runs_of
@@ -20,10 +21,14 @@ EQUAL, MISSED = 8, 0.05
 LATE = 0.3
 #: Runs of equal readings that chance may make where the voltage is fast, and that are none then.
 CHANCE = 0.05
-#: Share of readings that noise may repeat by chance, how many times that a failing sensor repeats,
-#: and which share at most; what noise is at least and at most, over the record's range and
-#: standard deviation.
-BY_NOISE, OFTENER, RARELY, NOISY = 2e-3, 3.0, 0.05, (1e-5, 0.5)
+#: Share of readings that noise may repeat by chance, that a failing sensor repeats at most, and the
+#: probability below which more of them are no chance.
+BY_NOISE, RARELY, NO_CHANCE = 2e-3, 0.05, 1e-4
+#: Least noise over the record's range, and least ratio of the fourth to the third differences: that
+#: of white noise is 1.87, that of a motion below a fifth of the sampling rate at most 1.2.
+NOISY, ROUGH = 1e-5, 1.3
+#: Parts of a record's values, by size, in each of which its digits are told.
+BANDS = 4
 
 
 def equal_runs(
@@ -86,24 +91,36 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
     return np.zeros_like(found) if late else found
 
 
-def repeated_in_noise(y: FloatArray, quantum: float | None) -> BoolArray:
+def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
     """Return where a reading is the last one to the last digit, which noise hardly ever makes.
 
     Two readings with noise of standard deviation s are alike to a digit d with a chance of
-    d / (2 sqrt(pi) s). Whether the stack moves or rests, and however late it is, a sensor that
-    repeats more than that does not measure; one that repeats often is read more slowly than it is
-    sampled, or rests.
+    d / (2 sqrt(pi) s). However slow or late the stack is, a sensor that repeats clearly more than
+    that while the voltage changes does not measure; one that repeats often is read more slowly than
+    it is sampled.
     """
     found = np.zeros(y.size, dtype=np.bool_)
     span, noise, same = float(np.ptp(y)), high_frequency_noise(y), _repeated(y)
-    if not NOISY[0] * span < noise < NOISY[1] * float(np.std(y)):
+    same &= np.diff(voltage) != 0.0
+    chance = max(quantum or 0.0, _digit(y)) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
+    if noise <= NOISY * span or not _rough(y) or not same.any():
         return found
-    apart = np.diff(np.unique(y))
-    digit = quantum or float(np.min(apart[apart > 1e-12 * span], initial=span))
-    chance = digit / (2.0 * np.sqrt(np.pi) * noise)
-    if chance < BY_NOISE and OFTENER * chance < np.mean(same) < RARELY:
+    unlikely = poisson.sf(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
+    if chance < BY_NOISE and unlikely and np.mean(same) < RARELY:
         found[1:] = same
     return found
+
+
+def _digit(y: FloatArray) -> float:
+    """Return the last digit of readings: the largest of what parts of them, by size, show."""
+    parts = np.array_split(np.unique(np.abs(y)), BANDS)
+    return max((float(np.min(np.diff(p))) for p in parts if p.size > 1), default=0.0)
+
+
+def _rough(y: FloatArray) -> bool:
+    """Whether the fast part of a signal is noise, not the bends of a smooth motion."""
+    third, fourth = (float(np.median(np.abs(np.diff(y, k)))) for k in (3, 4))
+    return fourth > ROUGH * third > 0.0
 
 
 def _repeated(y: FloatArray) -> BoolArray:

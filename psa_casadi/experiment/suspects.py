@@ -89,7 +89,7 @@ def suspects(record: Record) -> Suspects:
     quantum = quantum_of(y)
     stuck, dropped = equal_runs(y, record.voltage[valid], quantum)
     stuck |= missed_a_move(y, record.voltage[valid], quantum) & ~dropped
-    stuck |= repeated_in_noise(y, quantum) & ~dropped
+    stuck |= repeated_in_noise(y, record.voltage[valid], quantum) & ~dropped
     rest = ~(stuck | dropped)
     outlying = np.zeros(valid.size, dtype=np.bool_)
     outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
