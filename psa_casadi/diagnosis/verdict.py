@@ -54,7 +54,8 @@ def conclude(
     noise = noise_floor([e.record for e in experiments], errors)
     floor = pooled_level(noise, errors, last.screening.colour)
     share = explained_share(experiments, first.predicted, last.predicted, floor)
-    beyond = _beyond(first, experiments, noise)
+    colour = first.screening.colour
+    beyond = held_out_excess(first.fit, experiments, first.predicted, colour, noise)
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
     verdict: Verdict
     if not missing:
@@ -215,18 +216,15 @@ def _blind_spots(final: Round, table: Sequence[Component]) -> tuple[BlindSpot, .
     return tuple(spots)
 
 
-def _beyond(r: Round, experiments: Sequence[Experiment], noise: Sequence[NoiseFloor]) -> Excess:
-    return held_out_excess(r.fit, experiments, r.predicted, r.screening.colour, noise)
-
-
 def _remaining(r: Round, beyond: Excess) -> Remaining:
-    """Describe what is left; where nothing is named also in held-out samples."""
-    seen = f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
-    told = [seen] if r.test.alarm else []
-    if beyond:
-        told.append(_HELD_OUT.format(beyond.factor))
-    where = " ".join(told) or "What remains cannot be told from noise."
-    return Remaining(not told, min(r.test.p_value, beyond.p_value), where)
+    """Describe what is left; `beyond` the fit where that leaves nothing to be seen."""
+    where = "What remains cannot be told from noise."
+    if r.test.alarm:
+        where = f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
+    elif beyond:
+        where = _HELD_OUT.format(beyond.factor)
+    p_value = min(r.test.p_value, beyond.p_value)
+    return Remaining(not (r.test.alarm or beyond), p_value, where)
 
 
 _ADVICE = (
