@@ -5,6 +5,7 @@ import pytest
 from psa_casadi.bench.hidden import result_tables
 from psa_casadi.bench.hidden_cases import Case, Found, Kind
 from psa_casadi.bench.hidden_figure import RELIABILITY, in_class, picture
+from psa_casadi.bench.hidden_gain import Covered, intervals_table
 
 KNOWN, FOREIGN = ("slow_creep", "offset_drift"), ("dry_friction",)
 
@@ -74,3 +75,13 @@ def test_the_picture_shows_the_share_of_each_row_and_the_reliability() -> None:
     said = [text.get_text() for text in reliability.texts]
     assert "2 of 2" in said
     assert "2 of 3" in said
+
+
+def test_an_interval_of_the_gain_is_held_against_the_records_it_does_not_know() -> None:
+    found = [
+        Covered("slow_creep", 50.0, (40.0, 45.0), ((45.0, 55.0), (51.0, 60.0)), (50.0, 50.5)),
+        Covered("ageing", 30.0, (10.0, 60.0), ((25.0, 35.0), (20.0, 31.0)), (30.0, 30.0)),
+    ]
+    blocks, records = intervals_table(found).table.rows
+    assert blocks[1:] == ("50 % (1 of 2)", "27.5 %")
+    assert records[1:] == ("75 % (3 of 4)", "10.0 %")

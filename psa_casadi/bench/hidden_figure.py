@@ -103,7 +103,7 @@ def _reliability(axes: Axes, found: Sequence[Found]) -> None:
                 ha="left" if side > 0 else "right",
             )  # fmt: skip
         axes.plot([], [], marker=marker, color=colour, linestyle="", label=label)
-    axes.set_xlim(0.0, 107.0)
+    axes.set_xlim(-6.0, 112.0)
     axes.set_ylim(-8.0, 108.0)
     axes.set_xlabel("stated probability of an effect, mean of its class, %")
     axes.set_ylabel("it is the cause, % (95 % interval)")

@@ -17,6 +17,7 @@ from psa_casadi.bench.hidden_cases import ORDINARY, plants
 from psa_casadi.bench.outcome import Progress, TitledTable
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.errors_of import gain_of
+from psa_casadi.diagnosis.result import Gain
 from psa_casadi.experiment.reading import read_record
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.model.compose import Model
@@ -25,18 +26,24 @@ from psa_casadi.simulation.simulate import simulate_record
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Further records that are held out, and those whose mean error counts as the truth.
-HELD_OUT, TRUTH = 12, 36
+#: Further records of a device, and how many of them are held out together.
+PLAYS, HELD_OUT = 96, 12
 
 
 @dataclass(frozen=True)
 class Covered:
-    """The true reduction of the error [%], and the intervals from blocks and from experiments."""
+    """Reductions of the error [%] over further records, and the intervals that should hold them.
+
+    `blocks` is the interval from the diagnosed record's own blocks, for the reduction over all
+    further records; `experiments` are those from so many further records, `others` the reductions
+    over the rest of them.
+    """
 
     effect: str
-    true: float
+    reduction: float
     blocks: tuple[float, float]
-    experiments: tuple[float, float]
+    experiments: tuple[tuple[float, float], ...]
+    others: tuple[float, ...]
 
 
 def gain_table(known: Sequence[str], first: int, progress: Progress) -> TitledTable:
@@ -50,20 +57,32 @@ def gain_table(known: Sequence[str], first: int, progress: Progress) -> TitledTa
             one = job.result()
             if one is not None:
                 found.append(one)
-                progress(f"gain of {one.effect}: {one.true:.1f} %, {one.blocks}, {one.experiments}")
+                progress(f"gain of {one.effect}: {one.reduction:.1f} %, blocks {one.blocks}")
+    return intervals_table(found)
+
+
+def intervals_table(found: Sequence[Covered]) -> TitledTable:
+    """Return how many intervals hold the reduction over records that they do not know."""
     rows = []
-    for title, intervals in (
-        ("eight blocks of one record's held-out quarter", [f.blocks for f in found]),
-        (f"{HELD_OUT} held-out records", [f.experiments for f in found]),
+    for title, pairs in (
+        (
+            "eight blocks of one record's held-out quarter",
+            [(f.blocks, f.reduction) for f in found],
+        ),
+        (
+            f"{HELD_OUT} held-out records",
+            [p for f in found for p in zip(f.experiments, f.others, strict=True)],
+        ),
     ):
-        held = sum(low <= f.true <= high for f, (low, high) in zip(found, intervals, strict=True))
-        width = float(np.median([high - low for low, high in intervals])) if found else np.nan
-        rows.append((title, f"{held} of {len(found)}", f"{width:.1f} %"))
+        held = sum(low <= true <= high for (low, high), true in pairs)
+        share = 100.0 * held / len(pairs) if pairs else np.nan
+        width = float(np.median([high - low for (low, high), _ in pairs])) if pairs else np.nan
+        rows.append((title, f"{share:.0f} % ({held} of {len(pairs)})", f"{width:.1f} %"))
     return TitledTable(
         "Intervals of the gain (95 %)",
         Table(("interval from", "hold the truth", "median width"), tuple(rows)),
-        f"The truth is the reduction of the rms over {TRUTH} further records of the same device,"
-        " with other voltages and fresh noise.",
+        f"The truth is the reduction of the rms over the rest of {PLAYS} further records of the"
+        " same device, with other voltages and fresh noise.",
     )
 
 
@@ -78,12 +97,16 @@ def covered(effect: str, seed: int) -> Covered | None:
         if not found.causes:
             return None
         models = (found.base_fit.model, found.extended_fit.model)
-        plays = [
-            _play(play_again, truth, seed + k, path, models) for k in range(1, HELD_OUT + TRUTH + 1)
-        ]
-    held, rest = plays[:HELD_OUT], plays[HELD_OUT:]
-    true = gain_of(*_columns(rest)).holdout_rms_reduction_percent
-    return Covered(effect, true, found.gain.interval, gain_of(*_columns(held)).interval)
+        plays = [_play(play_again, truth, seed + k, path, models) for k in range(1, PLAYS + 1)]
+    groups = [range(k, k + HELD_OUT) for k in range(0, PLAYS, HELD_OUT)]
+    rests = [[p for k, p in enumerate(plays) if k not in group] for group in groups]
+    return Covered(
+        effect,
+        _gain(plays).holdout_rms_reduction_percent,
+        found.gain.interval,
+        tuple(_gain([plays[k] for k in group]).interval for group in groups),
+        tuple(_gain(rest).holdout_rms_reduction_percent for rest in rests),
+    )
 
 
 _Play = tuple[Experiment, FloatArray, FloatArray]
@@ -103,5 +126,6 @@ def _play(play_again: Any, truth: Any, seed: int, path: Path, models: tuple[Mode
     return experiment, predicted[0], predicted[1]
 
 
-def _columns(plays: Sequence[_Play]) -> tuple[list[Experiment], list[FloatArray], list[FloatArray]]:
-    return [p[0] for p in plays], [p[1] for p in plays], [p[2] for p in plays]
+def _gain(plays: Sequence[_Play]) -> Gain:
+    """Return the gain over some further records."""
+    return gain_of([p[0] for p in plays], [p[1] for p in plays], [p[2] for p in plays])
