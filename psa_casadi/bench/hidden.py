@@ -12,7 +12,7 @@ from psa_casadi.bench.hidden_cases import Case, Found, plants, run_case, study
 from psa_casadi.bench.hidden_controls import control_table
 from psa_casadi.bench.hidden_figure import BINS, RELIABILITY, in_class, picture
 from psa_casadi.bench.hidden_gain import gain_table
-from psa_casadi.bench.outcome import Outcome, Progress, TitledTable
+from psa_casadi.bench.outcome import Outcome, Progress, TitledTable, share
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.report.tables import Table
 
@@ -68,10 +68,7 @@ def of_kind(found: Sequence[Found], kind: str, noise: str | None = None) -> list
 
 
 def _share(found: Sequence[Found], holds: Callable[[Found], bool]) -> str:
-    if not found:
-        return "no case"
-    count = sum(holds(f) for f in found)
-    return f"{100.0 * count / len(found):.0f} % ({count} of {len(found)})"
+    return share(sum(holds(f) for f in found), len(found))
 
 
 def _wrong(f: Found) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.bench.hidden_cases import ORDINARY, plants
-from psa_casadi.bench.outcome import Progress, TitledTable
+from psa_casadi.bench.outcome import Progress, TitledTable, share
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.errors_of import gain_of
 from psa_casadi.diagnosis.result import Gain
@@ -75,14 +75,13 @@ def intervals_table(found: Sequence[Covered]) -> TitledTable:
         ),
     ):
         held = sum(low <= true <= high for (low, high), true in pairs)
-        share = 100.0 * held / len(pairs) if pairs else np.nan
         width = float(np.median([high - low for (low, high), _ in pairs])) if pairs else np.nan
-        rows.append((title, f"{share:.0f} % ({held} of {len(pairs)})", f"{width:.1f} %"))
+        rows.append((title, share(held, len(pairs)), f"{width:.1f} %"))
     return TitledTable(
         "Intervals of the gain (95 %)",
         Table(("interval from", "hold the truth", "median width"), tuple(rows)),
-        f"The truth is the reduction of the rms over the rest of {PLAYS} further records of the"
-        " same device, with other voltages and fresh noise.",
+        f"The truth is the reduction of the rms over those of {PLAYS} further records of the same"
+        " device, with other voltages and fresh noise, that the interval does not know.",
     )
 
 

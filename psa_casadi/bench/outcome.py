@@ -44,3 +44,8 @@ class Bench:
     name: str
     description: str
     run: Callable[[Progress, bool], Outcome]
+
+
+def share(count: int, of: int) -> str:
+    """Return a count of cases as percent, with both numbers."""
+    return f"{100.0 * count / of:.0f} % ({count} of {of})" if of else "no case"
