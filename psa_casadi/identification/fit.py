@@ -1,23 +1,34 @@
 """Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.levenberg_marquardt import Evaluate, minimise
-from psa_casadi.identification.prediction import measured, motions_of, predict
+from psa_casadi.identification.levenberg_marquardt import Evaluate, Minimum, minimise
+from psa_casadi.identification.prediction import (
+    Simulated,
+    measured,
+    motions_of,
+    predict,
+    simulated,
+)
 from psa_casadi.identification.unknowns import Unknowns, static_compliance, unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Relative tolerance of the stepper in fits: integration errors far below any sensor's noise.
+#: Relative tolerance of a step in fits.
 FIT_RTOL = 1e-6
+#: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
+#: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
+#: then the stepper is taken.
+_OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +39,8 @@ class Fit:
     measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
-    keyboard interrupt did that.
+    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how each
+    record was run and how accurately.
     """
 
     model: Model
@@ -41,6 +53,8 @@ class Fit:
     converged: bool
     interrupted: bool
     evaluations: int
+    way: Way
+    simulated: tuple[Simulated, ...]
 
     def of_record(self, experiments: Sequence[Experiment], record: int) -> slice:
         """Where the used samples of one record stand in `residuals` and `jacobian`."""
@@ -71,7 +85,7 @@ class Fit:
     def predicted(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict whole records [m], held-out samples included."""
         full = predict(
-            self.model, experiments, self.unknowns, self.theta, rtol=FIT_RTOL, everything=True
+            self.model, experiments, self.unknowns, self.theta, way=self.way, everything=True
         )
         return [p.displacement for p in full]
 
@@ -106,14 +120,9 @@ def fit(
     weights = np.concatenate(
         [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
     )
-    evaluate = objective(model, experiments, unknowns, weights, rtol)
-    minimum = minimise(
-        evaluate, theta, unknowns.bounds(), tolerance=tolerance, evaluations=evaluations
+    minimum, way, told = _minimum(
+        model, experiments, unknowns, weights, theta, (sigma, rtol, tolerance, evaluations)
     )
-    if minimum is None:
-        raise SimulationError(
-            "The model cannot be simulated at the start of the fit; start from other values."
-        )
     return Fit(
         model=model.with_values(unknowns.values(minimum.theta)),
         unknowns=unknowns,
@@ -125,7 +134,46 @@ def fit(
         converged=minimum.converged,
         interrupted=minimum.interrupted,
         evaluations=minimum.evaluations,
+        way=way,
+        simulated=tuple(told),
     )
+
+
+def _minimum(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    weights: FloatArray,
+    theta: FloatArray,
+    how: tuple[Sequence[float], float, float, int],
+) -> tuple[Minimum, Way, list[Simulated]]:
+    """Return the minimum, found by a simulation that is accurate there, and how that was done."""
+    sigma, rtol, tolerance, evaluations = how
+    allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
+    ways = [Way(rtol * 0.1**k) for k in range(_TENTHS)] + [Way(rtol, stepped=True)]
+    spent = 0
+    for way in ways:
+        evaluate = objective(model, experiments, unknowns, weights, way)
+        left = max(evaluations - spent, 2)
+        minimum = minimise(
+            evaluate, theta, unknowns.bounds(), tolerance=tolerance, evaluations=left
+        )
+        if minimum is None:
+            raise SimulationError(
+                "The model cannot be simulated at the start of the fit; start from other values."
+            )
+        spent += minimum.evaluations
+        theta = minimum.theta
+        told = simulated(model, experiments, unknowns, theta, way=way)
+        if minimum.interrupted or not any(t.error > a for t, a in zip(told, allowed, strict=True)):
+            break
+    return replace(minimum, evaluations=spent), way, told
+
+
+def _allowed(experiment: Experiment, sigma: float) -> float:
+    """Return the rms error [m] that a record's simulation may have."""
+    y = measured(experiment.record)[experiment.used]
+    return max(_OF_NOISE * sigma, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0)
 
 
 def objective(
@@ -133,7 +181,7 @@ def objective(
     experiments: Sequence[Experiment],
     unknowns: Unknowns,
     weights: FloatArray,
-    rtol: float,
+    way: Way,
 ) -> Evaluate:
     """Return the weighted residuals (predicted - measured, then priors) with their Jacobian."""
     target = np.concatenate([measured(e.record)[e.used] for e in experiments])
@@ -142,7 +190,7 @@ def objective(
 
     def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         try:
-            parts = predict(model, experiments, unknowns, theta, rtol=rtol)
+            parts = predict(model, experiments, unknowns, theta, way=way)
         except PsaError:
             return None
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])

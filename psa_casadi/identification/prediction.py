@@ -19,7 +19,7 @@ from psa_casadi.simulation.start import (
     settling_time,
     start_state,
 )
-from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.ways import STEPPER, Traced, Way, exact, trace
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,10 +30,14 @@ OUTPUT = "measured_displacement"
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted displacement (n,) [m] of one record and its derivative (n, size) by theta."""
+    """Predicted displacement (n,) [m] of one record and its derivative (n, size) by theta.
+
+    `way` tells how the record was integrated.
+    """
 
     displacement: FloatArray
     jacobian: FloatArray
+    way: str
 
 
 def measured(record: Record) -> FloatArray:
@@ -55,8 +59,25 @@ def predict_record(
     """Return displacement (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
 
     `start` holds deviations of the initial states from where the first inputs and their rates put
-    them, in the states' units. Time counts from the record's first sample.
+    them, in the states' units. Time counts from the record's first sample. `rtol` is the tolerance
+    of a step.
     """
+    found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol))
+    count = len(wanted)
+    return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
+
+
+def trace_record(
+    model: Model,
+    record: Record,
+    start: Mapping[str, float],
+    wanted: Sequence[str],
+    *,
+    stop: int,
+    way: Way,
+    halved: int = 0,
+) -> Traced:
+    """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
     names = model.state_names
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
     rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
@@ -75,14 +96,10 @@ def predict_record(
     columns = [model.parameter_names.index(n) for n in wanted]
     s0 = np.hstack([found.by_parameter[:, columns], by_start])
     unknowns: list[str | int] = [*wanted, *searched]
-    steps = run(
-        model, t, u, x0, rtol=rtol, steps_limit=_STEPS, unknowns=unknowns, s0=s0, output=OUTPUT
-    )
-    displacement = steps.y[:, model.output_names.index(OUTPUT)]
-    sensitivity = steps.sensitivity
-    if sensitivity is None:
-        sensitivity = np.zeros((stop, 0))
-    return displacement, sensitivity[:, : len(wanted)], sensitivity[:, len(wanted) :]
+    return trace(
+        model, t, u, x0, way=way, output=OUTPUT, unknowns=unknowns, s0=s0, halved=halved,
+        steps_limit=_STEPS,
+    )  # fmt: skip
 
 
 def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
@@ -122,7 +139,7 @@ def predict(
     unknowns: Unknowns,
     theta: FloatArray,
     *,
-    rtol: float,
+    way: Way,
     everything: bool = False,
 ) -> list[Prediction]:
     """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
@@ -135,18 +152,59 @@ def predict(
     def one(index: int) -> Prediction:
         experiment = experiments[index]
         stop = experiment.record.n if everything else experiment.stop
-        y, by_parameter, by_start = predict_record(
+        found = trace_record(
             current,
             experiment.record,
             unknowns.start(theta, index),
             unknowns.names,
             stop=stop,
-            rtol=rtol,
+            way=way,
         )
         start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
-        jacobian = by_start @ start_slopes
-        jacobian[:, : len(unknowns.names)] += by_parameter @ slopes
+        count = len(unknowns.names)
+        jacobian = found.sensitivity[:, count:] @ start_slopes
+        jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
         jacobian += offset_slopes
-        return Prediction(y + unknowns.offset(theta, index), jacobian)
+        return Prediction(found.output + unknowns.offset(theta, index), jacobian, found.way)
+
+    return side_by_side(one, range(len(experiments)))
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """How a record was run, and what a finer run differs by (rms of its used samples) [m].
+
+    The stepper controls its own error, which is not measured again: nan.
+    """
+
+    way: str
+    error: float
+
+
+def simulated(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    *,
+    way: Way,
+) -> list[Simulated]:
+    """Tell of every record how it is run, with its error: a tenth of the tolerance, half the step."""
+    current = model.with_values(unknowns.values(theta))
+
+    def one(index: int) -> Simulated:
+        experiment, start = experiments[index], unknowns.start(theta, index)
+        used = experiment.used[: experiment.stop]
+        if not exact(current, experiment.record.time, way, OUTPUT):
+            return Simulated(STEPPER, float("nan"))
+        plain, finer = (
+            trace_record(
+                current, experiment.record, start, (), stop=experiment.stop, way=w, halved=h
+            )
+            for w, h in ((way, 0), (way.finer, 1))
+        )
+        gap = (plain.output - finer.output)[used]
+        error = float(np.sqrt(np.mean(gap**2))) if gap.size else 0.0
+        return Simulated(plain.way, error if plain.way == finer.way else float("inf"))
 
     return side_by_side(one, range(len(experiments)))

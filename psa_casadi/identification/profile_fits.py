@@ -56,7 +56,7 @@ class HeldFits:
         weights = np.concatenate(
             [np.full(int(e.used.sum()), s) for e, s in zip(experiments, fit.sigma, strict=True)]
         )
-        self._evaluate = objective(fit.model, experiments, self.unknowns, weights, FIT_RTOL)
+        self._evaluate = objective(fit.model, experiments, self.unknowns, weights, fit.way)
         self._tolerance = float(np.clip(_CLOSE * limit / fit.cost, 1e-9, 1e-5))
         self._fitted = fit.theta
         edges = (float(edge[self.k]) for edge in (self.unknowns.low, self.unknowns.high))

@@ -120,7 +120,7 @@ def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
         prior=np.concatenate([fresh.prior[: count + 1], best.unknowns.prior[count:]]),
     )
     theta = np.concatenate([np.zeros(count + 1), best.theta[count:]])
-    parts = predict(best.model, experiments, unknowns, theta, rtol=FIT_RTOL)
+    parts = predict(best.model, experiments, unknowns, theta, way=best.way)
     jacobian = np.vstack(
         [p.jacobian[e.used[: e.stop]] for p, e in zip(parts, experiments, strict=True)]
     )

@@ -11,7 +11,10 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
+
+import numpy.lib.introspect
 
 from psa_casadi.errors import PsaError
 
@@ -56,6 +59,18 @@ def compiler_command() -> list[str]:
 def zig_command() -> list[str]:
     """Return the command of the C compiler in the `ziglang` wheel."""
     return [sys.executable, "-m", "ziglang", "cc"]
+
+
+@cache
+def vector_flags() -> tuple[str, ...]:
+    """Return the flags for this processor's vectors; the results have the same bits without them.
+
+    numpy knows which of its own kernels run here.
+    """
+    found = numpy.lib.introspect.opt_func_info(func_name="^multiply$", signature="float64")
+    kernels = " ".join(str(k.get("current")) for f in found.values() for k in f.values())
+    wide = any(name in kernels for name in ("AVX2", "X86_V3", "AVX512", "X86_V4"))
+    return ("-mavx2",) if wide else ()
 
 
 def run_compiler(command: Sequence[str], directory: Path) -> None:

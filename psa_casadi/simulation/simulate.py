@@ -10,20 +10,25 @@ from psa_casadi.errors import Problems
 from psa_casadi.experiment.record import Record
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import initial_slope, start_state
-from psa_casadi.simulation.stepper import Steps, run
+from psa_casadi.simulation.stepper import Steps
+from psa_casadi.simulation.ways import accurate
 
 FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A simulated experiment in SI units; arrays of shape (n,), one per state and output."""
+    """A simulated experiment in SI units; arrays of shape (n,), one per state and output.
+
+    `way` tells how it was integrated, by exact steps of the linear part or by the stepper.
+    """
 
     time: FloatArray
     voltage: FloatArray
     states: Mapping[str, FloatArray]
     outputs: Mapping[str, FloatArray]
     steps: int
+    way: str
 
     @property
     def displacement(self) -> FloatArray:
@@ -51,8 +56,7 @@ def simulate(
     (`hold="zero"`). The model
     starts in the state that the first voltage and its rate imply, with `memory` deviations
     (see `start_state`), or with every state at 0 if `from_rest_at_zero`. Sampled states start at
-    their declared values. `rtol` is the relative
-    tolerance of the error-controlled stepper.
+    their declared values. The displacement errs by at most `rtol` of its range.
 
     Raises SimulationError, and InputError for samples that do not fit the times or the model.
     """
@@ -67,7 +71,7 @@ def simulate(
     if not from_rest_at_zero:
         rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
         x0 = start_state(model, list(u[0]), rates, memory, float(t[0])).x
-    return _trajectory(model, t, v, run(model, t, u, x0, rtol=rtol, hold=hold))
+    return _trajectory(model, t, v, *accurate(model, t, u, x0, rtol=rtol, hold=hold))
 
 
 def input_samples(model: Model, n: int, given: Mapping[str, FloatArray]) -> FloatArray:
@@ -112,7 +116,9 @@ def simulate_record(
     return simulate(model, record.time, record.voltage, memory=memory, rtol=rtol, **extra)
 
 
-def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps) -> Trajectory:
+def _trajectory(
+    model: Model, t: FloatArray, v: FloatArray, steps: Steps, way: str
+) -> Trajectory:
     return Trajectory(
         time=t,
         voltage=v,
@@ -122,4 +128,5 @@ def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps) -> Tra
         },
         outputs=dict(zip(model.output_names, steps.y.T, strict=True)),
         steps=steps.steps,
+        way=way,
     )

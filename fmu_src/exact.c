@@ -1,0 +1,1062 @@
+/* Exact steps of a linear part with what is nonlinear beside it, and their exact derivatives.
+
+   Between two samples the input is linear in time. A step of h / 2^level takes the linear part exactly
+   (exact_levels.h). States along a path (hysteresis) take one Runge-Kutta step of fourth order over their
+   driver's way, whatever its course in time; between the ends they follow Hermite's cubic. A port's values at
+   start, half and end make a parabola in time, beside a part that moves with its driver, whose response is
+   exact. Ports that feed back to what they depend on are solved for at the half and the end.
+
+   A step is refused and halved where the driver turns or comes to rest inside it, where the Runge-Kutta step
+   errs, or where a port at a quarter of the step is off its parabola. */
+#include "exact.h"
+
+#include "exact_model.h"
+#include "exact_levels.h"
+
+#define SLOWS 0.1        /* a driver whose rate falls to less than this share of it may come to rest */
+#define GROWS 0.03       /* of the tolerance: the next step may be twice as long */
+#define BRIEF 2e-3       /* of its nominal size: a driver's way along which the midpoint rule does */
+#define NEWTON_LIMIT 12
+#define STILL 1e-9       /* of its nominal size: a driver's way along which nothing can be told */
+
+/* Columns of sensitivities, four at a time; with lanes there are none */
+#if PSA_LANES == 1
+typedef double column __attribute__((vector_size(32), aligned(8)));
+#define COLUMNS 4
+#else
+typedef real column;
+#define COLUMNS 1
+#endif
+
+enum { WHOLE, HALF, QUARTER, NODES };
+
+/* One leg of a group's way, on which its driver does not turn, with what the derivatives need */
+typedef struct {
+    real begin, dt;                       /* share of the step at which it begins; its duration */
+    real from[EX_NX], to[EX_NX];          /* path variables at both ends, states at both ends */
+    real at[4][EX_NX];                    /* path variables and states of the four evaluations */
+    real out[4][EX_GROUP_OUT];            /* slopes and their partial derivatives */
+    real last[EX_NX];                     /* slopes at the end */
+    real rate, way;                       /* mean rate of the driver, its way */
+    int stages;                           /* 4, or 2 where the way is short */
+} psa_leg;
+
+/* A group's way: one leg, or two where the driver turns at the share `turn` of the step */
+typedef struct {
+    psa_leg leg[2];
+    int legs;
+    real w[NODES + 1], turn;              /* the driver's rate at whole, half, quarter, start */
+    real share[NODES];                    /* of the leg's way at the nodes */
+    int on[NODES];                        /* the leg of each node; with lanes only the first counts */
+    int bracket;                          /* half of the step in which the driver turns */
+    real basis[4];                        /* Hermite's, at the turn */
+    real rate_slopes[NODES + 1][EX_RATE_OUT];
+} psa_stages;
+
+/* Everything of one step under trial */
+typedef struct {
+    const psa_level *level;
+    real dt, t[NODES];
+    real v0[EX_NU + 1], v[NODES][EX_NU + 1], dv[EX_NU + 1];
+    real l[ROWS], x[NODES][EX_NX];
+    real port[NODES][EX_NPORT + 1];       /* values */
+    real slopes[NODES][EX_NPORT + 1][EX_PORT_OUT]; /* values and partial derivatives */
+    real chord[EX_NCH + 1], beyond[EX_NCH + 1][NL]; /* sigma, and the response to u(t) beyond the parabola */
+    psa_stages stages[EX_NG + 1];
+    real error;                           /* over the tolerance */
+} psa_trial;
+
+/* A partial derivative that counts: by a state (kind 0), the rate (1), or straight into a column (2); the
+   list ends with kind -1 */
+typedef struct {
+    short kind, index, entry;
+} psa_active;
+
+typedef struct {
+    psa_exact *run;
+    real t, x[EX_NX], port[EX_NPORT + 1], start_slopes[EX_NPORT + 1][EX_PORT_OUT];
+    real p[EX_NP + 1], k[EX_NK + 1];
+    real nominal[EX_NX], inverse_nominal[NL], tolerance;
+    psa_ladder *ladders;                  /* [lengths][lanes] */
+    psa_level *levels;                    /* [lengths][finest + 1][1 + thetas] */
+    char *ready;                          /* [lengths][finest + 1] */
+    double scale[NL];
+    int thetas;                           /* unknown parameters of the linear part */
+    int theta_column[EX_NTHETA + 1];
+    int column_of[EX_NP + 1];             /* -1: not asked for */
+    int blocks;                           /* of columns */
+    column *s, *sport;                    /* [EX_NX][blocks], [EX_NPORT][blocks] */
+    column *node, *snode_port, *scratch;  /* work of one step */
+    psa_active group_list[EX_NX + 1][EX_GROUP_OUT + 1], port_list[EX_NPORT + 1][EX_PORT_OUT + 1],
+        rate_list[EX_NG + 1][EX_RATE_OUT + 1], shown_list[EX_SHOWN_OUT + 1];
+    psa_trial trial;
+} psa_state;
+
+static void set_error(psa_trial *trial, real error) {
+    /* a number that is not finite counts as an infinite error */
+    const bits fine = MASK(error <= 1e300);
+    trial->error = v_fmax(trial->error, choose(fine, error, REAL(1e300)));
+}
+
+/* ---- values ------------------------------------------------------------------------------------------ */
+
+/* sum += the response of L to its start, the input and a constant; the whole of it */
+static inline void respond(const psa_node *node, const real *l, const real *v0, const real *dv, real *sum) {
+    for (int i = 0; i < ROWS; ++i) sum[i] += node->c[i];
+    for (int j = 0; j < NL; ++j)
+        for (int i = 0; i < ROWS; ++i) sum[i] += node->f[j][i] * l[j];
+    for (int j = 0; j < EX_NU; ++j)
+        for (int i = 0; i < ROWS; ++i) sum[i] += node->a1[j][i] * v0[j] + node->a2[j][i] * dv[j];
+}
+
+/* L at a node without ports, from the start of the step */
+static inline void linear_node(const psa_state *state, psa_trial *trial, int n) {
+    const psa_node *const node = trial->level->node + n;
+    if (n == WHOLE) {
+        real sum[ROWS];
+        for (int i = 0; i < ROWS; ++i) sum[i] = trial->l[i];
+        respond(node, trial->l, trial->v0, trial->dv, sum);
+        for (int i = 0; i < NL; ++i) trial->x[n][ex_linear[i]] = sum[i];
+        return;
+    }
+    for (int r = 0; r < EX_NEED; ++r) {
+        const int i = ex_need[r];
+        real sum = node->c[i];
+        for (int j = 0; j < ex_reads[i]; ++j) sum += node->f[j][i] * trial->l[j];
+        for (int j = 0; j < EX_NU; ++j) sum += node->a1[j][i] * trial->v0[j] + node->a2[j][i] * trial->dv[j];
+        trial->x[n][ex_linear[i]] = trial->l[i] + sum;
+    }
+}
+
+/* Add a port's response to L at a node */
+static inline void add_port(const psa_state *state, psa_trial *trial, int n, int j) {
+    const psa_node *const node = trial->level->node + n;
+    const real n0 = state->port[j], n1 = trial->port[HALF][j], n2 = trial->port[WHOLE][j];
+    if (n == WHOLE)
+        for (int i = ex_port_reaches[j]; i < NL; ++i)
+            trial->x[n][ex_linear[i]] += node->w[j][0][i] * n0 + node->w[j][1][i] * n1 + node->w[j][2][i] * n2;
+    else
+        for (int r = 0; r < EX_NEED; ++r) {
+            const int i = ex_need[r];
+            if (i >= ex_port_reaches[j])
+                trial->x[n][ex_linear[i]] +=
+                    node->w[j][0][i] * n0 + node->w[j][1][i] * n1 + node->w[j][2][i] * n2;
+        }
+}
+
+static void evaluate_port(psa_state *state, psa_trial *trial, int n, int j, int slopes) {
+    if (slopes)
+        ex_port_slopes(j, trial->t[n], trial->x[n], trial->v[n], REAL(0.0), state->k,
+                       trial->slopes[n][j]);
+    else ex_port(j, trial->t[n], trial->x[n], trial->v[n], REAL(0.0), state->k, trial->slopes[n][j]);
+    trial->port[n][j] = trial->slopes[n][j][0];
+}
+
+/* How far a port at the quarter is off the parabola through its values, without what the chord takes */
+static void check_port(psa_state *state, psa_trial *trial, int j, real sigma, int driver) {
+    evaluate_port(state, trial, QUARTER, j, 0);
+    real off = trial->port[QUARTER][j] - 0.375 * state->port[j] - 0.75 * trial->port[HALF][j] +
+               0.125 * trial->port[WHOLE][j];
+    if (driver >= 0) {
+        const int u = ex_linear[driver];
+        off -= sigma * (trial->x[QUARTER][u] - 0.375 * state->x[u] - 0.75 * trial->x[HALF][u] +
+                        0.125 * trial->x[WHOLE][u]);
+    }
+    real response = REAL(0.0);
+    const psa_node *const node = trial->level->node + WHOLE;
+    for (int i = ex_port_reaches[j]; i < NL; ++i)
+        response = v_fmax(response, v_fabs(node->w[j][1][i]) * state->inverse_nominal[i]);
+    set_error(trial, v_fabs(off) * response / state->tolerance);
+}
+
+/* The response to a chord's driver beyond the parabola */
+static inline void respond_beyond(const psa_level *level, int c, const real *l, const real *v0, const real *dv,
+                                  real *sum) {
+    for (int i = 0; i < ROWS; ++i) sum[i] = level->chord_c[c][i];
+    for (int k = 0; k < ex_reads[ex_chord_driver[c]]; ++k)
+        for (int i = 0; i < ROWS; ++i) sum[i] += level->chord_f[c][k][i] * l[k];
+    for (int q = 0; q < EX_NU; ++q)
+        for (int i = 0; i < ROWS; ++i)
+            sum[i] += level->chord_a1[c][q][i] * v0[q] + level->chord_a2[c][q][i] * dv[q];
+}
+
+static void do_port(psa_state *state, psa_trial *trial, int j, int slopes) {
+    const int c = ex_port_chord[j], driver = c >= 0 ? ex_chord_driver[c] : -1;
+    real sigma = REAL(0.0);
+    evaluate_port(state, trial, HALF, j, slopes);
+    evaluate_port(state, trial, WHOLE, j, slopes);
+    if (c >= 0) {
+        const int u = ex_linear[driver];
+        const real way = trial->x[WHOLE][u] - state->x[u];
+        bits moves = MASK(v_fabs(way) > STILL * state->nominal[u]);
+        for (int g = 0; g < EX_NG; ++g)
+            if (ex_group_driver[g] == driver) moves &= MASK(trial->stages[g].turn >= 1.0);
+        sigma = choose(moves, (trial->port[WHOLE][j] - state->port[j]) / choose(moves, way, REAL(1.0)),
+                       REAL(0.0));
+    }
+    check_port(state, trial, j, sigma, driver);
+    for (int n = 0; n < NODES; ++n) add_port(state, trial, n, j);
+    if (c < 0) return;
+    trial->chord[c] = sigma;
+    const psa_level *const level = trial->level;
+    real sum[ROWS];
+    respond_beyond(level, c, trial->l, trial->v0, trial->dv, sum);
+    for (int i = 0; i < NL; ++i) {
+        trial->beyond[c][i] = sum[i];
+        trial->x[WHOLE][ex_linear[i]] += sigma * sum[i];
+    }
+}
+
+/* Hermite's cubic at s between values a and b with slopes da and db over the interval */
+static void hermite(real s, real basis[4]) {
+    const real r = 1.0 - s;
+    basis[0] = r * r * (1.0 + 2.0 * s);
+    basis[1] = s * r * r;
+    basis[2] = s * s * (3.0 - 2.0 * s);
+    basis[3] = -(s * s * r);
+}
+
+/* Where the driver turns: the zero of its rate in the half of the step in which it changes sign, on Hermite's
+   cubic, and its value there. The quarter's value tells the cubic's error, which is returned. */
+static real find_turn(psa_state *state, psa_trial *trial, psa_stages *stages, int u, real *value) {
+    const real u0 = state->x[u], u1 = trial->x[HALF][u], u2 = trial->x[WHOLE][u];
+    const real w0 = stages->w[NODES], w1 = stages->w[HALF], w2 = stages->w[WHOLE], d = 0.5 * trial->dt;
+    const int late = stages->bracket;
+    const real a = late ? u1 : u0, b = late ? u2 : u1, da = d * (late ? w1 : w0), db = d * (late ? w2 : w1);
+    /* slope of the cubic: da + s (6 (b - a) - 4 da - 2 db) + s^2 (3 da + 3 db - 6 (b - a)) = 0 */
+    const real p = 6.0 * (b - a) - 4.0 * da - 2.0 * db, q = 3.0 * (da + db) - 6.0 * (b - a);
+    const real root = v_sqrt(v_fmax(p * p - 4.0 * q * da, REAL(0.0)));
+    const real s = v_fmin(v_fmax(-2.0 * da / choose(MASK(da > 0.0), p - root, p + root), REAL(0.0)), REAL(1.0));
+    real quarter[4];
+    hermite(s, stages->basis);
+    *value = stages->basis[0] * a + stages->basis[1] * da + stages->basis[2] * b + stages->basis[3] * db;
+    stages->turn = 0.5 * (s + late);
+    hermite(REAL(0.5), quarter);
+    return v_fabs(trial->x[QUARTER][u] -
+                  (quarter[0] * u0 + quarter[1] * d * w0 + quarter[2] * u1 + quarter[3] * d * w1));
+}
+
+/* One Runge-Kutta step along a leg, of fourth order; where the way is short the midpoint rule */
+static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int slopes) {
+    static const double SHARE[4] = {0.0, 0.5, 0.5, 1.0};
+    const int first = ex_group_first[g], size = ex_group_size[g];
+    const real finish = leg->begin + leg->dt / trial->dt;
+    const bits brief = MASK(v_fabs(leg->way) < BRIEF * state->nominal[ex_linear[ex_group_driver[g]]]);
+    leg->stages = 2;
+    for (int lane = 0; lane < PSA_LANES; ++lane)
+        if (!LANE(brief, lane)) leg->stages = 4;
+    for (int stage = 0; stage < leg->stages; ++stage) {
+        real *const x = leg->at[stage], v[EX_NU + 1];
+        const double s = SHARE[stage];
+        for (int r = 0; r < EX_NPATH; ++r) {
+            const int q = ex_path[r];
+            x[q] = leg->from[q] + s * (leg->to[q] - leg->from[q]);
+        }
+        for (int j = 0; j < EX_NU; ++j)
+            v[j] = trial->v0[j] + (leg->begin + s * (finish - leg->begin)) * trial->dv[j];
+        for (int i = 0; i < size; ++i) {
+            const int q = ex_group_states[first + i];
+            x[q] = leg->from[q];
+            if (stage > 0) x[q] += s * leg->dt * leg->out[stage - 1][i];
+        }
+        const real t = state->t + leg->begin * trial->dt + s * leg->dt;
+        if (slopes) ex_group_slopes(g, t, x, v, leg->rate, state->k, leg->out[stage]);
+        else ex_group(g, t, x, v, leg->rate, state->k, leg->out[stage]);
+    }
+    for (int i = 0; i < size; ++i) {
+        const int q = ex_group_states[first + i];
+        const real k1 = leg->out[0][i], k2 = leg->out[1][i];
+        real mean = k2, last = 2.0 * k2 - k1, e = 0.1 * BRIEF * leg->dt * v_fabs(k2 - k1) / state->nominal[q];
+        if (leg->stages == 4) {
+            const real k3 = leg->out[2][i], k4 = leg->out[3][i];
+            /* the two slopes at the middle differ in third order, the step errs in fifth: between the two */
+            const real apart = leg->dt * v_fabs(k3 - k2) / state->nominal[q];
+            mean = choose(brief, mean, (k1 + 2.0 * (k2 + k3) + k4) / 6.0);
+            last = choose(brief, last, k4);
+            e = choose(brief, e, apart * v_sqrt(apart));
+        }
+        leg->to[q] = leg->from[q] + leg->dt * mean;
+        leg->last[i] = last;
+        set_error(trial, e / state->tolerance);
+    }
+}
+
+/* The states at a node, by Hermite's cubic over the way of the leg on which it lies */
+static void group_node(psa_state *state, psa_trial *trial, int g, int n, double theta) {
+    psa_stages *const stages = trial->stages + g;
+    const int u = ex_linear[ex_group_driver[g]];
+    real basis[2][4];
+    bits second = MASK(REAL(0.0) > 1.0);
+    stages->on[n] = 0;
+    for (int k = 0; k < stages->legs; ++k) {
+        const psa_leg *const leg = stages->leg + k;
+        const bits moves = MASK(v_fabs(leg->way) > STILL * state->nominal[u]);
+        const real in_time = (theta - leg->begin) * trial->dt / choose(MASK(leg->dt > 0.0), leg->dt, REAL(1.0));
+        const real on_way = (trial->x[n][u] - leg->from[u]) / choose(moves, leg->way, REAL(1.0));
+        const real s = v_fmin(v_fmax(choose(moves, on_way, in_time), REAL(0.0)), REAL(1.0));
+        hermite(s, basis[k]);
+        if (k == 0) stages->share[n] = s;
+        else {
+            second = MASK(theta + REAL(0.0) > leg->begin);
+            stages->share[n] = choose(second, s, stages->share[n]);
+            stages->on[n] = LANE(second, 0) != 0;
+        }
+    }
+    for (int i = 0; i < ex_group_size[g]; ++i) {
+        const int q = ex_group_states[ex_group_first[g] + i];
+        for (int k = 0; k < stages->legs; ++k) {
+            const psa_leg *const leg = stages->leg + k;
+            const real x = basis[k][0] * leg->from[q] + basis[k][1] * leg->dt * leg->out[0][i] +
+                           basis[k][2] * leg->to[q] + basis[k][3] * leg->dt * leg->last[i];
+            trial->x[n][q] = k ? choose(second, x, trial->x[n][q]) : x;
+        }
+    }
+}
+
+/* A driver that slows down may come to rest, or all but so. What its states do in time and not along its way
+   (r is not proportional to the rate there) then needs steps in which that does nothing. */
+static void check_rest(psa_state *state, psa_trial *trial, int g, real most, bits slows) {
+    real fast[EX_GROUP_OUT], slow[EX_GROUP_OUT];
+    ex_group(g, state->t, state->x, trial->v0, most, state->k, fast);
+    ex_group(g, state->t, state->x, trial->v0, SLOWS * most, state->k, slow);
+    for (int i = 0; i < ex_group_size[g]; ++i) {
+        const real in_time = v_fabs(fast[i] - slow[i] / SLOWS) / (1.0 / SLOWS - 1.0);
+        const real e = 0.5 * in_time * trial->dt / state->nominal[ex_group_states[ex_group_first[g] + i]];
+        set_error(trial, choose(slows, e / state->tolerance, REAL(0.0)));
+    }
+}
+
+/* The legs of a group's way: two where the driver's rate changes sign once between start, half and end */
+static void find_legs(psa_state *state, psa_trial *trial, int g, int slopes) {
+    static const int AT[4] = {WHOLE, HALF, QUARTER, NODES};
+    psa_stages *const stages = trial->stages + g;
+    const int u = ex_linear[ex_group_driver[g]];
+    for (int k = 0; k < 4; ++k) {
+        const int n = AT[k], start = n == NODES;
+        if (n == QUARTER) continue;
+        const real *const x = start ? state->x : trial->x[n], *const v = start ? trial->v0 : trial->v[n];
+        if (slopes) ex_rate_slopes(g, start ? state->t : trial->t[n], x, v, REAL(0.0), state->k,
+                                   stages->rate_slopes[n]);
+        else ex_rate(g, start ? state->t : trial->t[n], x, v, REAL(0.0), state->k, stages->rate_slopes[n]);
+        stages->w[n] = stages->rate_slopes[n][0];
+    }
+    const real w0 = stages->w[NODES], w1 = stages->w[HALF], w2 = stages->w[WHOLE];
+    const real most = v_fmax(v_fmax(v_fabs(w0), v_fabs(w1)), v_fabs(w2));
+    const real least = v_fmin(v_fmin(v_fabs(w0), v_fabs(w1)), v_fabs(w2));
+    const bits early = MASK(w0 * w1 < 0.0), late = MASK(w1 * w2 < 0.0) | (MASK(w1 == 0.0) & MASK(w0 * w2 < 0.0));
+    const bits slows = MASK(least < SLOWS * most) & ~(early | late);
+    psa_leg *const one = stages->leg, *const two = stages->leg + 1;
+    stages->legs = 1;
+    stages->turn = REAL(1.0);
+    memcpy(one->from, state->x, sizeof one->from);
+    memcpy(one->to, trial->x[WHOLE], sizeof one->to);
+    one->begin = REAL(0.0);
+    one->dt = trial->dt;
+#if PSA_LANES == 1
+    if (slows) check_rest(state, trial, g, w0 + w2 > 0.0 ? most : -most, slows);
+    if (early && late) {
+        /* it turns twice: nothing along such a way unless that is nothing */
+        set_error(trial, REAL(1e3));
+    }
+    if (early || late) {
+        real value;
+        stages->bracket = late && !early;
+        const real missed = find_turn(state, trial, stages, u, &value);
+        stages->legs = 2;
+        *two = *one;
+        one->dt = stages->turn * trial->dt;
+        for (int r = 0; r < EX_NPATH; ++r) {
+            const int q = ex_path[r];
+            one->to[q] = one->from[q] + stages->turn * (one->to[q] - one->from[q]);
+        }
+        one->to[u] = value;
+        memcpy(two->from, one->to, sizeof two->from);
+        two->begin = stages->turn;
+        two->dt = trial->dt - one->dt;
+        stages->w[QUARTER] = missed;
+    }
+#endif
+    for (int k = 0; k < stages->legs; ++k) {
+        psa_leg *const leg = stages->leg + k;
+        leg->way = leg->to[u] - leg->from[u];
+        leg->rate = choose(MASK(leg->dt > 0.0), leg->way / leg->dt, REAL(0.0));
+    }
+}
+
+static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
+    psa_stages *const stages = trial->stages + g;
+    const int first = ex_group_first[g], size = ex_group_size[g];
+    find_legs(state, trial, g, slopes);
+    for (int k = 0; k < stages->legs; ++k) {
+        psa_leg *const leg = stages->leg + k;
+        if (k > 0)
+            for (int i = 0; i < size; ++i) {
+                const int q = ex_group_states[first + i];
+                leg->from[q] = stages->leg[k - 1].to[q];
+            }
+        do_leg(state, trial, g, leg, slopes);
+    }
+    const psa_leg *const last = stages->leg + stages->legs - 1;
+    for (int i = 0; i < size; ++i) {
+        const int q = ex_group_states[first + i];
+        trial->x[WHOLE][q] = last->to[q];
+        if (stages->legs > 1) {
+            /* a turn that is off by `missed` is off by the slopes of both branches */
+            real slope = REAL(0.0);
+            for (int k = 0; k < 2; ++k) {
+                const psa_leg *const leg = stages->leg + k;
+                const real rate = v_fabs(leg->rate);
+                slope += choose(MASK(rate > 0.0), v_fabs(leg->out[0][i]) / rate, REAL(0.0));
+            }
+            set_error(trial, slope * stages->w[QUARTER] / state->nominal[q] / state->tolerance);
+        }
+    }
+    group_node(state, trial, g, HALF, 0.5);
+    group_node(state, trial, g, QUARTER, 0.25);
+}
+
+/* Entry of a port's partial derivatives by a linear state, 0 where it has none */
+static real port_by_linear(const psa_trial *trial, int n, int j, int linear) {
+    real sum = REAL(0.0);
+    for (int e = 0; e < ex_port_count[j]; ++e)
+        if (ex_port_entries[j][e].kind == 0 && ex_port_entries[j][e].index == ex_linear[linear])
+            sum += trial->slopes[n][j][1 + e];
+    return sum;
+}
+
+/* I - d(values)/d(values) of the ports of a loop at half and end: their own response seen by themselves */
+static void loop_matrix(const psa_trial *trial, const int *ports, int count, real *a) {
+    static const int AT[2] = {HALF, WHOLE};
+    const int size = 2 * count;
+    for (int n = 0; n < 2; ++n)
+        for (int j = 0; j < count; ++j)
+            for (int m = 0; m < 2; ++m)
+                for (int i = 0; i < count; ++i) {
+                    real sum = n == m && i == j ? REAL(1.0) : REAL(0.0);
+                    for (int r = 0; r < EX_NEED; ++r) {
+                        const int q = ex_need[r];
+                        sum -= port_by_linear(trial, AT[n], ports[j], q) *
+                               trial->level->node[AT[n]].w[ports[i]][m + 1][q];
+                    }
+                    a[(n * count + j) * size + m * count + i] = sum;
+                }
+}
+
+/* Gauss elimination without exchanges: the matrix is the unit one and a contraction */
+static void eliminate(int size, real *a, real *b) {
+    for (int k = 0; k < size; ++k)
+        for (int i = k + 1; i < size; ++i) {
+            const real factor = a[i * size + k] / a[k * size + k];
+            a[i * size + k] = factor;
+            for (int j = k + 1; j < size; ++j) a[i * size + j] -= factor * a[k * size + j];
+            b[i] -= factor * b[k];
+        }
+    for (int k = size - 1; k >= 0; --k) {
+        for (int j = k + 1; j < size; ++j) b[k] -= a[k * size + j] * b[j];
+        b[k] /= a[k * size + k];
+    }
+}
+
+#if EX_NLOOP > 0
+static void do_loop(psa_state *state, psa_trial *trial, const int *ports, int count) {
+    static const int AT[2] = {HALF, WHOLE};
+    real without[2][EX_NX], a[4 * EX_NPORT * EX_NPORT], b[2 * EX_NPORT], first[2 * EX_NPORT];
+    real change = REAL(0.0);
+    for (int n = 0; n < 2; ++n) memcpy(without[n], trial->x[AT[n]], sizeof without[n]);
+    for (int j = 0; j < count; ++j)
+        trial->port[HALF][ports[j]] = trial->port[WHOLE][ports[j]] = state->port[ports[j]];
+    for (int iteration = 0; iteration < NEWTON_LIMIT; ++iteration) {
+        for (int n = 0; n < 2; ++n) {
+            memcpy(trial->x[AT[n]], without[n], sizeof without[n]);
+            for (int j = 0; j < count; ++j) add_port(state, trial, AT[n], ports[j]);
+        }
+        for (int n = 0; n < 2; ++n)
+            for (int j = 0; j < count; ++j) {
+                const real guess = trial->port[AT[n]][ports[j]];
+                evaluate_port(state, trial, AT[n], ports[j], 1);
+                b[n * count + j] = trial->port[AT[n]][ports[j]] - guess;
+                trial->port[AT[n]][ports[j]] = guess;
+            }
+        loop_matrix(trial, ports, count, a);
+        eliminate(2 * count, a, b);
+        change = REAL(0.0);
+        for (int n = 0; n < 2; ++n)
+            for (int j = 0; j < count; ++j) {
+                trial->port[AT[n]][ports[j]] += b[n * count + j];
+                real response = REAL(0.0);
+                for (int r = 0; r < EX_NEED; ++r) {
+                    const int q = ex_need[r];
+                    response = v_fmax(response, v_fabs(trial->level->node[WHOLE].w[ports[j]][n + 1][q]) /
+                                                    state->nominal[ex_linear[q]]);
+                }
+                change = v_fmax(change, v_fabs(b[n * count + j]) * response);
+            }
+        (void)first;
+        int settled = 1;
+        for (int lane = 0; lane < PSA_LANES; ++lane)
+            if (!(LANE(change, lane) <= 1e-3 * LANE(state->tolerance, lane))) settled = 0;
+        if (settled) break;
+    }
+    set_error(trial, change / state->tolerance);
+    for (int n = 0; n < 2; ++n) {
+        memcpy(trial->x[AT[n]], without[n], sizeof without[n]);
+        for (int j = 0; j < count; ++j) add_port(state, trial, AT[n], ports[j]);
+    }
+    for (int j = 0; j < count; ++j) add_port(state, trial, QUARTER, ports[j]);
+    for (int j = 0; j < count; ++j) check_port(state, trial, ports[j], REAL(0.0), -1);
+}
+#endif
+
+/* Try the step of `level` from `begin` to `end`, shares of the sample */
+static void try_step(psa_state *state, const psa_level *level, long sample, real begin, real length, double h,
+                     int slopes) {
+    psa_trial *const trial = &state->trial;
+    const psa_exact *const run = state->run;
+    const double *const now = run->v + sample * EX_NU, *const next = now + EX_NU;
+    static const double THETA[NODES] = {1.0, 0.5, 0.25};
+    trial->level = level;
+    for (int i = 0; i < ROWS; ++i) trial->l[i] = i < NL ? state->x[ex_linear[i]] : REAL(0.0);
+    trial->dt = length * h;
+    trial->error = REAL(0.0);
+    for (int j = 0; j < EX_NU; ++j) {
+        const double change = run->zero_order_hold ? 0.0 : next[j] - now[j];
+        trial->v0[j] = now[j] + begin * change;
+        trial->dv[j] = length * change;
+        for (int n = 0; n < NODES; ++n) trial->v[n][j] = trial->v0[j] + THETA[n] * trial->dv[j];
+    }
+    for (int n = 0; n < NODES; ++n) {
+        trial->t[n] = state->t + THETA[n] * trial->dt;
+        linear_node(state, trial, n);
+    }
+    for (int k = 0; k < EX_NITEMS; ++k) {
+        const psa_item *const item = ex_items + k;
+        if (item->kind == EX_GROUP) do_group(state, trial, item->members[0], slopes);
+        else if (item->kind == EX_PORT) do_port(state, trial, item->members[0], slopes);
+#if EX_NLOOP > 0
+        else do_loop(state, trial, item->members, item->count);
+#endif
+    }
+}
+
+/* ---- derivatives -------------------------------------------------------------------------------------- */
+
+#if PSA_LANES == 1
+#define ROW(array, i) ((array) + (size_t)(i) * (size_t)nb)
+
+static void fill(column *x, int nb) { memset(x, 0, sizeof(column) * (size_t)nb); }
+static void copy(const column *from, column *to, int nb) { memcpy(to, from, sizeof(column) * (size_t)nb); }
+static inline void axpy(double a, const column *x, column *y, int nb) {
+    for (int b = 0; b < nb; ++b) y[b] += a * x[b];
+}
+static inline void add_to(column *x, int at, double value) { ((double *)x)[at] += value; }
+
+/* The derivative of a value whose partial derivatives stand in `partial`; `x` are the states' columns, `rate`
+   those of the driver's rate */
+static inline void chain(const psa_state *state, const psa_active *list, const real *partial, const column *x,
+                         const column *rate, column *out) {
+    const int nb = state->blocks;
+    fill(out, nb);
+    for (; list->kind >= 0; ++list) {
+        const double a = partial[list->entry];
+        if (list->kind == 2) add_to(out, list->index, a);
+        else axpy(a, list->kind == 0 ? ROW(x, list->index) : rate, out, nb);
+    }
+}
+
+/* What the matrices' own derivatives add to the columns of L at a node goes to one column each */
+static void matrix_columns(psa_state *state, int n, int j, const double *sigma, int c) {
+    const psa_trial *const trial = &state->trial;
+    const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
+    for (int m = 0; m < state->thetas; ++m) {
+        const psa_node *const d = trial->level[m + 1].node + n;
+        double sum[ROWS];
+        if (j < 0) {
+            for (int i = 0; i < ROWS; ++i) sum[i] = 0.0;
+            respond(d, trial->l, trial->v0, trial->dv, sum);
+        } else {
+            const double n0 = state->port[j], n1 = trial->port[HALF][j], n2 = trial->port[WHOLE][j];
+            if (sigma) {
+                respond_beyond(trial->level + m + 1, c, trial->l, trial->v0, trial->dv, sum);
+                for (int i = 0; i < ROWS; ++i) sum[i] *= *sigma;
+            } else
+                for (int i = 0; i < ROWS; ++i) sum[i] = 0.0;
+            for (int i = 0; i < ROWS; ++i) sum[i] += d->w[j][0][i] * n0 + d->w[j][1][i] * n1 + d->w[j][2][i] * n2;
+        }
+        for (int r = 0; r < rows; ++r) {
+            const int i = n == WHOLE ? r : ex_need[r];
+            add_to(ROW(ROW(state->node, n * EX_NX), ex_linear[i]), state->theta_column[m], sum[i]);
+        }
+    }
+}
+
+/* Columns of L at a node without ports */
+static void linear_columns(psa_state *state, int n) {
+    const psa_trial *const trial = &state->trial;
+    const psa_node *const node = trial->level->node + n;
+    const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
+    column *const x = ROW(state->node, n * EX_NX);
+    for (int r = 0; r < rows; ++r) {
+        const int i = n == WHOLE ? r : ex_need[r];
+        column *const out = ROW(x, ex_linear[i]);
+        const column *const own = ROW(state->s, ex_linear[i]);
+        for (int b = 0; b < nb; ++b) {
+            column sum = own[b];
+            for (int j = 0; j < ex_reads[i]; ++j) sum += node->f[j][i] * ROW(state->s, ex_linear[j])[b];
+            out[b] = sum;
+        }
+    }
+    matrix_columns(state, n, -1, NULL, 0);
+}
+
+static void add_port_columns(psa_state *state, int n, int j, const double *sigma) {
+    const psa_trial *const trial = &state->trial;
+    const psa_node *const node = trial->level->node + n;
+    const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
+    const column *const n0 = ROW(state->sport, j), *const n1 = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
+    const column *const n2 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
+    int any = 0;
+    for (int r = 0; r < rows; ++r) {
+        const int i = n == WHOLE ? r : ex_need[r];
+        if (i < ex_port_reaches[j]) continue;
+        column *const out = ROW(ROW(state->node, n * EX_NX), ex_linear[i]);
+        const double w0 = node->w[j][0][i], w1 = node->w[j][1][i], w2 = node->w[j][2][i];
+        for (int b = 0; b < nb; ++b) out[b] += w0 * n0[b] + w1 * n1[b] + w2 * n2[b];
+        any = 1;
+    }
+    if (any) matrix_columns(state, n, j, sigma, ex_port_chord[j]);
+}
+
+static void port_columns(psa_state *state, int n, int j) {
+    const int nb = state->blocks;
+    column *const out = ROW(state->snode_port, n * (EX_NPORT + 1) + j);
+    chain(state, state->port_list[j], state->trial.slopes[n][j] + 1, ROW(state->node, n * EX_NX), NULL, out);
+}
+
+static void do_port_columns(psa_state *state, int j) {
+    const psa_trial *const trial = &state->trial;
+    const int nb = state->blocks, c = ex_port_chord[j];
+    port_columns(state, HALF, j);
+    port_columns(state, WHOLE, j);
+    add_port_columns(state, HALF, j, NULL);
+    if (c >= 0 && trial->chord[c] != 0.0) {
+        const int u = ex_linear[ex_chord_driver[c]];
+        const double sigma = trial->chord[c], way = trial->x[WHOLE][u] - state->x[u];
+        column *const x = ROW(state->node, WHOLE * EX_NX), *const dsigma = state->scratch;
+        const column *const n0 = ROW(state->sport, j);
+        const column *const n1 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
+        for (int b = 0; b < nb; ++b)
+            dsigma[b] = (n1[b] - n0[b] - sigma * (ROW(x, u)[b] - ROW(state->s, u)[b])) / way;
+        add_port_columns(state, WHOLE, j, &sigma);
+        for (int i = 0; i < NL; ++i) {
+            column *const out = ROW(x, ex_linear[i]);
+            const double beyond = trial->beyond[c][i];
+            for (int b = 0; b < nb; ++b) {
+                column sum = beyond * dsigma[b];
+                for (int q = 0; q < ex_reads[ex_chord_driver[c]]; ++q)
+                    sum += sigma * trial->level->chord_f[c][q][i] * ROW(state->s, ex_linear[q])[b];
+                out[b] += sum;
+            }
+        }
+    } else add_port_columns(state, WHOLE, j, NULL);
+}
+
+/* Columns of the driver at its turn: at a zero of its rate, those at a fixed time */
+static void turn_columns(psa_state *state, int g, column *out, column *rate) {
+    const psa_trial *const trial = &state->trial;
+    const psa_stages *const stages = trial->stages + g;
+    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]], late = stages->bracket;
+    const double d = 0.5 * trial->dt;
+    const int node[2] = {late ? HALF : NODES, late ? WHOLE : HALF};
+    fill(out, nb);
+    for (int k = 0; k < 2; ++k) {
+        const column *const x = node[k] == NODES ? state->s : ROW(state->node, node[k] * EX_NX);
+        chain(state, state->rate_list[g], stages->rate_slopes[node[k]] + 1, x, NULL, rate);
+        axpy(stages->basis[2 * k], ROW(x, u), out, nb);
+        axpy(stages->basis[2 * k + 1] * d, rate, out, nb);
+    }
+}
+
+/* Columns along one leg: `from` and `to` are those of the path variables, `x` those of the states at its
+   start, which become those at its end; `k` holds the four slopes' */
+static void leg_columns(psa_state *state, int g, const psa_leg *leg, const column *from, const column *to,
+                        column *start, column *x, column *k) {
+    static const double SHARE[4] = {0.0, 0.5, 0.5, 1.0};
+    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
+    const int first = ex_group_first[g], size = ex_group_size[g];
+    const double dt = leg->dt;
+    column *const rate = ROW(k, 4 * size);
+    if (dt > 0.0)
+        for (int b = 0; b < nb; ++b) rate[b] = (ROW(to, u)[b] - ROW(from, u)[b]) / dt;
+    else fill(rate, nb);
+    for (int stage = 0; stage < leg->stages; ++stage) {
+        const double share = SHARE[stage];
+        for (int r = 0; r < EX_NPATH; ++r) {
+            const int q = ex_path[r];
+            for (int b = 0; b < nb; ++b)
+                ROW(x, q)[b] = ROW(from, q)[b] + share * (ROW(to, q)[b] - ROW(from, q)[b]);
+        }
+        for (int i = 0; i < size; ++i) {
+            const int q = ex_group_states[first + i];
+            copy(ROW(start, i), ROW(x, q), nb);
+            if (stage > 0) axpy(share * dt, ROW(k, (stage - 1) * size + i), ROW(x, q), nb);
+        }
+        for (int i = 0; i < size; ++i) {
+            column *const out = ROW(k, stage * size + i);
+            chain(state, state->group_list[first + i], leg->out[stage] + size, x, rate, out);
+        }
+    }
+    for (int i = 0; i < size; ++i) {
+        const column *const k1 = ROW(k, i), *const k2 = ROW(k, size + i), *const k3 = ROW(k, 2 * size + i);
+        column *const k4 = ROW(k, 3 * size + i), *const x1 = ROW(start, i);
+        if (leg->stages == 4)
+            for (int b = 0; b < nb; ++b) x1[b] += dt / 6.0 * (k1[b] + 2.0 * (k2[b] + k3[b]) + k4[b]);
+        else
+            for (int b = 0; b < nb; ++b) {
+                x1[b] += dt * k2[b];
+                k4[b] = 2.0 * k2[b] - k1[b]; /* the slope at the end */
+            }
+    }
+}
+
+/* Columns of a group's states at the half of the step, if that lies on this leg */
+static void half_columns(psa_state *state, int g, const psa_leg *leg, const column *from, const column *to,
+                         const column *begin, const column *end, const column *k) {
+    const psa_trial *const trial = &state->trial;
+    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
+    const int first = ex_group_first[g], size = ex_group_size[g];
+    const double s = trial->stages[g].share[HALF], dt = leg->dt;
+    const int inside = s > 0.0 && s < 1.0 && fabs(leg->way) > STILL * state->nominal[u];
+    column *const half = ROW(state->node, HALF * EX_NX);
+    real basis[4];
+    hermite(s, basis);
+    for (int i = 0; i < size; ++i) {
+        const int q = ex_group_states[first + i];
+        const double change = leg->to[q] - leg->from[q], a = dt * leg->out[0][i], e = dt * leg->last[i];
+        const double by_share = 6.0 * s * (1.0 - s) * change + (1.0 - s) * (1.0 - 3.0 * s) * a + s * (3.0 * s - 2.0) * e;
+        const column *const k1 = ROW(k, i), *const k4 = ROW(k, 3 * size + i);
+        for (int b = 0; b < nb; ++b) {
+            column sum = basis[0] * ROW(begin, i)[b] + basis[1] * dt * k1[b] + basis[2] * ROW(end, i)[b] +
+                         basis[3] * dt * k4[b];
+            if (inside)
+                sum += by_share / leg->way *
+                       (ROW(half, u)[b] - ROW(from, u)[b] - s * (ROW(to, u)[b] - ROW(from, u)[b]));
+            ROW(half, q)[b] = sum;
+        }
+    }
+}
+
+static void do_group_columns(psa_state *state, int g) {
+    const psa_trial *const trial = &state->trial;
+    const psa_stages *const stages = trial->stages + g;
+    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
+    const int first = ex_group_first[g], size = ex_group_size[g];
+    column *const x = state->scratch, *const k = ROW(x, EX_NX), *const turn = ROW(k, 4 * size + 1);
+    column *const begin = ROW(turn, EX_NX), *const end = ROW(begin, size);
+    const column *from = state->s, *to = ROW(state->node, WHOLE * EX_NX);
+    for (int i = 0; i < size; ++i) copy(ROW(state->s, ex_group_states[first + i]), ROW(end, i), nb);
+    if (stages->legs > 1) {
+        const double s = stages->turn;
+        for (int r = 0; r < EX_NPATH; ++r) {
+            const int q = ex_path[r];
+            for (int b = 0; b < nb; ++b)
+                ROW(turn, q)[b] = ROW(from, q)[b] + s * (ROW(to, q)[b] - ROW(from, q)[b]);
+        }
+        turn_columns(state, g, ROW(turn, u), k);
+    }
+    for (int n = 0; n < stages->legs; ++n) {
+        const column *const a = n == 0 ? from : turn, *const b = n + 1 == stages->legs ? to : turn;
+        memcpy(begin, end, sizeof(column) * (size_t)(size * nb));
+        leg_columns(state, g, stages->leg + n, a, b, end, x, k);
+        if (stages->on[HALF] == n) half_columns(state, g, stages->leg + n, a, b, begin, end, k);
+    }
+    for (int i = 0; i < size; ++i)
+        copy(ROW(end, i), ROW(state->node, WHOLE * EX_NX + ex_group_states[first + i]), nb);
+}
+
+#if EX_NLOOP > 0
+static void do_loop_columns(psa_state *state, const int *ports, int count) {
+    static const int AT[2] = {HALF, WHOLE};
+    const psa_trial *const trial = &state->trial;
+    const int nb = state->blocks, size = 2 * count;
+    real a[4 * EX_NPORT * EX_NPORT];
+    /* first with the ports' values held at half and end, then what they change by */
+    for (int n = 0; n < 2; ++n)
+        for (int j = 0; j < count; ++j) fill(ROW(state->snode_port, AT[n] * (EX_NPORT + 1) + ports[j]), nb);
+    for (int n = 0; n < 2; ++n)
+        for (int j = 0; j < count; ++j) add_port_columns(state, AT[n], ports[j], NULL);
+    for (int n = 0; n < 2; ++n)
+        for (int j = 0; j < count; ++j) port_columns(state, AT[n], ports[j]);
+    loop_matrix(trial, ports, count, a);
+    for (int k = 0; k < size; ++k)
+        for (int i = k + 1; i < size; ++i) {
+            const double factor = a[i * size + k] / a[k * size + k];
+            for (int j = k; j < size; ++j) a[i * size + j] -= factor * a[k * size + j];
+            axpy(-factor, ROW(state->snode_port, AT[k / count] * (EX_NPORT + 1) + ports[k % count]),
+                 ROW(state->snode_port, AT[i / count] * (EX_NPORT + 1) + ports[i % count]), nb);
+        }
+    for (int k = size - 1; k >= 0; --k) {
+        column *const b = ROW(state->snode_port, AT[k / count] * (EX_NPORT + 1) + ports[k % count]);
+        for (int j = k + 1; j < size; ++j)
+            axpy(-a[k * size + j], ROW(state->snode_port, AT[j / count] * (EX_NPORT + 1) + ports[j % count]), b,
+                 nb);
+        for (int q = 0; q < nb; ++q) b[q] /= a[k * size + k];
+    }
+    for (int n = 0; n < 2; ++n)
+        for (int r = 0; r < (AT[n] == WHOLE ? NL : EX_NEED); ++r) {
+            const int i = AT[n] == WHOLE ? r : ex_need[r];
+            column *const out = ROW(ROW(state->node, AT[n] * EX_NX), ex_linear[i]);
+            for (int j = 0; j < count; ++j)
+                for (int m = 0; m < 2; ++m)
+                    axpy(trial->level->node[AT[n]].w[ports[j]][m + 1][i],
+                         ROW(state->snode_port, AT[m] * (EX_NPORT + 1) + ports[j]), out, nb);
+        }
+}
+#endif
+
+static void step_columns(psa_state *state) {
+    linear_columns(state, HALF);
+    linear_columns(state, WHOLE);
+    for (int k = 0; k < EX_NITEMS; ++k) {
+        const psa_item *const item = ex_items + k;
+        if (item->kind == EX_GROUP) do_group_columns(state, item->members[0]);
+        else if (item->kind == EX_PORT) do_port_columns(state, item->members[0]);
+#if EX_NLOOP > 0
+        else do_loop_columns(state, item->members, item->count);
+#endif
+    }
+    const int nb = state->blocks;
+    memcpy(state->s, ROW(state->node, WHOLE * EX_NX), sizeof(column) * (size_t)(EX_NX * nb));
+    for (int j = 0; j < EX_NPORT; ++j)
+        copy(ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j), ROW(state->sport, j), nb);
+}
+#endif
+
+/* ---- the run ------------------------------------------------------------------------------------------ */
+
+static const psa_level *level_of(psa_state *state, int step, int level) {
+    const psa_exact *const run = state->run;
+    const int each = 1 + state->thetas, at = step * (run->finest + 1) + level;
+    psa_level *const found = state->levels + (size_t)at * (size_t)each;
+    if (!state->ready[at]) {
+        for (int lane = 0; lane < PSA_LANES; ++lane)
+            for (int t = 0; t < each; ++t)
+                fill_level(state->ladders + step * PSA_LANES + lane, level, t, state->scale, lane, found + t);
+        state->ready[at] = 1;
+    }
+    return found;
+}
+
+/* Values of the ports at the start of an interval, with their derivatives */
+static void start_ports(psa_state *state, const double *input) {
+    real v[EX_NU + 1];
+    for (int j = 0; j < EX_NU; ++j) v[j] = input[j] + REAL(0.0);
+    for (int j = 0; j < EX_NPORT; ++j) {
+        real *const out = state->start_slopes[j];
+        ex_port_slopes(j, state->t, state->x, v, REAL(0.0), state->k, out);
+        state->port[j] = out[0];
+#if PSA_LANES == 1
+        const int nb = state->blocks;
+        if (nb > 0)
+            chain(state, state->port_list[j], out + 1, state->s, NULL, ROW(state->sport, j));
+#endif
+    }
+}
+
+static int write_sample(psa_state *state, long sample) {
+    const psa_exact *const run = state->run;
+    const int sets = run->sets;
+    real v[EX_NU + 1], out[EX_SHOWN_OUT > EX_NY ? EX_SHOWN_OUT : EX_NY];
+    for (int j = 0; j < EX_NU; ++j) v[j] = run->v[sample * EX_NU + j] + REAL(0.0);
+    if (run->x)
+        for (int i = 0; i < EX_NX; ++i)
+            for (int lane = 0; lane < sets; ++lane)
+                run->x[(sample * EX_NX + i) * sets + lane] = LANE(state->x[i], lane);
+    if (run->y) {
+        ex_outputs(state->t, state->x, v, REAL(0.0), state->k, out);
+        for (int i = 0; i < EX_NY; ++i)
+            for (int lane = 0; lane < sets; ++lane)
+                run->y[(sample * EX_NY + i) * sets + lane] = LANE(out[i], lane);
+    }
+    if (!run->shown) return 0;
+    if (run->count == 0) {
+        ex_shown(state->t, state->x, v, REAL(0.0), state->k, out);
+        for (int lane = 0; lane < sets; ++lane) {
+            run->shown[sample * sets + lane] = LANE(out[0], lane);
+            if (!isfinite(LANE(out[0], lane))) return 1;
+        }
+        return 0;
+    }
+#if PSA_LANES == 1
+    column *const dy = state->scratch;
+    ex_shown_slopes(state->t, state->x, v, 0.0, state->k, out);
+    chain(state, state->shown_list, out + 1, state->s, NULL, dy);
+    run->shown[sample] = out[0];
+    memcpy(run->dy + sample * run->count, dy, sizeof(double) * (size_t)run->count);
+    return !isfinite(out[0]);
+#else
+    return 0;
+#endif
+}
+
+/* Steps over one interval between samples. Positions are counted in the finest lengths; a step begins at a
+   multiple of its own length. Lanes stand side by side as long as their levels agree. */
+#if PSA_LANES == 1
+static int next_sample(psa_state *state, long sample, int *level) {
+    psa_exact *const run = state->run;
+    const int step = run->which_step[sample], finest = run->finest;
+    const double h = run->length[step];
+    const long end = 1L << finest;
+    long at = 0, left = run->steps_limit;
+    while (at < end) {
+        const long units = end >> *level;
+        if (--left < 0) return 3;
+        try_step(state, level_of(state, step, *level), sample, ldexp((double)at, -finest), ldexp(1.0, -*level),
+                 h, run->count > 0);
+        if (!(state->trial.error <= 1.0) && *level < finest) {
+            ++*level;
+            run->rejected++;
+            continue;
+        }
+        if (!(state->trial.error <= 1.0)) run->forced++;
+        if (!(state->trial.error < 1e300)) return 1;
+        if (run->count > 0) step_columns(state);
+        memcpy(state->x, state->trial.x[WHOLE], sizeof state->x);
+        memcpy(state->port, state->trial.port[WHOLE], sizeof state->port);
+        at += units;
+        run->steps++;
+        state->t = run->t[sample] + h * ldexp((double)at, -finest);
+        while (*level > run->coarsest && state->trial.error < GROWS && at % (2 * (end >> *level)) == 0) {
+            --*level;
+            break;
+        }
+    }
+    state->t = run->t[sample + 1];
+    return 0;
+}
+#endif
+
+/* The entries of one row that count here */
+static void activate(const psa_state *state, const psa_entry *entries, int count, int row, psa_active *list) {
+    for (int e = 0; e < count; ++e) {
+        if (entries[e].row != row) continue;
+        const int asked = entries[e].kind == 2 ? state->column_of[entries[e].index] : entries[e].index;
+        if (asked < 0) continue;
+        *list++ = (psa_active){entries[e].kind, (short)asked, (short)e};
+    }
+    list->kind = -1;
+}
+
+static void activate_all(psa_state *state) {
+    for (int g = 0; g < EX_NG; ++g) {
+        activate(state, ex_rate_entries[g], ex_rate_count[g], 0, state->rate_list[g]);
+        for (int i = 0; i < ex_group_size[g]; ++i)
+            activate(state, ex_group_entries[g], ex_group_count[g], i, state->group_list[ex_group_first[g] + i]);
+    }
+    for (int j = 0; j < EX_NPORT; ++j)
+        activate(state, ex_port_entries[j], ex_port_count[j], 0, state->port_list[j]);
+    activate(state, ex_shown_entries, EX_SHOWN_OUT - 1, 0, state->shown_list);
+}
+
+static int set_up(psa_state *state) {
+    psa_exact *const run = state->run;
+    const int one = NL * (NL + EX_NU + 1);
+    for (int i = 0; i < EX_NP; ++i)
+        for (int lane = 0; lane < PSA_LANES; ++lane)
+            SET_LANE(state->p[i], lane, run->p[i * run->sets + (lane < run->sets ? lane : 0)]);
+    for (int i = 0; i < EX_NX; ++i) {
+        state->nominal[i] = run->nominal[i] + REAL(0.0);
+        for (int lane = 0; lane < PSA_LANES; ++lane)
+            SET_LANE(state->x[i], lane, run->x0[i * run->sets + (lane < run->sets ? lane : 0)]);
+    }
+    for (int i = 0; i < NL; ++i) {
+        state->scale[i] = run->nominal[ex_linear[i]];
+        state->inverse_nominal[i] = 1.0 / state->nominal[ex_linear[i]];
+    }
+    state->tolerance = run->tolerance + REAL(0.0);
+    psa_prepare(state->p, state->k);
+    for (int i = 0; i < EX_NP; ++i) state->column_of[i] = -1;
+    for (int c = 0; c < run->count; ++c)
+        if (run->which[c] >= 0) state->column_of[run->which[c]] = c;
+    activate_all(state);
+    int theta[EX_NTHETA + 1];
+    state->thetas = 0;
+    for (int m = 0; m < EX_NTHETA; ++m)
+        if (state->column_of[ex_theta[m]] >= 0) {
+            theta[state->thetas] = m;
+            state->theta_column[state->thetas++] = state->column_of[ex_theta[m]];
+        }
+    state->ladders = calloc((size_t)(run->lengths * PSA_LANES), sizeof(psa_ladder));
+    const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
+    state->levels = calloc(levels * (size_t)(1 + state->thetas), sizeof(psa_level));
+    state->ready = calloc(levels, 1);
+    real *const plain = malloc((size_t)one * sizeof(real));
+    real *const slopes = malloc((size_t)(one * (EX_NTHETA + 1)) * sizeof(real));
+    double *const lin = malloc((size_t)(one * (state->thetas + 1)) * sizeof(double));
+    int status = !state->ladders || !state->levels || !state->ready || !plain || !slopes || !lin ? 2 : 0;
+    if (status == 0) {
+        psa_linear(state->p, plain);
+        if (state->thetas > 0) psa_linear_slopes(state->p, slopes);
+    }
+    for (int lane = 0; lane < PSA_LANES && status == 0; ++lane) {
+        for (int i = 0; i < one; ++i) {
+            lin[i] = LANE(plain[i], lane);
+            for (int m = 0; m < state->thetas; ++m)
+                lin[(m + 1) * one + i] = LANE(slopes[theta[m] * one + i], lane);
+        }
+        for (int step = 0; step < run->lengths && status == 0; ++step)
+            status = build_ladder(state->ladders + step * PSA_LANES + lane, state->thetas, lin, state->scale,
+                                  run->length[step], run->finest + 2);
+    }
+    free(plain);
+    free(slopes);
+    free(lin);
+#if PSA_LANES == 1
+    if (run->count > 0 && status == 0) {
+        const int nb = state->blocks = (run->count + COLUMNS - 1) / COLUMNS;
+        const size_t rows = EX_NX + EX_NPORT + NODES * (EX_NX + EX_NPORT + 1) + 8 * EX_NX + 2;
+        column *const memory = calloc(rows * (size_t)nb, sizeof(column));
+        if (!memory) return 2;
+        state->s = memory;
+        state->sport = ROW(state->s, EX_NX);
+        state->node = ROW(state->sport, EX_NPORT);
+        state->snode_port = ROW(state->node, NODES * EX_NX);
+        state->scratch = ROW(state->snode_port, NODES * (EX_NPORT + 1));
+        for (int i = 0; i < EX_NX; ++i)
+            memcpy(ROW(state->s, i), run->s0 + i * run->count, sizeof(double) * (size_t)run->count);
+    }
+#endif
+    return status;
+}
+
+static void tear_down(psa_state *state) {
+    if (state->ladders)
+        for (int i = 0; i < state->run->lengths * PSA_LANES; ++i) free(state->ladders[i].blocks);
+    free(state->ladders);
+    free(state->levels);
+    free(state->ready);
+    free(state->s);
+}
+
+int psa_run_exact(psa_exact *run) {
+    psa_state *const state = calloc(1, sizeof *state);
+    if (!state) return 2;
+    state->run = run;
+    run->steps = run->rejected = run->forced = 0;
+    int status = set_up(state);
+    state->t = run->t[0] + REAL(0.0);
+    if (status == 0) {
+        start_ports(state, run->v);
+        status = write_sample(state, 0);
+    }
+    int level = run->coarsest;
+    for (long sample = 0; sample + 1 < run->samples && status == 0; ++sample) {
+        if (run->zero_order_hold && sample > 0) start_ports(state, run->v + sample * EX_NU);
+        level = level < run->coarsest ? run->coarsest : level;
+        status = next_sample(state, sample, &level);
+        if (status == 0) status = write_sample(state, sample + 1);
+    }
+    run->t_failed = LANE(state->t, 0);
+    tear_down(state);
+    free(state);
+    return status;
+}

@@ -1,0 +1,331 @@
+/* The linear part's exact steps, and their derivatives, for the lengths h, h/2, h/4, ...
+
+   L' = M L + B v + c + sum_i e_i n_i over a step of length d, with s = tau / d between 0 and 1:
+
+       L(d) = (I + F) L(0) + a_1 v(0) + a_2 (v(d) - v(0)) + c_1 + sum_i (q_1 n_0 + q_2 n_1 + q_3 n_2)
+
+   for v linear in s and n_i = n_0 + n_1 s + n_2 s^2, where F = exp(M d) - I and, for a column b of B, c or
+   the unit matrix, b_m = (m-1)! d phi_m(M d) b. A Taylor polynomial gives them for a length on which M is
+   small; each doubling of the length follows from
+
+       F <- 2 F + F F,  b_1 <- 2 b_1 + F b_1,  b_2 <- (2 b_2 + F b_2 + b_1) / 2,
+       b_3 <- (2 b_3 + F b_3 + b_1 + 2 b_2) / 4.
+
+   F instead of exp(M d) keeps the digits of what is slow. Scaling and squaring: Higham, SIAM J. Matrix Anal.
+   Appl. 26 (2005) 1179; the integrals: van Loan, IEEE Trans. Autom. Control 23 (1978) 395; derivatives by the
+   product rule at every step: Al-Mohy and Higham, SIAM J. Matrix Anal. Appl. 30 (2009) 1639.
+
+   A port that varies along a driver u as sigma u(t) has the response sigma dF/dS with M + S e_i e_u^T: another
+   direction, whose derivatives by the parameters are the mixed ones. */
+#ifndef PSA_EXACT_LEVELS_H
+#define PSA_EXACT_LEVELS_H
+
+#include <stdlib.h>
+
+#include "exact_math.h"
+
+#define NL EX_NL
+#define NV (2 * EX_NU + 1 + 3 * EX_NPORT) /* vectors beside F: a_1, a_2, c_1, q_1, q_2, q_3 */
+#define TAYLOR 12                         /* terms; enough to 1e-17 where |M d| <= 1/4 */
+#define SMALL 0.25
+#define DEEPEST 60 /* halvings to where M is small */
+
+/* F and the vectors of one direction (or of none) at one length; row-major */
+typedef struct {
+    double f[NL * NL];
+    double v[NV][NL];
+} psa_block;
+
+#if PSA_LANES == 1
+#define ROWS ((NL + 3) / 4 * 4) /* rows of L in whole vectors, the last ones 0 */
+#else
+#define ROWS NL
+#endif
+
+/* What a step of one length needs. Of each node (the whole, the half and the quarter of the step): F, a_1, a_2
+   (over the step's change of v), c_1, and each port's weights of its values at the start, the half and the
+   end. Of each chord: the response to sigma u(t) beyond what these weights see of it. */
+typedef struct {
+    real f[NL][ROWS], a1[EX_NU + 1][ROWS], a2[EX_NU + 1][ROWS], c[ROWS], w[EX_NPORT + 1][3][ROWS];
+} psa_node; /* by columns */
+
+typedef struct {
+    psa_node node[3]; /* whole, half, quarter */
+    real chord_f[EX_NCH + 1][NL][ROWS], chord_a1[EX_NCH + 1][EX_NU + 1][ROWS],
+        chord_a2[EX_NCH + 1][EX_NU + 1][ROWS], chord_c[EX_NCH + 1][ROWS];
+} psa_level;
+
+/* Directions: [chord or 0][parameter or 0]; the algebra in which parameters and chords square to zero */
+#define BLOCK(blocks, count, chord, theta) ((blocks) + (chord) * ((count) + 1) + (theta))
+
+static void multiply_add(const double *a, const double *b, double *out) {
+    for (int i = 0; i < NL; ++i)
+        for (int k = 0; k < NL; ++k) {
+            const double factor = a[i * NL + k];
+            if (factor != 0.0)
+                for (int j = 0; j < NL; ++j) out[i * NL + j] += factor * b[k * NL + j];
+        }
+}
+
+static void apply_add(const double *a, const double *x, double factor, double *out) {
+    for (int i = 0; i < NL; ++i) {
+        double sum = 0.0;
+        for (int k = 0; k < NL; ++k) sum += a[i * NL + k] * x[k];
+        out[i] += factor * sum;
+    }
+}
+
+/* The pairs of directions whose product belongs to direction (chord, theta) */
+static int pairs_of(int chord, int theta, int pair[4][4]) {
+    int n = 0;
+    for (int c = 0; c <= (chord > 0); ++c)
+        for (int t = 0; t <= (theta > 0); ++t) {
+            pair[n][0] = c ? chord : 0, pair[n][1] = t ? theta : 0;
+            pair[n][2] = c ? 0 : chord, pair[n][3] = t ? 0 : theta;
+            ++n;
+        }
+    return n;
+}
+
+/* One more Taylor term: next = Z previous / divisor in every direction; z are M d and its derivatives */
+static void next_term(int count, const double *z, const double *previous, double divisor, int columns,
+                      double *next) {
+    int pair[4][4];
+    for (int c = 0; c <= EX_NCH; ++c)
+        for (int t = 0; t <= count; ++t) {
+            double *out = next + (c * (count + 1) + t) * NL * columns;
+            memset(out, 0, sizeof(double) * NL * (size_t)columns);
+            for (int n = pairs_of(c, t, pair) - 1; n >= 0; --n) {
+                const double *a = z + (pair[n][0] * (count + 1) + pair[n][1]) * NL * NL;
+                const double *b = previous + (pair[n][2] * (count + 1) + pair[n][3]) * NL * columns;
+                for (int i = 0; i < NL; ++i)
+                    for (int k = 0; k < NL; ++k) {
+                        const double factor = a[i * NL + k] / divisor;
+                        if (factor != 0.0)
+                            for (int j = 0; j < columns; ++j)
+                                out[i * columns + j] += factor * b[k * columns + j];
+                    }
+            }
+        }
+}
+
+/* One channel's vectors of a length: their place in a block, how many, and b in all directions */
+static void start_channel(int count, const double *z, double d, const double *b, int first, int orders,
+                          int stride, psa_block *blocks) {
+    const size_t size = (size_t)(EX_NCH + 1) * (size_t)(count + 1) * NL;
+    double *const term = malloc(2 * size * sizeof(double)), *const other = term + size;
+    for (int m = 1; m <= orders; ++m) {
+        memset(term, 0, size * sizeof(double));
+        for (int t = 0; t <= count; ++t)
+            for (int i = 0; i < NL; ++i) term[t * NL + i] = b[t * NL + i] * d / m;
+        /* (m-1)! / m! = 1/m; the following terms divide by k + m */
+        for (int k = 0; k <= TAYLOR; ++k) {
+            for (int c = 0; c <= EX_NCH; ++c)
+                for (int t = 0; t <= count; ++t) {
+                    double *const v = BLOCK(blocks, count, c, t)->v[first + (m - 1) * stride];
+                    for (int i = 0; i < NL; ++i) v[i] += term[(c * (count + 1) + t) * NL + i];
+                }
+            next_term(count, z, term, k + 1 + m, 1, other);
+            memcpy(term, other, size * sizeof(double));
+        }
+    }
+    free(term);
+}
+
+#define A1(j) (j)
+#define A2(j) (EX_NU + (j))
+#define C1 (2 * EX_NU)
+#define Q(order, i) (2 * EX_NU + 1 + (order) * EX_NPORT + (i))
+
+/* F and all vectors of the length d, where M d is small. `lin` are M, B, c and their derivatives by the
+   parameters, each (NL * (NL + EX_NU + 1)) numbers, row-major one after the other. */
+static void start_blocks(int count, const double *lin, double d, psa_block *blocks) {
+    const size_t matrices = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
+    double *const z = calloc(3 * matrices * NL * NL, sizeof(double));
+    double *term = z + matrices * NL * NL, *other = term + matrices * NL * NL;
+    const int one = NL * (NL + EX_NU + 1);
+    double b[(EX_NTHETA + 1) * NL];
+    memset(blocks, 0, matrices * sizeof *blocks);
+    for (int t = 0; t <= count; ++t)
+        for (int i = 0; i < NL * NL; ++i) z[t * NL * NL + i] = lin[t * one + i] * d;
+    for (int c = 0; c < EX_NCH; ++c)
+        z[(c + 1) * (count + 1) * NL * NL + ex_chord_row[c] * NL + ex_chord_driver[c]] = d;
+    memcpy(term, z, matrices * NL * NL * sizeof(double));
+    for (int k = 1; k <= TAYLOR + 1; ++k) {
+        for (int c = 0; c <= EX_NCH; ++c)
+            for (int t = 0; t <= count; ++t)
+                for (int i = 0; i < NL * NL; ++i)
+                    BLOCK(blocks, count, c, t)->f[i] += term[(c * (count + 1) + t) * NL * NL + i];
+        next_term(count, z, term, k + 1, NL, other);
+        double *const swap = term;
+        term = other;
+        other = swap;
+    }
+    for (int j = 0; j < EX_NU; ++j) {
+        for (int t = 0; t <= count; ++t)
+            for (int i = 0; i < NL; ++i) b[t * NL + i] = lin[t * one + NL * NL + i * EX_NU + j];
+        start_channel(count, z, d, b, A1(j), 2, EX_NU, blocks);
+    }
+    for (int t = 0; t <= count; ++t)
+        for (int i = 0; i < NL; ++i) b[t * NL + i] = lin[t * one + NL * (NL + EX_NU) + i];
+    start_channel(count, z, d, b, C1, 1, 0, blocks);
+    for (int j = 0; j < EX_NPORT; ++j) {
+        memset(b, 0, sizeof b);
+        b[ex_port_row[j]] = 1.0;
+        start_channel(count, z, d, b, Q(0, j), 3, EX_NPORT, blocks);
+    }
+    free(z);
+}
+
+/* Twice the length, in one direction */
+static void double_direction(int count, const psa_block *from, int c, int t, psa_block *to) {
+    int pair[4][4];
+    const psa_block *const own = BLOCK(from, count, c, t);
+    for (int i = 0; i < NL * NL; ++i) to->f[i] = 2.0 * own->f[i];
+    for (int k = 0; k < NV; ++k)
+        for (int i = 0; i < NL; ++i) to->v[k][i] = 2.0 * own->v[k][i];
+    for (int n = pairs_of(c, t, pair) - 1; n >= 0; --n) {
+        const psa_block *const a = BLOCK(from, count, pair[n][0], pair[n][1]);
+        const psa_block *const b = BLOCK(from, count, pair[n][2], pair[n][3]);
+        multiply_add(a->f, b->f, to->f);
+        for (int k = 0; k < NV; ++k) apply_add(a->f, b->v[k], 1.0, to->v[k]);
+    }
+    for (int j = 0; j < EX_NU; ++j)
+        for (int i = 0; i < NL; ++i) to->v[A2(j)][i] = 0.5 * (to->v[A2(j)][i] + own->v[A1(j)][i]);
+    for (int j = 0; j < EX_NPORT; ++j)
+        for (int i = 0; i < NL; ++i) {
+            const double q1 = own->v[Q(0, j)][i], q2 = own->v[Q(1, j)][i];
+            to->v[Q(2, j)][i] = 0.25 * (to->v[Q(2, j)][i] + q1 + 2.0 * q2);
+            to->v[Q(1, j)][i] = 0.5 * (to->v[Q(1, j)][i] + q1);
+        }
+}
+
+/* A step length h, its halves, and what has been asked of them */
+typedef struct {
+    int count;          /* parameters by which it is differentiated */
+    int depth;          /* levels below h that are there */
+    psa_block *blocks;  /* [depth + 1][EX_NCH + 1][count + 1] */
+} psa_ladder;
+
+static const psa_block *rung(const psa_ladder *ladder, int level) {
+    const size_t each = (size_t)(EX_NCH + 1) * (size_t)(ladder->count + 1);
+    return ladder->blocks + each * (size_t)level;
+}
+
+/* Fill a ladder down to `levels` at least; 0, or 1 where numbers are not finite or memory is out. `scale` are
+   typical sizes of the states, by which M is balanced. */
+static int build_ladder(psa_ladder *ladder, int count, const double *lin, const double *scale, double h,
+                        int levels) {
+    const int one = NL * (NL + EX_NU + 1);
+    const size_t each = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
+    double norm = 0.0;
+    for (int i = 0; i < NL; ++i) {
+        double sum = 0.0;
+        for (int j = 0; j < NL; ++j) sum += fabs(lin[i * NL + j]) * scale[j] / scale[i];
+        norm = fmax(norm, sum);
+    }
+    for (int i = 0; i < one * (count + 1); ++i)
+        if (!isfinite(lin[i])) return 1;
+    int depth = levels;
+    while (depth < DEEPEST && !(ldexp(norm * h, -depth) <= SMALL)) ++depth;
+    ladder->count = count;
+    ladder->depth = depth;
+    ladder->blocks = malloc((size_t)(depth + 1) * each * sizeof(psa_block));
+    double *const balanced = malloc((size_t)(one * (count + 1)) * sizeof(double));
+    if (!ladder->blocks || !balanced) return 1;
+    for (int t = 0; t <= count; ++t)
+        for (int i = 0; i < NL; ++i) {
+            for (int j = 0; j < NL; ++j)
+                balanced[t * one + i * NL + j] = lin[t * one + i * NL + j] * scale[j] / scale[i];
+            for (int j = 0; j <= EX_NU; ++j) {
+                const int at = t * one + NL * NL + (j < EX_NU ? i * EX_NU + j : NL * EX_NU + i);
+                balanced[at] = lin[at] / scale[i];
+            }
+        }
+    start_blocks(count, balanced, ldexp(h, -depth), (psa_block *)rung(ladder, depth));
+    for (int level = depth - 1; level >= 0; --level)
+        for (int c = 0; c <= EX_NCH; ++c)
+            for (int t = 0; t <= count; ++t)
+                double_direction(count, rung(ladder, level + 1), c, t,
+                                 (psa_block *)BLOCK(rung(ladder, level), count, c, t));
+    free(balanced);
+    return 0;
+}
+
+/* Weights of a port's values at start, half and end in the response at the node theta of the step, from the
+   vectors of the node's own length */
+static void port_weights(const psa_block *b, int j, double theta, double out[3][NL]) {
+    for (int i = 0; i < NL; ++i) {
+        const double q1 = b->v[Q(0, j)][i], q2 = theta * b->v[Q(1, j)][i];
+        const double q3 = theta * theta * b->v[Q(2, j)][i];
+        out[0][i] = q1 - 3.0 * q2 + 2.0 * q3;
+        out[1][i] = 4.0 * (q2 - q3);
+        out[2][i] = 2.0 * q3 - q2;
+    }
+}
+
+/* Write direction t of a level into one lane; the balance is taken back */
+static void fill_level(const psa_ladder *ladder, int level, int t, const double *scale, int lane,
+                       psa_level *out) {
+    const int count = ladder->count;
+    static const double THETA[3] = {1.0, 0.5, 0.25};
+    double w[3][NL], dw[3][NL];
+    for (int n = 0; n < 3; ++n) {
+        const psa_block *const b = BLOCK(rung(ladder, level + n), count, 0, t);
+        psa_node *const node = out->node + n;
+        for (int i = 0; i < NL; ++i) {
+            for (int j = 0; j < NL; ++j)
+                SET_LANE(node->f[j][i], lane, b->f[i * NL + j] * scale[i] / scale[j]);
+            for (int j = 0; j < EX_NU; ++j) {
+                SET_LANE(node->a1[j][i], lane, b->v[A1(j)][i] * scale[i]);
+                SET_LANE(node->a2[j][i], lane, THETA[n] * b->v[A2(j)][i] * scale[i]);
+            }
+            SET_LANE(node->c[i], lane, b->v[C1][i] * scale[i]);
+        }
+        for (int j = 0; j < EX_NPORT; ++j) {
+            /* a port adds to its row in physical units: 1 is 1/scale in the balanced ones */
+            const double unit = 1.0 / scale[ex_port_row[j]];
+            port_weights(b, j, THETA[n], w);
+            for (int q = 0; q < 3; ++q)
+                for (int i = 0; i < NL; ++i)
+                    SET_LANE(node->w[j][q][i], lane, w[q][i] * unit * scale[i]);
+        }
+    }
+    for (int c = 0; c < EX_NCH; ++c) {
+        const int port = ex_chord_port[c], u = ex_chord_driver[c];
+        const psa_block *const s = BLOCK(rung(ladder, level), count, c + 1, t);
+        const psa_block *node[2], *base[2];
+        for (int n = 0; n < 2; ++n) {
+            node[n] = BLOCK(rung(ladder, level + n), count, 0, t);
+            base[n] = BLOCK(rung(ladder, level + n), count, 0, 0);
+        }
+        /* w belongs to no direction, dw to t; u(t) at the half and the end from L, v and c alone */
+        port_weights(base[0], port, 1.0, w);
+        port_weights(node[0], port, 1.0, dw);
+        const double unit = scale[u] / scale[ex_port_row[port]];
+        for (int i = 0; i < NL; ++i) {
+            for (int j = 0; j < NL; ++j) {
+                double seen = j == u ? dw[0][i] + dw[1][i] + dw[2][i] : 0.0;
+                seen += dw[1][i] * base[1]->f[u * NL + j] + dw[2][i] * base[0]->f[u * NL + j];
+                if (t > 0) seen += w[1][i] * node[1]->f[u * NL + j] + w[2][i] * node[0]->f[u * NL + j];
+                SET_LANE(out->chord_f[c][j][i], lane,
+                         (s->f[i * NL + j] - seen) * unit * scale[i] / scale[j]);
+            }
+            for (int j = 0; j < EX_NU; ++j) {
+                double one = dw[1][i] * base[1]->v[A1(j)][u] + dw[2][i] * base[0]->v[A1(j)][u];
+                double two = dw[1][i] * 0.5 * base[1]->v[A2(j)][u] + dw[2][i] * base[0]->v[A2(j)][u];
+                if (t > 0) {
+                    one += w[1][i] * node[1]->v[A1(j)][u] + w[2][i] * node[0]->v[A1(j)][u];
+                    two += w[1][i] * 0.5 * node[1]->v[A2(j)][u] + w[2][i] * node[0]->v[A2(j)][u];
+                }
+                SET_LANE(out->chord_a1[c][j][i], lane, (s->v[A1(j)][i] - one) * unit * scale[i]);
+                SET_LANE(out->chord_a2[c][j][i], lane, (s->v[A2(j)][i] - two) * unit * scale[i]);
+            }
+            double rest = dw[1][i] * base[1]->v[C1][u] + dw[2][i] * base[0]->v[C1][u];
+            if (t > 0) rest += w[1][i] * node[1]->v[C1][u] + w[2][i] * node[0]->v[C1][u];
+            SET_LANE(out->chord_c[c][i], lane, (s->v[C1][i] - rest) * unit * scale[i]);
+        }
+    }
+}
+
+#endif

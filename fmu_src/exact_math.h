@@ -1,0 +1,123 @@
+/* Numbers or lanes of numbers (PSA_LANES of them, the compiler's vector extension), and the functions of
+   them that generated code calls. A lane has the same bits as a number by itself: exp and log are written
+   out here, from operations that IEEE 754 rounds correctly; all others go lane by lane to libm. */
+#ifndef PSA_EXACT_MATH_H
+#define PSA_EXACT_MATH_H
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#ifndef PSA_LANES
+#define PSA_LANES 1
+#endif
+
+#if PSA_LANES == 1
+typedef double real;
+typedef int64_t bits;
+typedef uint64_t ubits;
+#define LANE(r, i) ((void)(i), (r))
+#define SET_LANE(r, i, value) ((void)(i), (r) = (value))
+#define REAL(c) (c)
+#else
+typedef double real __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
+typedef int64_t bits __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
+typedef uint64_t ubits __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
+#define LANE(r, i) ((r)[i])
+#define SET_LANE(r, i, value) ((r)[i] = (value))
+#define REAL(c) (c - (real){0})
+#endif
+
+static inline bits bits_of(real x) {
+    bits b;
+    memcpy(&b, &x, sizeof b);
+    return b;
+}
+
+static inline real real_of(bits b) {
+    real x;
+    memcpy(&x, &b, sizeof x);
+    return x;
+}
+
+/* a where the mask is set, else b */
+static inline real choose(bits mask, real a, real b) {
+    return real_of((mask & bits_of(a)) | (~mask & bits_of(b)));
+}
+
+#if PSA_LANES == 1
+#define MASK(condition) (-(int64_t)(condition))
+#define EACH_LANE(name, call)                                                                           \
+    static inline real name(real x) { return call(x); }
+#else
+#define MASK(condition) ((bits)(condition))
+#define EACH_LANE(name, call)                                                                           \
+    static inline real name(real x) {                                                                   \
+        real y = x;                                                                                     \
+        for (int i = 0; i < PSA_LANES; ++i) y[i] = call(x[i]);                                          \
+        return y;                                                                                       \
+    }
+#endif
+
+EACH_LANE(v_sqrt, sqrt)
+EACH_LANE(v_sin, sin)
+EACH_LANE(v_cos, cos)
+EACH_LANE(v_tan, tan)
+EACH_LANE(v_atan, atan)
+EACH_LANE(v_tanh, tanh)
+
+static inline real v_fabs(real x) { return real_of(bits_of(x) & (bits_of(REAL(0.0)) + INT64_MAX)); }
+static inline real v_fmax(real a, real b) { return choose(MASK(a < b), b, a); }
+static inline real v_fmin(real a, real b) { return choose(MASK(b < a), b, a); }
+static inline real v_less(real a, real b) { return choose(MASK(a < b), REAL(1.0), REAL(0.0)); }
+static inline real v_less_equal(real a, real b) { return choose(MASK(a <= b), REAL(1.0), REAL(0.0)); }
+static inline real v_equal(real a, real b) { return choose(MASK(a == b), REAL(1.0), REAL(0.0)); }
+static inline real v_unequal(real a, real b) { return choose(MASK(a != b), REAL(1.0), REAL(0.0)); }
+static inline real v_not(real a) { return choose(MASK(a == 0.0), REAL(1.0), REAL(0.0)); }
+static inline real v_and(real a, real b) { return choose(MASK(a != 0.0) & MASK(b != 0.0), REAL(1.0), REAL(0.0)); }
+static inline real v_or(real a, real b) { return choose(MASK(a != 0.0) | MASK(b != 0.0), REAL(1.0), REAL(0.0)); }
+static inline real v_if(real condition, real x) { return choose(MASK(condition != 0.0), x, REAL(0.0)); }
+static inline real v_sign(real x) { return v_less(REAL(0.0), x) - v_less(x, REAL(0.0)); }
+
+/* exp(x) to one unit in the last place, between -708 and 709, where it ends: x = n ln 2 + r, |r| <= ln(2)/2,
+   and the Taylor polynomial of degree 13 in Estrin's order. */
+static inline real v_exp(real x) {
+    const double shift = 6755399441055744.0; /* 1.5 * 2^52: what is added to it is rounded to integers */
+    const real y = choose(MASK(x < -708.0), REAL(-708.0), choose(MASK(x > 709.0), REAL(709.0), x));
+    const real shifted = y * 1.4426950408889634074 + shift;
+    const real n = shifted - shift;
+    const real r = (y - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10;
+    const real r2 = r * r, r4 = r2 * r2, r8 = r4 * r4;
+    const real a = (1.0 + r) + r2 * (0.5 + r * (1.0 / 6.0));
+    const real b = (1.0 / 24.0 + r * (1.0 / 120.0)) + r2 * (1.0 / 720.0 + r * (1.0 / 5040.0));
+    const real c = (1.0 / 40320.0 + r * (1.0 / 362880.0)) + r2 * (1.0 / 3628800.0 + r * (1.0 / 39916800.0));
+    const real d = 1.0 / 479001600.0 + r * (1.0 / 6227020800.0);
+    const real p = (a + r4 * b) + r8 * (c + r4 * d);
+    const bits power = (bits)((ubits)(bits_of(shifted) - bits_of(REAL(shift)) + 1023) << 52);
+    return p * real_of(power);
+}
+
+/* log(x) to one unit in the last place for normal x > 0, not a number elsewhere: the algorithm of
+   fdlibm's e_log.c (Sun Microsystems 1993). */
+static inline real v_log(real x) {
+    const int64_t half = 0x3FE6A09E667F3BCDLL; /* the bits of sqrt(1/2) */
+    const bits b = bits_of(x), e = (b - half) >> 52;
+    const real m = real_of(b - (bits)((ubits)e << 52)); /* between sqrt(1/2) and sqrt(2) */
+#if PSA_LANES == 1
+    const real k = (real)e;
+#else
+    const real k = __builtin_convertvector(e, real);
+#endif
+    const real f = m - 1.0, s = f / (2.0 + f), z = s * s, w = z * z;
+    const real odd = z * (6.666666666666735130e-01 +
+                          w * (2.857142874366239149e-01 +
+                               w * (1.818357216161805012e-01 + w * 1.479819860511658591e-01)));
+    const real even = w * (3.999999999940941908e-01 +
+                           w * (2.222219843214978396e-01 + w * 1.531383769920937332e-01));
+    const real square = 0.5 * f * f;
+    const real y = k * 6.93147180369123816490e-01 -
+                   ((square - (s * (square + (odd + even)) + k * 1.90821492927058770002e-10)) - f);
+    return choose(MASK(x > 0.0), y, REAL(NAN));
+}
+
+#endif

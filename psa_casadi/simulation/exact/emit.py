@@ -1,0 +1,252 @@
+"""CasADi functions printed as C for exact steps: one text for a number and for lanes of numbers.
+
+What depends on the parameters alone is computed once for a run and kept in `k`. Powers of one base
+whose exponents differ by halves share one exponential; a division by a parameter is a product.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+
+from psa_casadi.component import Expression
+
+#: (operation, arguments) or ("x", index), ("c", value), ...; equal nodes are one number.
+_Node = tuple[object, ...]
+
+_BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
+_CALLS = {
+    ca.OP_SQRT: "v_sqrt",
+    ca.OP_EXP: "v_exp",
+    ca.OP_LOG: "v_log",
+    ca.OP_FABS: "v_fabs",
+    ca.OP_FMIN: "v_fmin",
+    ca.OP_FMAX: "v_fmax",
+    ca.OP_SIN: "v_sin",
+    ca.OP_COS: "v_cos",
+    ca.OP_TAN: "v_tan",
+    ca.OP_ATAN: "v_atan",
+    ca.OP_TANH: "v_tanh",
+    ca.OP_SIGN: "v_sign",
+    ca.OP_LT: "v_less",
+    ca.OP_LE: "v_less_equal",
+    ca.OP_EQ: "v_equal",
+    ca.OP_NE: "v_unequal",
+    ca.OP_NOT: "v_not",
+    ca.OP_AND: "v_and",
+    ca.OP_OR: "v_or",
+    ca.OP_IF_ELSE_ZERO: "v_if",
+}
+_POWERS = (ca.OP_POW, ca.OP_CONSTPOW)
+_LEAVES = ("x", "v", "t", "w", "p", "c")
+
+
+class Unprintable(Exception):  # noqa: N818 - the model is stepped instead, which is no mistake
+    """An operation that these steps do not have."""
+
+
+@dataclass
+class _Graph:
+    """Nodes by number; a node's arguments have smaller numbers. `fixed` ones need no state."""
+
+    nodes: list[_Node] = field(default_factory=list)
+    numbers: dict[_Node, int] = field(default_factory=dict)
+    fixed: list[bool] = field(default_factory=list)
+
+    def add(self, *node: object) -> int:
+        if node not in self.numbers:
+            leaf = node[0] in _LEAVES
+            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in node[1:])  # type: ignore[call-overload]
+            self.numbers[node] = len(self.nodes)
+            self.nodes.append(node)
+            self.fixed.append(fixed)
+        return self.numbers[node]
+
+    def constant(self, value: float) -> int:
+        return self.add("c", float(value))
+
+    def value(self, number: int) -> float | None:
+        node = self.nodes[number]
+        return float(node[1]) if node[0] == "c" else None  # type: ignore[arg-type]
+
+    def operation(self, op: int, *arguments: int) -> int:
+        if op == ca.OP_DIV and self.fixed[arguments[1]] and not self.fixed[arguments[0]]:
+            return self.add("*", arguments[0], self.add("/", self.constant(1.0), arguments[1]))
+        if op in _BINARY:
+            return self.add(_BINARY[op], *arguments)
+        if op in _POWERS:
+            return self._power(*arguments)
+        one = arguments[0]
+        simple: dict[int, Callable[[], int]] = {
+            ca.OP_SQ: lambda: self.add("*", one, one),
+            ca.OP_TWICE: lambda: self.add("+", one, one),
+            ca.OP_NEG: lambda: self.add("neg", one),
+            ca.OP_INV: lambda: self.add("/", self.constant(1.0), one),
+            ca.OP_ASSIGN: lambda: one,
+        }
+        if op in simple:
+            return simple[op]()
+        if op in _CALLS:
+            return self.add(_CALLS[op], *arguments)
+        raise Unprintable(f"operation {op}")
+
+    def _power(self, base: int, exponent: int) -> int:
+        """Return base^exponent; base^(e + k/2) from base^e where that is there."""
+        symbol, factor, shift = self._affine(exponent)
+        if symbol is None:
+            if shift == round(shift) and 0 < shift <= 16:
+                return self._whole(base, int(shift))
+            return self.add("v_exp", self.add("*", self.add("v_log", base), exponent))
+        halves = 2.0 * shift
+        rest = shift - 0.5 * round(halves)
+        scaled = symbol if factor == 1.0 else self.add("*", symbol, self.constant(factor))
+        reduced = scaled if rest == 0.0 else self.add("+", scaled, self.constant(rest))
+        first = self.add("v_exp", self.add("*", self.add("v_log", base), reduced))
+        return self._shifted(first, base, round(halves))
+
+    def _shifted(self, power: int, base: int, halves: int) -> int:
+        """Return power base^(halves/2)."""
+        factor = self._whole(base, abs(halves) // 2) if abs(halves) > 1 else None
+        if halves % 2:
+            root = self.add("v_sqrt", base)
+            factor = root if factor is None else self.add("*", factor, root)
+        if factor is None:
+            return power
+        return self.add("*" if halves > 0 else "/", power, factor)
+
+    def _whole(self, base: int, exponent: int) -> int:
+        if exponent == 1:
+            return base
+        half = self._whole(base, exponent // 2)
+        square = self.add("*", half, half)
+        return self.add("*", square, base) if exponent % 2 else square
+
+    def _affine(self, number: int) -> tuple[int | None, float, float]:
+        """Return (symbol, factor, shift) of an exponent factor symbol + shift."""
+        node = self.nodes[number]
+        if node[0] == "c":
+            return None, 0.0, float(node[1])  # type: ignore[arg-type]
+        if node[0] == "neg":
+            symbol, factor, shift = self._affine(int(node[1]))  # type: ignore[call-overload]
+            return symbol, -factor, -shift
+        if node[0] in ("+", "-", "*", "/"):
+            a, b = (self._affine(int(q)) for q in node[1:])  # type: ignore[call-overload]
+            sign = 1.0 if node[0] == "+" else -1.0
+            if node[0] in ("+", "-") and (a[0] is None or b[0] is None or a[0] == b[0]):
+                symbol = a[0] if a[0] is not None else b[0]
+                return symbol, a[1] + sign * b[1], a[2] + sign * b[2]
+            if node[0] == "*" and a[0] is None:
+                return b[0], a[2] * b[1], a[2] * b[2]
+            if node[0] == "*" and b[0] is None:
+                return a[0], b[2] * a[1], b[2] * a[2]
+            if node[0] == "/" and b[0] is None and b[2] != 0.0:
+                return a[0], a[1] / b[2], a[2] / b[2]
+        return number, 1.0, 0.0
+
+
+class Printer:
+    """Prints functions of (t, x, v, w, p) and collects what depends on p alone in `k`."""
+
+    def __init__(self, arguments: Mapping[str, Expression]) -> None:
+        self._arguments = dict(arguments)
+        self._graph = _Graph()
+        self._kept: dict[int, int] = {}
+        self.functions: list[str] = []
+
+    def function(self, name: str, outputs: Sequence[Expression]) -> None:
+        """Print `static void name(t, x, v, w, k, out)` that fills `out` with all the outputs."""
+        numbers = self._numbers(outputs)
+        lines = self._body(numbers, fixed=False)
+        lines += [f"    out[{i}] = {self._name(n)};" for i, n in enumerate(numbers)]
+        head = (
+            f"static inline void {name}(real t, const real *x, const real *v, real w,"
+            " const real *k, real *out) {"
+        )
+        self.functions.append("\n".join([head, "    (void)t, (void)x, (void)v, (void)w, (void)k;",
+                                         *lines, "}", ""]))
+
+    def of_parameters(self, name: str, outputs: Sequence[Expression]) -> None:
+        """Print `static void name(p, out)` for outputs that depend on the parameters alone."""
+        numbers = self._numbers(outputs)
+        lines = self._body(numbers, fixed=True)
+        lines += [f"    out[{i}] = {self._fixed_name(n)};" for i, n in enumerate(numbers)]
+        self.functions.append(
+            "\n".join([f"static void {name}(const real *p, real *out) {{", "    (void)p;",
+                       *lines, "}", ""])
+        )
+
+    def kept(self) -> tuple[int, str]:
+        """Return the size of `k` and the function `psa_prepare(p, k)`; print it last."""
+        numbers = list(self._kept)
+        lines = self._body(numbers, fixed=True)
+        lines += [f"    k[{i}] = {self._fixed_name(n)};" for n, i in self._kept.items()]
+        head = "static void psa_prepare(const real *p, real *k) {"
+        return len(numbers), "\n".join([head, "    (void)p, (void)k;", *lines, "}", ""])
+
+    def _numbers(self, outputs: Sequence[Expression]) -> list[int]:
+        names = list(self._arguments)
+        whole = ca.cse([ca.densify(ca.vertcat(*[ca.vec(ca.SX(o)) for o in outputs]))])
+        function = ca.Function("f", list(self._arguments.values()), whole)
+        slots: dict[int, int] = {}
+        found = [0] * function.numel_out(0)
+        for k in range(function.n_instructions()):
+            op = function.instruction_id(k)
+            if op == ca.OP_CONST:
+                slots[function.instruction_output(k)[0]] = self._graph.constant(
+                    function.instruction_constant(k)
+                )
+            elif op == ca.OP_INPUT:
+                argument, element = function.instruction_input(k)
+                slots[function.instruction_output(k)[0]] = self._graph.add(
+                    names[argument], element
+                )
+            elif op == ca.OP_OUTPUT:
+                found[function.instruction_output(k)[1]] = slots[function.instruction_input(k)[0]]
+            else:
+                given = [slots[a] for a in function.instruction_input(k)]
+                slots[function.instruction_output(k)[0]] = self._graph.operation(op, *given)
+        return found
+
+    def _body(self, numbers: Sequence[int], *, fixed: bool) -> list[str]:
+        """Return the assignments that the numbers need; the fixed ones too, or read from k."""
+        needed: set[int] = set()
+        stack = list(numbers)
+        while stack:
+            n = stack.pop()
+            node = self._graph.nodes[n]
+            if n in needed or node[0] in _LEAVES or (self._graph.fixed[n] and not fixed):
+                continue
+            needed.add(n)
+            stack += [int(a) for a in node[1:]]  # type: ignore[call-overload]
+        name = self._fixed_name if fixed else self._name
+        return [f"    const real s{n} = {self._text(n, name)};" for n in sorted(needed)]
+
+    def _leaf(self, number: int) -> str | None:
+        node = self._graph.nodes[number]
+        if node[0] == "c":
+            return f"REAL({node[1]!r})"
+        if node[0] in ("t", "w"):
+            return str(node[0])
+        if node[0] in ("x", "v", "p"):
+            return f"{node[0]}[{node[1]}]"
+        return None
+
+    def _name(self, number: int) -> str:
+        """Return how a varying function reads a node; what is fixed it reads from k."""
+        node = self._graph.nodes[number]
+        if self._graph.fixed[number] and node[0] != "c":
+            return f"k[{self._kept.setdefault(number, len(self._kept))}]"
+        return self._leaf(number) or f"s{number}"
+
+    def _fixed_name(self, number: int) -> str:
+        return self._leaf(number) or f"s{number}"
+
+    def _text(self, number: int, name: Callable[[int], str]) -> str:
+        node = self._graph.nodes[number]
+        operation = str(node[0])
+        arguments = [name(a) for a in node[1:]]  # type: ignore[arg-type]
+        if operation == "neg":
+            return f"-{arguments[0]}"
+        if operation in ("+", "-", "*", "/"):
+            return f"{arguments[0]} {operation} {arguments[1]}"
+        return f"{operation}({', '.join(arguments)})"

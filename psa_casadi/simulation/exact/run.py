@@ -1,0 +1,180 @@
+"""Runs of a model by exact steps of its linear part: for fits and simulations of sampled records.
+
+Works where the model splits (`split_of`) and the record has few different time steps. The C code is
+`fmu_src/exact.c`; its sensitivities are the derivatives of its own discrete equations.
+"""
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.model.compose import Model, Structure
+from psa_casadi.simulation.compiler import shared_library, vector_flags
+from psa_casadi.simulation.exact.emit import Unprintable
+from psa_casadi.simulation.exact.generate import generate
+from psa_casadi.simulation.exact.split import split_of
+
+FloatArray = npt.NDArray[np.float64]
+
+#: A sample is halved so many times at most; what then misses the tolerance is counted as forced.
+FINEST = 12
+#: Time steps that differ by less than this share count as one, and so many may differ by more.
+_ALIKE, _LENGTHS = 1e-6, 8
+#: vectors of four numbers whatever the processor; strict C99 has no vectors
+_FLAGS = ("-std=gnu99", "-O3", "-fno-math-errno")
+_POINTER = ctypes.c_void_p
+
+
+class NotExact(Exception):  # noqa: N818 - the stepper is taken instead, which is no mistake
+    """A run that exact steps do not do; the message says why."""
+
+
+class _Run(ctypes.Structure):
+    """Mirror of `psa_exact` in exact.h."""
+
+    _fields_ = [
+        ("samples", ctypes.c_long), ("t", _POINTER), ("v", _POINTER),
+        ("zero_order_hold", ctypes.c_int), ("lengths", ctypes.c_int), ("length", _POINTER),
+        ("which_step", _POINTER), ("sets", ctypes.c_int), ("p", _POINTER), ("x0", _POINTER),
+        ("nominal", _POINTER), ("tolerance", ctypes.c_double), ("coarsest", ctypes.c_int),
+        ("finest", ctypes.c_int), ("steps_limit", ctypes.c_long), ("x", _POINTER),
+        ("y", _POINTER), ("shown", _POINTER), ("count", ctypes.c_int), ("which", _POINTER),
+        ("s0", _POINTER), ("dy", _POINTER), ("steps", ctypes.c_long),
+        ("rejected", ctypes.c_long), ("forced", ctypes.c_long), ("t_failed", ctypes.c_double),
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ExactSteps:
+    """What a run returned; arrays are None where they were not asked for.
+
+    `shown` (n,) is the chosen output, `sensitivity` (n, k) its derivatives, `x` (n, nx) and `y`
+    (n, ny) all states and outputs. `forced` steps missed the tolerance at the finest length.
+    """
+
+    shown: FloatArray
+    sensitivity: FloatArray | None
+    x: FloatArray | None
+    y: FloatArray | None
+    steps: int
+    rejected: int
+    forced: int
+
+
+def why_not(structure: Structure, output: str) -> str | None:
+    """Return why a model's output cannot be had by exact steps; None if it can."""
+    split = split_of(structure)
+    if isinstance(split, str):
+        return split
+    if output not in (o.name for o in structure.outputs):
+        return f"it has no output {output}"
+    generated = _generated(structure, output)
+    return None if generated.startswith("#") else generated
+
+
+@cache
+def _generated(structure: Structure, output: str) -> str:
+    split = split_of(structure)
+    if isinstance(split, str):
+        return split
+    try:
+        return generate(split, output)
+    except Unprintable as reason:
+        return f"it has an operation that is not printed ({reason})"
+
+
+@cache
+def _library(structure: Structure, output: str, lanes: int) -> ctypes.CDLL:
+    path = shared_library(
+        {"exact_model.h": _generated(structure, output)},
+        ("exact.c",),
+        (*_FLAGS, *vector_flags(), f"-DPSA_LANES={lanes}"),
+    )
+    library = ctypes.CDLL(str(path))
+    library.psa_run_exact.argtypes = [ctypes.POINTER(_Run)]
+    library.psa_run_exact.restype = ctypes.c_int
+    return library
+
+
+def time_steps(t: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
+    """Return the different steps (m,) [s] of times (n,) and which of them each is, (n - 1,).
+
+    Raises NotExact where there are more than a few.
+    """
+    steps = np.diff(t)
+    mean = float(steps.mean())
+    if float(np.abs(steps - mean).max()) <= _ALIKE * mean:
+        return np.array([mean]), np.zeros(steps.size, np.int32)
+    order = np.argsort(steps, kind="stable")
+    sizes = steps[order]
+    begins = np.concatenate([[True], np.diff(sizes) > _ALIKE * sizes[1:]])
+    groups = np.cumsum(begins) - 1
+    count = int(groups[-1]) + 1
+    if count > _LENGTHS:
+        raise NotExact(f"the record has {count} different time steps")
+    which = np.empty(steps.size, np.int32)
+    which[order] = groups
+    return np.bincount(groups, sizes) / np.bincount(groups), which
+
+
+def run_exact(
+    model: Model,
+    t: FloatArray,
+    u: FloatArray,
+    x0: FloatArray,
+    *,
+    tolerance: float,
+    coarsest: int = 0,
+    hold: str = "linear",
+    steps_limit: int = 100_000,
+    unknowns: Sequence[str | int] = (),
+    s0: FloatArray | None = None,
+    output: str = "measured_displacement",
+    values: Mapping[str, float] | None = None,
+    everything: bool = False,
+) -> ExactSteps:
+    """Integrate a model over times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
+
+    `tolerance` bounds the estimated error of a step, over the states' nominal sizes; every sample
+    is divided by 2^coarsest at least. `unknowns` and `s0` are those of the stepper's `run`;
+    `everything` asks for all states and outputs. Raises NotExact where this way is not possible,
+    or where it fails.
+    """
+    reason = why_not(model.structure, output)
+    if reason:
+        raise NotExact(reason)
+    lengths, which_step = time_steps(t)
+    n, nx, count = len(t), len(model.state_names), len(unknowns)
+    given = values or model.values
+    names = model.parameter_names
+    which = np.array([names.index(q) if isinstance(q, str) else -1 for q in unknowns], np.int32)
+    start = np.zeros((nx, count)) if s0 is None else s0
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "t": _doubles(t), "v": _doubles(u), "length": lengths, "which_step": which_step,
+        "p": np.array([given[name] for name in names]), "x0": _doubles(x0),
+        "nominal": model.state_nominals(), "shown": np.empty(n), "which": which,
+        "s0": _doubles(start), "dy": np.empty((n, count)),
+    }  # fmt: skip
+    if everything:
+        arrays |= {"x": np.empty((n, nx)), "y": np.empty((n, len(model.output_names)))}
+    request = _Run(
+        samples=n, zero_order_hold=int(hold == "zero"), lengths=len(lengths), sets=1,
+        tolerance=tolerance, coarsest=coarsest, finest=max(FINEST, coarsest),
+        steps_limit=steps_limit, count=count, **{k: a.ctypes.data for k, a in arrays.items()},
+    )  # fmt: skip
+    status = _library(model.structure, output, 1).psa_run_exact(ctypes.byref(request))
+    if status:
+        raise NotExact(f"exact steps ended at t = {request.t_failed:.6g} s")
+    return ExactSteps(
+        arrays["shown"], arrays["dy"] if count else None, arrays.get("x"), arrays.get("y"),
+        request.steps, request.rejected, request.forced,
+    )  # fmt: skip
+
+
+def _doubles(values: npt.ArrayLike) -> FloatArray:
+    return np.ascontiguousarray(values, dtype=np.float64)

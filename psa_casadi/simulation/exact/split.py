@@ -1,0 +1,310 @@
+"""How a model splits for exact steps: a linear part, states along a path, and what is left.
+
+A stack is a cascade. Most of it is linear with constant coefficients,
+
+    L' = M L + B u + c + e_i n_i,
+
+with M, B and c functions of the parameters and a *port* n_i for each row that is not linear: all of
+that row that the linear part leaves. States of hysteresis change along the path of another state
+(the *driver*), whatever its course in time: they rest where it rests. Both are found here from the
+equations alone, by their sparsity and by what the derivatives depend on. Ports and groups of states
+along one driver are evaluated in the order in which they feed each other; a port that feeds back to
+what it depends on (a load's stiffness) is solved for.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse.csgraph import connected_components
+
+from psa_casadi.component import Expression
+from psa_casadi.model.structure import Structure
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+class NoSplit(Exception):  # noqa: N818 - it says that a form does not fit, which is no mistake
+    """The model does not have the form of exact steps; the message says why."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """States along the path of one driver, by their indices in the model's state vector.
+
+    `rate` is the symbol that stands for the driver's rate in `slopes`, the states' derivatives.
+    """
+
+    driver: int
+    states: tuple[int, ...]
+    rate: Expression
+    slopes: Expression
+
+
+@dataclass(frozen=True)
+class Port:
+    """What the linear part leaves of one state's derivative.
+
+    `chord` is the driver along whose path the port varies, -1 if there is none.
+    """
+
+    state: int
+    value: Expression
+    feedback: bool
+    chord: int
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """The parts of a model by their indices in its state vector.
+
+    `linear` are the states of L. `order` lists what is evaluated one after the other: a group (its
+    index), a port or ports that are solved for together (their indices). M (nL, nL), B (nL, nu) and
+    c (nL,) depend on the parameters alone.
+    """
+
+    structure: Structure
+    linear: tuple[int, ...]
+    groups: tuple[Group, ...]
+    ports: tuple[Port, ...]
+    order: tuple[tuple[str, tuple[int, ...]], ...]
+    matrices: tuple[Expression, Expression, Expression]
+
+    @property
+    def along(self) -> tuple[int, ...]:
+        """The states along a path, in the order of the groups."""
+        return tuple(i for g in self.groups for i in g.states)
+
+
+@cache
+def split_of(structure: Structure) -> Split | str:
+    """Return how a model splits, or a sentence that says why it does not."""
+    try:
+        return _split(structure)
+    except NoSplit as reason:
+        return str(reason)
+
+
+def _split(s: Structure) -> Split:
+    if s.sampled:
+        raise NoSplit("it has sampled states")
+    if not s.states:
+        raise NoSplit("it has no states")
+    depends = _depends(s.xdot, s.x)  # [k, j]: x_k' depends on x_j
+    reach = closure(depends)
+    moving = [i for i in range(len(s.states)) if not _constant_slopes(s, i)]
+    alone = [i for i in moving if not any(reach[i, j] and reach[j, i] for j in _others(s, i))]
+    found = {i: g for i in alone if (g := _along(s, i, reach)) is not None}
+    groups = _groups(found)
+    # what feeds comes before what it feeds: M is block triangular
+    linear = tuple(sorted((i for i in range(len(s.states)) if i not in found),
+                          key=lambda i: (int(reach[i].sum()), i)))
+    matrices, remainders = _linear_part(s, linear)
+    ports = _ports(s, linear, remainders, groups, reach)
+    _check_switches(s, groups)
+    split = Split(s, linear, groups, ports, (), matrices)
+    return Split(s, linear, groups, ports, _order(s, split, reach), matrices)
+
+
+def _others(s: Structure, i: int) -> Iterable[int]:
+    return (j for j in range(len(s.states)) if j != i)
+
+
+def _depends(of: Expression, on: Expression) -> BoolArray:
+    """Return which rows of an expression depend on which symbols, shape (rows, symbols)."""
+    return np.array(ca.DM(ca.jacobian_sparsity(of, on), 1).full(), dtype=bool)
+
+
+def closure(depends: BoolArray) -> BoolArray:
+    """Return [k, j]: a change of j reaches k sooner or later; each reaches itself."""
+    reach = depends | np.eye(len(depends), dtype=bool)
+    for _ in range(len(depends).bit_length()):
+        reach = (reach.astype(int) @ reach.astype(int)) > 0
+    return reach
+
+
+def _variables(s: Structure) -> Expression:
+    return ca.vertcat(s.x, s.u, s.time)
+
+
+def _constant_slopes(s: Structure, i: int) -> bool:
+    """Whether x_i' is affine in states, inputs and time with constant coefficients."""
+    everything = _variables(s)
+    slopes = ca.jacobian(s.xdot[i], everything)
+    return not ca.depends_on(slopes, everything)
+
+
+def _along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Expression] | None:
+    """Return driver, rate symbol and slope of a state that rests where its driver rests.
+
+    With the driver's rate at zero its derivative may depend on nothing but the state itself, and on
+    that linearly (a heat that decays).
+    """
+    rates = {j: name for j in _others(s, i) if (name := _rate_name(s, j)) is not None}
+    for driver, name in rates.items():
+        if not reach[i, driver] or reach[driver, i]:
+            continue
+        rate = ca.SX.sym("rate")
+        keep = {name} if name in s.balances else set()
+        slope = _resolved(s, s.der[s.states[i].name], keep)
+        slope = ca.substitute(slope, s.symbols[name], rate)
+        if not ca.depends_on(slope, rate):
+            continue
+        resting = ca.substitute(slope, rate, ca.SX(0))
+        everything = ca.vertcat(s.x[list(_others(s, i))], s.u, s.time)
+        own = ca.jacobian(resting, s.x[i])
+        if not ca.depends_on(resting, everything) and not ca.depends_on(own, s.x[i]):
+            return driver, rate, slope
+    return None
+
+
+def _rate_name(s: Structure, i: int) -> str | None:
+    """Return the name of the balance or state that is a state's derivative, if there is one."""
+    derivative = ca.SX(s.der[s.states[i].name])
+    return derivative.name() if derivative.is_symbolic() else None
+
+
+def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expression:
+    """Return an expression with all balances but those kept substituted."""
+    names = [n for n in s.balances if n not in keep]
+    symbols, sums = [s.symbols[n] for n in names], [s.balances[n] for n in names]
+    unused = [q for n, q in s.symbols.items() if n not in s.balances and _is_balance(s, n)]
+    result = ca.substitute([ca.SX(expression)], unused, [ca.SX(0)] * len(unused))[0]
+    while any(ca.depends_on(result, q) for q in symbols):
+        result = ca.substitute([result], symbols, sums)[0]
+        result = ca.substitute([result], unused, [ca.SX(0)] * len(unused))[0]
+    return result
+
+
+def _is_balance(s: Structure, name: str) -> bool:
+    declared = {q.name for q in (*s.states, *s.inputs, *s.parameters, *s.sampled)}
+    return name not in declared and name != "time"
+
+
+def _groups(found: dict[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
+    drivers = sorted({driver for driver, *_ in found.values()})
+    groups = []
+    for driver in drivers:
+        states = tuple(i for i, (d, *_) in found.items() if d == driver)
+        rate = found[states[0]][1]
+        slopes = [ca.substitute(found[i][2], found[i][1], rate) for i in states]
+        groups.append(Group(driver, states, rate, ca.vertcat(*slopes)))
+    return tuple(groups)
+
+
+def _linear_part(
+    s: Structure, linear: Sequence[int]
+) -> tuple[tuple[Expression, Expression, Expression], list[Expression]]:
+    """Return M, B, c at the origin, and what they leave of each row."""
+    rows = list(linear)
+    xdot, x = s.xdot[rows], s.x[rows]
+    everything = _variables(s)
+    origin = ca.SX.zeros(everything.numel())
+    blocks = [ca.jacobian(xdot, x), ca.jacobian(xdot, s.u), xdot]
+    m, b, c = (ca.densify(q) for q in ca.substitute(blocks, [everything], [origin]))
+    given, coefficients = ca.vertcat(x, s.u), ca.horzcat(m, b)
+    remainders = [
+        _remainder(xdot[k], given, coefficients[k, :].T, c[k], everything)
+        for k in range(len(rows))
+    ]
+    return (m, b, c), remainders
+
+
+def _remainder(
+    row: Expression, given: Expression, linear: Expression, constant: Expression, everything: Expression
+) -> Expression:
+    """Return what `linear` and `constant` leave of a row.
+
+    Where the row is affine in a variable, this is taken out by setting it to 0, so that nothing
+    cancels in numbers.
+    """
+    slopes = ca.jacobian(row, given)
+    bent = [j for j in range(given.numel()) if ca.depends_on(slopes[j], everything)]
+    straight = [j for j in range(given.numel()) if j not in bent]
+    rest = ca.substitute(row, given[straight], ca.SX.zeros(len(straight)))
+    if not ca.depends_on(rest, everything):
+        return ca.SX(0)
+    return rest - constant - (linear[bent].T @ given[bent] if bent else 0)
+
+
+def _ports(
+    s: Structure,
+    linear: Sequence[int],
+    remainders: Sequence[Expression],
+    groups: Sequence[Group],
+    reach: BoolArray,
+) -> tuple[Port, ...]:
+    ports = []
+    for state, value in zip(linear, remainders, strict=True):
+        if not ca.depends_on(value, _variables(s)):
+            continue
+        read = [int(j) for j in np.flatnonzero(_depends(value, s.x)[0])]
+        feedback = any(reach[j, state] for j in read)
+        if feedback and any(j in g.states for g in groups for j in read):
+            raise NoSplit("a hysteresis lies in a loop")
+        drivers = [g.driver for g in groups if set(g.states) & set(read)]
+        near = [j for j in read if j in {g.driver for g in groups}] or [
+            j for j in read if j in linear
+        ]
+        chord = -1 if feedback else next(iter([*drivers, *near]), -1)
+        ports.append(Port(state, value, feedback, chord))
+    return tuple(ports)
+
+
+def _check_switches(s: Structure, groups: Sequence[Group]) -> None:
+    """Refuse kinks that are not those of a driver's rate: steps do not look for others."""
+    rates = [s.xdot[g.driver] for g in groups]
+    for name, expression in s.switches.items():
+        if not any(ca.is_equal(expression, rate, 20) for rate in rates):
+            raise NoSplit(f"its equations have a kink of their own ({name})")
+
+
+def _order(
+    s: Structure, split: Split, reach: BoolArray
+) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """Return the order in which groups and ports are evaluated, each after what feeds it."""
+    items: list[tuple[str, tuple[int, ...]]] = [("group", (k,)) for k in range(len(split.groups))]
+    _, label = connected_components(reach & reach.T, directed=False)
+    loops: dict[int, list[int]] = {}
+    for k, port in enumerate(split.ports):
+        if port.feedback:
+            loops.setdefault(int(label[port.state]), []).append(k)
+        else:
+            items.append(("port", (k,)))
+    items += [("loop", tuple(ks)) for ks in loops.values()]
+    feeds = [_feeds(split, item) for item in items]
+    reads = [_reads(s, split, item) for item in items]
+    waiting, done = list(range(len(items))), []
+    while waiting:
+        ready = [
+            k
+            for k in waiting
+            if not any(
+                reach[r, f] for o in waiting if o != k for f in feeds[o] for r in reads[k]
+            )
+        ]
+        if not ready:
+            raise NoSplit("its nonlinear parts feed each other in a loop")
+        done += ready
+        waiting = [k for k in waiting if k not in ready]
+    return tuple(items[k] for k in done)
+
+
+def _feeds(split: Split, item: tuple[str, tuple[int, ...]]) -> list[int]:
+    kind, members = item
+    if kind == "group":
+        return list(split.groups[members[0]].states)
+    return [split.ports[k].state for k in members]
+
+
+def _reads(s: Structure, split: Split, item: tuple[str, tuple[int, ...]]) -> list[int]:
+    kind, members = item
+    if kind == "group":
+        group = split.groups[members[0]]
+        inside = np.any(_depends(group.slopes, s.x), axis=0)
+        return [j for j in np.flatnonzero(inside) if j not in group.states] + [group.driver]
+    inside = np.any([_depends(split.ports[k].value, s.x)[0] for k in members], axis=0)
+    return [int(j) for j in np.flatnonzero(inside)]

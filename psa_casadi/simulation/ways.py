@@ -1,0 +1,128 @@
+"""Two ways through a record: exact steps where the model and the record allow, else the stepper."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.exact.run import NotExact, run_exact, time_steps, why_not
+from psa_casadi.simulation.stepper import Steps, run
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Names of the two ways in results.
+EXACT, STEPPER = "exact steps", "stepper"
+#: The stepper's tolerance of a step over the tolerance asked of the whole run, as in the FMU
+#: (`fmu_src/instance.c`), and the smallest that doubles can meet.
+STEP_SHARE, SMALLEST_STEP_RTOL = 0.003, 1e-12
+#: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
+#: Each is judged by the one before.
+_LADDER = ((0.1, 0), (0.01, 1), (1e-3, 2), (1e-4, 3))
+#: Loosest tolerance of exact steps: beyond it nothing is won.
+_LOOSEST = 1e-5
+#: Range below which a displacement counts as constant, over its nominal size.
+_STILL = 1e-3
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a record is run: `rtol` is the tolerance of a step; `stepped` rules exact steps out."""
+
+    rtol: float
+    stepped: bool = False
+
+    @property
+    def finer(self) -> "Way":
+        """A way whose error is far smaller: what this one's is judged by."""
+        return Way(0.1 * self.rtol, self.stepped)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """One output (n,), its derivatives (n, k), and the way that was taken."""
+
+    output: FloatArray
+    sensitivity: FloatArray
+    way: str
+
+
+def exact(model: Model, t: FloatArray, way: Way, output: str) -> bool:
+    """Whether a model's output over times `t` (n,) is run by exact steps."""
+    if way.stepped or why_not(model.structure, output):
+        return False
+    try:
+        time_steps(t)
+    except NotExact:
+        return False
+    return True
+
+
+def trace(
+    model: Model,
+    t: FloatArray,
+    u: FloatArray,
+    x0: FloatArray,
+    *,
+    way: Way,
+    output: str,
+    unknowns: Sequence[str | int] = (),
+    s0: FloatArray | None = None,
+    halved: int = 0,
+    steps_limit: int = 0,
+) -> Traced:
+    """Return one output of a run and its derivatives by `unknowns` (see `run`).
+
+    Exact steps divide every sample by 2^`halved` at least. `steps_limit` bounds the stepper's work
+    between two samples. Raises SimulationError where both ways fail.
+    """
+    none = np.zeros((len(t), 0))
+    if not way.stepped:
+        try:
+            found = run_exact(
+                model, t, u, x0, tolerance=min(way.rtol, _LOOSEST), coarsest=halved,
+                unknowns=unknowns, s0=s0, output=output,
+            )  # fmt: skip
+            slopes = none if found.sensitivity is None else found.sensitivity
+            return Traced(found.shown, slopes, EXACT)
+        except NotExact:
+            pass
+    steps = run(
+        model, t, u, x0, rtol=way.rtol, steps_limit=steps_limit, unknowns=unknowns, s0=s0,
+        output=output,
+    )  # fmt: skip
+    slopes = none if steps.sensitivity is None else steps.sensitivity
+    return Traced(steps.y[:, model.output_names.index(output)], slopes, STEPPER)
+
+
+def accurate(
+    model: Model, t: FloatArray, u: FloatArray, x0: FloatArray, *, rtol: float, hold: str
+) -> tuple[Steps, str]:
+    """Return a run whose displacement errs by less than `rtol` of its range, and the way taken.
+
+    Exact steps are halved until two runs agree to that; where they do not, the stepper takes steps
+    of 0.003 `rtol`.
+    """
+    names = ("measured_displacement", "displacement")
+    output = next((n for n in names if n in model.output_names), None)
+    before: FloatArray | None = None
+    nominal = 0.0 if output is None else model.output_nominals()[model.output_names.index(output)]
+    for share, coarsest in _LADDER if output else ():
+        try:
+            found = run_exact(
+                model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
+                output=output or "", everything=coarsest > 0,
+            )  # fmt: skip
+        except NotExact:
+            break
+        size = max(float(np.ptp(found.shown)), _STILL * nominal)
+        if before is not None and np.max(np.abs(found.shown - before)) <= rtol * size:
+            x, y = found.x, found.y
+            if x is not None and y is not None:
+                empty = np.empty((len(t), 0))
+                steps = Steps(x, empty, y, None, found.steps, found.rejected, 0)
+                return steps, EXACT
+        before = found.shown
+    share = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
+    return run(model, t, u, x0, rtol=share, hold=hold), STEPPER
