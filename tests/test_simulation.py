@@ -9,11 +9,13 @@ from scipy.linalg import expm
 
 from psa_casadi.components import BASE
 from psa_casadi.components.drive import DRIVE
+from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.model.structure import structure_of
 from psa_casadi.simulation import compiler
-from psa_casadi.simulation.codegen import generate_c
+from psa_casadi.simulation.codegen import fingerprint, generate_c
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import SOURCES, SimulationError, run
 from tests.stack_models import LINEAR, jacobian, sine, stack
@@ -208,3 +210,12 @@ def test_a_broken_compiler_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             generate_c(compose((DRIVE,)).structure, sensitivities=True), SOURCES
         )
     assert not list(tmp_path.rglob("*.so"))
+
+
+def test_a_fingerprint_differs_where_the_generated_text_does() -> None:
+    structures = [structure_of(BASE), structure_of(BASE[:2])]
+    structures += [structure_of((*BASE, e)) for e in EFFECTS.values() if not e.needs]
+    prints = [fingerprint(s) for s in structures]
+    texts = [repr(generate_c(s, sensitivities=True)) for s in structures]
+    assert len(set(prints)) == len(set(texts)) == len(structures)
+    assert fingerprint(structure_of.__wrapped__(BASE)) == prints[0]

@@ -100,6 +100,8 @@ def _beside(path: Path | None) -> Path | None:
 
 def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> "Diagnosis":
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
+    if path is None or d.verdict != "ambiguous":
+        return d
     from dataclasses import replace
 
     from psa_casadi.diagnosis.contenders import one_of_each
@@ -108,8 +110,6 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
     from psa_casadi.input_design.experiment import resolving_experiment
     from psa_casadi.report.experiment_part import sentences, write_voltage
 
-    if path is None or d.verdict != "ambiguous":
-        return d
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
         return d
@@ -127,16 +127,14 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
 
 def _write(d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str) -> None:
     """Write what was asked for, each file whole or not at all."""
+    import psa_casadi as psa
     from psa_casadi.files import atomic_write
-    from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.figure import save_figure
-    from psa_casadi.report.page import write_report
 
     writers: dict[str, Callable[[Path], None]] = {
-        "--output": lambda path: save_model(d.model, path),
+        "--output": lambda path: psa.save_model(d.model, path),
         "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: write_report(d, path, origin=origin),
-        "--figure": lambda path: save_figure(d, path, origin=origin),
+        "--report": lambda path: psa.write_report(d, path, origin=origin),
+        "--figure": lambda path: psa.save_figure(d, path, origin=origin),
     }
     for option, path in outputs.items():
         if path is not None:

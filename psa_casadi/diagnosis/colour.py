@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
+from psa_casadi.experiment.filtering import filtered
 from psa_casadi.experiment.noise import first_order_noise
 from psa_casadi.experiment.repeats import autoregression_of
 
@@ -57,9 +57,9 @@ class Colour:
         for a, length in zip(self.autoregression, self.lengths, strict=True):
             part = signal[first : first + length]
             if a.size and length > a.size:
-                filtered = np.asarray(lfilter(np.concatenate([[1.0], -a]), [1.0], part, axis=0))
-                filtered[: a.size] = part[: a.size] / np.sqrt(_power(a))
-                white[first : first + length] = filtered
+                own = white[first : first + length]
+                own[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
+                own[: a.size] = part[: a.size] / np.sqrt(_power(a))
             first += length
         return white
 
@@ -121,8 +121,8 @@ def left_correlation(correlation: float, removed: Sequence[FloatArray]) -> float
 
 def _correlated(r: float, columns: FloatArray) -> FloatArray:
     """Return S q for columns q: their sum over all samples, weighted with r^|i-j|."""
-    ahead = np.asarray(lfilter([1.0], [1.0, -r], columns, axis=0))
-    behind = np.asarray(lfilter([1.0], [1.0, -r], columns[::-1], axis=0))[::-1]
+    ahead = filtered([1.0], [1.0, -r], columns)
+    behind = filtered([1.0], [1.0, -r], columns[::-1])[::-1]
     both: FloatArray = ahead + behind - columns
     return both
 
@@ -146,6 +146,8 @@ def _before(seen: float, removed: Sequence[FloatArray]) -> float:
         return seen
     own, left = [0.0], [left_correlation(0.0, removed)]
     for r in _TRIED:
+        if seen <= left[-1]:
+            break
         more = left_correlation(r, removed)
         if more - left[-1] < _TOLD * (r - own[-1]):
             break
@@ -215,4 +217,4 @@ def _power(a: FloatArray) -> float:
         return 1.0
     impulse = np.zeros(4096)
     impulse[0] = 1.0
-    return float(np.sum(np.asarray(lfilter([1.0], np.concatenate([[1.0], -a]), impulse)) ** 2))
+    return float(np.sum(filtered([1.0], np.concatenate([[1.0], -a]), impulse) ** 2))

@@ -32,6 +32,7 @@ from psa_casadi.identification.refitting import Progress, refit
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import chosen_start
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.one_thread import one_thread_of_algebra
 
 #: Most causes that are named for one set of records.
 MOST_CAUSES = 3
@@ -43,6 +44,7 @@ MORE = 3
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
 
+@one_thread_of_algebra()
 def diagnose(
     records: Sequence[Record],
     *,

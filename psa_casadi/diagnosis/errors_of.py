@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from psa_casadi.diagnosis.colour import uncertain
 from psa_casadi.diagnosis.result import Errors, Gain
@@ -112,7 +112,7 @@ def gain_of(
     if k > 1:
         without = np.array([_log_ratio(np.sum(np.delete(sums, i, 0), axis=0)) for i in range(k)])
         spread = float(np.sqrt((k - 1) * np.var(without)))
-        half = float(stats.t.ppf(0.975, k - 1)) * spread
+        half = float(special.stdtrit(k - 1, 0.975)) * spread
     low, high = (100.0 * (1.0 - float(np.exp(centre + side * half))) for side in (1.0, -1.0))
     return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), records)
 

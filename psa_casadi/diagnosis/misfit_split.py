@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from psa_casadi.diagnosis.noise_floor import quantity
 from psa_casadi.experiment.record import Record
@@ -131,7 +131,7 @@ def _significant(line: FloatArray, between: FloatArray, periods: int) -> float:
     above = float(np.sum(line)) - noise
     if noise > 0:
         freedom = 4 * (periods - 1) * max(1, line.size // 2)
-        p = float(stats.f.sf(float(np.sum(line)) / noise, 2 * line.size, freedom))
+        p = float(special.fdtrc(2 * line.size, freedom, float(np.sum(line)) / noise))
         above = above if p < _SIGNIFICANT else 0.0
     return max(above, 0.0)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from psa_casadi.diagnosis.colour import Colour
 
@@ -71,7 +71,7 @@ def whiteness(white: FloatArray) -> float:
         return 1.0
     r = np.array([centred[k:] @ centred[:-k] / power for k in range(1, _LAGS + 1)])
     statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, _LAGS + 1)))
-    return float(stats.chi2.sf(statistic, _LAGS))
+    return float(special.chdtrc(_LAGS, statistic))
 
 
 def _fisher_line(white: FloatArray) -> float:
@@ -140,4 +140,4 @@ def _f_test(x: FloatArray, y: FloatArray) -> float:
     freedom = len(y) - rank
     if rest <= 0 or freedom <= 0:
         return 1.0
-    return float(stats.f.sf(explained / rank / (rest / freedom), rank, freedom))
+    return float(special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))

@@ -6,11 +6,11 @@ from itertools import product
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import find_peaks
 
 from psa_casadi.component import RECORD_DURATION, SPECTRAL_PEAKS, Component
 from psa_casadi.errors import PsaError
 from psa_casadi.experiment.drive import among_harmonics
+from psa_casadi.experiment.filtering import peaks as highest_peaks
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit
 from psa_casadi.identification.prediction import measured, predict_record
@@ -79,9 +79,8 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     power = np.abs(np.fft.rfft(residual * np.hanning(count), _FINER * count)) ** 2
     frequency = np.fft.rfftfreq(_FINER * count, experiment.record.sample_time)
     lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
-    where, _ = find_peaks(power[lowest:], distance=apart)
-    order = where[np.argsort(power[lowest:][where])[::-1]] + lowest
-    tones = [k for k in order[: 5 * _PEAKS] if not among_harmonics(frequency[k], experiment.record)]
+    order = highest_peaks(power[lowest:], apart, 5 * _PEAKS) + lowest
+    tones = [k for k in order if not among_harmonics(frequency[k], experiment.record)]
     strongest = np.array(tones[:_PEAKS], dtype=int)
     return tuple(float(f) for f in np.sort(frequency[strongest])) or (
         0.1 / experiment.record.sample_time,

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.errors import PsaError
+from psa_casadi.experiment.filtering import filtered
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.force_start import force_of
@@ -126,6 +126,6 @@ def _response(
         if force is not None:
             where = _places(e, interval)[e.used]
             for column, zeros in enumerate(([1.0, -1.0], [0.0, 1.0, -1.0])):
-                own[:, column] = np.asarray(lfilter(zeros, poles, force))[where]
+                own[:, column] = filtered(zeros, poles, force)[where]
         parts.append(own)
     return np.vstack(parts)

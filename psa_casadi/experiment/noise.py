@@ -2,7 +2,8 @@
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import detrend
+
+from psa_casadi.experiment.filtering import without_line
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -85,7 +86,7 @@ def _median_density(signal: FloatArray) -> FloatArray:
     """
     parts = np.lib.stride_tricks.sliding_window_view(signal, _SEGMENT)[:: _SEGMENT // 2]
     window = np.hanning(_SEGMENT)
-    power = np.abs(np.fft.rfft(detrend(parts, axis=1) * window, axis=1)) ** 2
+    power = np.abs(np.fft.rfft(without_line(parts) * window, axis=1)) ** 2
     return np.asarray(np.median(power, axis=0) / np.sum(window**2) / np.log(2.0))
 
 

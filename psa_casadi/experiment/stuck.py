@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import poisson
+from scipy.special import pdtrc
 
 from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.experiment.runs import runs_of
@@ -105,7 +105,7 @@ def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None)
     chance = max(quantum or 0.0, _digit(y)) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
     if noise <= NOISY * span or not _rough(y) or not same.any():
         return found
-    unlikely = poisson.sf(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
+    unlikely = pdtrc(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
     if chance < BY_NOISE and unlikely and np.mean(same) < RARELY:
         found[1:] = same
     return found

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import oaconvolve
 
+from psa_casadi.experiment.filtering import convolved
 from psa_casadi.experiment.noise import autocovariance
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import FIT_RTOL, Fit
@@ -111,8 +111,7 @@ def covariance_of(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray:
         lags = autocovariance(fit.residuals[part] / level)
         if lags[0] > 2.0 * np.sum(lags) - lags[0]:
             lags = lags[:1]  # colour never makes intervals shorter than white residuals do
-        kernel = np.concatenate([lags[:0:-1], lags])[:, None]
-        spread += scaled.T @ oaconvolve(scaled, kernel, mode="same", axes=0)
+        spread += scaled.T @ convolved(scaled, np.concatenate([lags[:0:-1], lags]))
     inverse = np.linalg.pinv(curvature, hermitian=True)
     covariance: FloatArray = inverse @ spread @ inverse
     return 0.5 * (covariance + covariance.T)

@@ -18,6 +18,7 @@ from psa_casadi.identification.refitting import Progress, record_rms, refit
 from psa_casadi.identification.search import Search, StartOutcome, search
 from psa_casadi.identification.starting import chosen_start
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.variables import Provenance
 from psa_casadi.version import __version__
 
@@ -54,6 +55,7 @@ class Identification:
     read_off: tuple[str, ...] = ()
 
 
+@one_thread_of_algebra()
 def identify(
     records: Sequence[Record],
     *,

@@ -11,7 +11,8 @@ from math import exp, log, sqrt
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
+
+from psa_casadi.experiment.filtering import filtered
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -42,8 +43,7 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
         lower = [1.0, -2.0 * np.real(decay), abs(decay) ** 2]
     else:
         upper, lower = np.real([now, before]), [1.0, -np.real(decay)]
-    found: FloatArray = lfilter(upper, lower, x, axis=0)
-    return found
+    return filtered(upper, lower, x)
 
 
 def first_order(time_constant: float, x: FloatArray, h: float) -> FloatArray:

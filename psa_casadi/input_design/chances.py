@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from psa_casadi.diagnosis.evidence import CREDIBLE, FORM, TEMPERATURE
 from psa_casadi.errors import PsaError
@@ -33,7 +33,7 @@ def naming_probability(
     for other in others:
         t = distances[truth.name, other.name]
         gained = truth.evidence - other.evidence + 0.5 * t - needed
-        chances.append(float(norm.cdf(gained / np.sqrt(max(t, LEAST)))))
+        chances.append(float(ndtr(gained / np.sqrt(max(t, LEAST)))))
     return min(chances, default=1.0)
 
 

@@ -11,6 +11,7 @@ from psa_casadi.experiment.record import Record
 from psa_casadi.input_design.candidates import KINDS, Kind, Waveform, draw
 from psa_casadi.input_design.criterion import Criterion, Point
 from psa_casadi.input_design.limits import Limits
+from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
@@ -52,6 +53,7 @@ class Best:
     evaluations: int
 
 
+@one_thread_of_algebra()
 def search(
     criterion: Criterion,
     limits: Limits,

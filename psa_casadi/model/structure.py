@@ -114,13 +114,14 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     following = {k: v for e in parts for k, v in e.next.items()}
     full = _substitute_in_order(balances, sums)
 
-    def resolve(expression: Expression) -> Expression:
-        return ca.substitute([ca.SX(expression)], list(sums.values()), full)[0]
+    def resolved(expressions: Iterable[Expression]) -> list[Expression]:
+        given = [ca.SX(e) for e in expressions]
+        return list(ca.substitute(given, list(sums.values()), full))
 
     x = _column(table[s.name] for s in states)
-    xdot = _column(resolve(der[s.name]) for s in states)
+    xdot = _column(resolved(der[s.name] for s in states))
     if "displacement" in balances:
-        shown = resolve(sums["displacement"])
+        shown = full[list(sums).index("displacement")]
         out["velocity"] = _time_derivative(shown, x, xdot, table["time"])
     return Structure(
         components=components,
@@ -137,13 +138,13 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
         der=der,
         out=out,
         xdot=xdot,
-        y=_column(resolve(out[o.name]) for o in outputs),
-        switches={name: resolve(expression) for name, expression in switches.items()},
+        y=_column(resolved(out[o.name] for o in outputs)),
+        switches=dict(zip(switches, resolved(switches.values()), strict=True)),
         sampled=sampled,
         period=period,
         z=_column(table[s.name] for s in sampled),
         next=following,
-        znext=_column(resolve(following[s.name]) for s in sampled),
+        znext=_column(resolved(following[s.name] for s in sampled)),
     )
 
 
@@ -183,24 +184,25 @@ def _substitute_in_order(
 ) -> list[Expression]:
     """Substitute balances into each other until none is left; name the loop if there is one."""
     resolved: dict[str, Expression] = {n: ca.SX(0) for n in symbols if n not in balances}
+    needed = {name: _names_in(expression) for name, expression in balances.items()}
     waiting = dict(balances)
     while waiting:
-        ready = [
-            name
-            for name, expression in waiting.items()
-            if not any(ca.depends_on(expression, symbols[other]) for other in waiting)
-        ]
+        ready = [name for name in waiting if needed[name].isdisjoint(waiting)]
         if not ready:
             loop = " -> ".join(_find_loop(waiting, symbols))
             raise InputError(
                 [f"The balances form a loop: {loop}; put a state between two of them."]
             )
         for name in ready:
-            known = list(resolved)
+            known = [k for k in resolved if k in needed[name]]
             resolved[name] = ca.substitute(
                 [waiting.pop(name)], [symbols[k] for k in known], [resolved[k] for k in known]
             )[0]
     return [resolved[name] for name in symbols]
+
+
+def _names_in(expression: Expression) -> set[str]:
+    return {symbol.name() for symbol in ca.symvar(expression)}
 
 
 def _find_loop(waiting: Mapping[str, Expression], symbols: Mapping[str, Expression]) -> list[str]:

@@ -7,7 +7,7 @@ import numpy as np
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.document import Document, Picture
-from psa_casadi.report.phrases import added, length_scale, micro, number, percent
+from psa_casadi.report.phrases import added, length_scale, micro, number, percent, weight
 from psa_casadi.report.tables import Table
 from psa_casadi.report.view_plots import spectrum_view_plot, view_named, view_plot
 
@@ -53,14 +53,6 @@ def add_remainder(page: Document, d: Diagnosis) -> None:
     """Add what the extended model leaves, in sentences."""
     if d.remainder and added(d):
         _sentences(page, d.remainder)
-
-
-def strongest_sentence(misfits: Sequence[Misfit]) -> str:
-    """Return the sentence that says most of what is wrong, "" if nothing is above the noise."""
-    told = [m for m in misfits if len(m.sentences) > 1]
-    if told:
-        return micro(max(told, key=_weight).sentences[1])
-    return ""
 
 
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
@@ -122,13 +114,8 @@ def split_table(before: Misfit, after: Misfit | None, *, counts: bool) -> Table:
     return Table(tuple(head), tuple(rows))
 
 
-def _weight(m: Misfit) -> float:
-    """Return the excess over the noise, by which records are compared."""
-    return m.excess * (m.rms / m.floor.level if m.floor.level > 0 else 1.0)
-
-
 def _sentences(page: Document, misfits: Sequence[Misfit]) -> None:
-    order = sorted(misfits, key=lambda m: -_weight(m))
+    order = sorted(misfits, key=lambda m: -weight(m))
     for m in order[:_RECORDS]:
         page.bullets(map(micro, m.sentences[:_SENTENCES]))
     if len(order) > _RECORDS:

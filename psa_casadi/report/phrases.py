@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.units import convert
@@ -66,6 +67,19 @@ def percent(share: float) -> str:
 def micro(sentence: str) -> str:
     """Return a sentence with "um" after a number written as "µm", as the pages write it."""
     return _MICRO.sub(" µm", sentence)
+
+
+def strongest_sentence(misfits: Sequence[Misfit]) -> str:
+    """Return the sentence that says most of what is wrong, "" if nothing is above the noise."""
+    told = [m for m in misfits if len(m.sentences) > 1]
+    if told:
+        return micro(max(told, key=weight).sentences[1])
+    return ""
+
+
+def weight(m: Misfit) -> float:
+    """Return the excess over the noise, by which records are compared."""
+    return m.excess * (m.rms / m.floor.level if m.floor.level > 0 else 1.0)
 
 
 def probability_text(probability: float) -> str:

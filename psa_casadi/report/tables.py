@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.export.check import CheckReport, CheckRow
 from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.search import StartOutcome
 from psa_casadi.model.compose import Model
@@ -26,6 +26,9 @@ from psa_casadi.report.phrases import (
 )
 from psa_casadi.report.residuals import ResidualFigures
 from psa_casadi.units import convert
+
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.export.check import CheckReport, CheckRow
 
 
 @dataclass(frozen=True)
@@ -215,7 +218,7 @@ def stack_table(stack: Stack) -> Table:
     return _table(("parameter", "value", "unit", "", "source"), rows)
 
 
-def check_table(report: CheckReport) -> Table:
+def check_table(report: "CheckReport") -> Table:
     """Return the checks of an FMU with figure, limit and result."""
     rows = [
         (r.name, _found(r), number(r.limit), "pass" if r.passed else "FAIL", r.remark)
@@ -224,6 +227,6 @@ def check_table(report: CheckReport) -> Table:
     return _table(("check", "found", "allowed", "result", "remark"), rows)
 
 
-def _found(row: CheckRow) -> str:
+def _found(row: "CheckRow") -> str:
     """Return the figure of a check; where none is allowed it counts problems."""
     return str(int(row.figure)) if row.limit == 0 and row.figure >= 0 else number(row.figure)

@@ -4,13 +4,12 @@ import re
 import textwrap
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Cause, Diagnosis, Errors
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.export.check import CheckReport
 from psa_casadi.identification.identify import Identification
-from psa_casadi.report.misfit_part import strongest_sentence
 from psa_casadi.report.phrases import (
     VERDICTS,
     Scale,
@@ -23,9 +22,13 @@ from psa_casadi.report.phrases import (
     plain,
     probability_text,
     rest_sentence,
+    strongest_sentence,
     verdict_sentence,
 )
 from psa_casadi.report.tables import blindest, effect_parameter_table, parameter_table
+
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.export.check import CheckReport
 
 _LABEL = 10
 #: Blind spots that a terminal names.
@@ -125,7 +128,7 @@ def effect_page(effect: Component, width: int = 100) -> str:
     return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect)}"
 
 
-def check_sentence(report: CheckReport) -> str:
+def check_sentence(report: "CheckReport") -> str:
     """Say how the check of an FMU ended."""
     against = "" if report.compared else " There was no model to compare it with."
     if report.passed:

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -92,30 +92,47 @@ def shared_library(
     generated: Mapping[str, str], sources: Sequence[str], flags: Sequence[str] = ()
 ) -> Path:
     """Compile generated text and files of `fmu_src` to a shared library; cached by content."""
+    return generated_library(repr(sorted(generated.items())), lambda: generated, sources, flags)
+
+
+def generated_library(
+    fingerprint: str,
+    generate: Callable[[], Mapping[str, str]],
+    sources: Sequence[str],
+    flags: Sequence[str] = (),
+) -> Path:
+    """Return the same library; text is generated only where none with the `fingerprint` is cached.
+
+    The fingerprint differs wherever the text does.
+    """
     folder = sources_directory()
     command = compiler_command()
     digest = hashlib.sha256(
         repr((command, OPTIMISE, flags, platform.machine(), sys.platform)).encode()
     )
-    for name, text in sorted(generated.items()):
-        digest.update(name.encode() + text.encode())
+    digest.update(fingerprint.encode())
     for path in sorted(folder.glob("*.[ch]")):
         digest.update(path.name.encode() + path.read_bytes())
     suffix = {"Windows": ".dll", "Darwin": ".dylib"}.get(platform.system(), ".so")
     target = cache_directory() / "models" / (digest.hexdigest()[:32] + suffix)
-    if target.exists():
-        return target
-    target.parent.mkdir(parents=True, exist_ok=True)
+    if not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _compile(target, generate(), [str(folder / s) for s in sources], flags)
+    return target
+
+
+def _compile(
+    target: Path, generated: Mapping[str, str], sources: Sequence[str], flags: Sequence[str]
+) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent) as work:
         for name, text in generated.items():
             (Path(work) / name).write_text(text)
-        files = [n for n in generated if n.endswith(".c")] + [str(folder / s) for s in sources]
-        output = "model" + suffix
+        files = [n for n in generated if n.endswith(".c")] + list(sources)
+        output = "model" + target.suffix
         position = () if platform.system() == "Windows" else ("-fPIC",)
         run_compiler(
-            [*command, *OPTIMISE, *flags, *position, "-fvisibility=hidden", "-shared", "-I.",
-             f"-I{folder}", *files, "-lm", "-o", output],
+            [*compiler_command(), *OPTIMISE, *flags, *position, "-fvisibility=hidden", "-shared",
+             "-I.", f"-I{sources_directory()}", *files, "-lm", "-o", output],
             Path(work),
         )  # fmt: skip
         os.replace(Path(work) / output, target)
-    return target

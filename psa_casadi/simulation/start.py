@@ -7,6 +7,7 @@ rest value plus a deviation that is 0 unless it is estimated or given.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -68,10 +69,12 @@ def start_state(
     without = p.copy()
     without[gains] = 0.0  # a saturating effect would lead Newton's method astray from far away
     nominal = model.state_nominals()
-    x = _settle(rest, np.zeros(len(structure.states)), (time, u, without, deviation), nominal)
-    x = _settle(rest, x, (time, u, p, deviation), nominal)
-    final, by_p, by_memory = (np.array(a) for a in moving(time, x, u, w, p, deviation))
-    return Start(final.ravel(), by_p, by_memory)
+    now = np.array([time])
+    x = np.zeros(len(structure.states))
+    for values in (without, p) if np.any(p[gains]) else (p,):
+        x = _settle(rest, x, (now, u, values, deviation), nominal)
+    final, by_p, by_memory = _Call(moving, (now, x, u, w, p, deviation))()
+    return Start(final[:, 0], by_p, by_memory)
 
 
 def settling_time(model: Model) -> float:
@@ -99,15 +102,17 @@ def _fast_jacobian(structure: Structure) -> ca.Function:
 def _settle(
     rest: ca.Function,
     x: FloatArray,
-    where: tuple[float, FloatArray, FloatArray, FloatArray],
+    where: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     nominal: FloatArray,
 ) -> FloatArray:
     time, u, p, deviation = where
+    x = x.copy()
+    step = _Call(rest, (time, x, u, p, deviation))
     for _ in range(_NEWTON_STEPS):
-        new: FloatArray = np.array(rest(time, x, u, p, deviation)).ravel()
+        new = step()[0][:, 0]
         with np.errstate(invalid="ignore"):  # overflow ends in nan, which is no equilibrium
-            change = np.max(np.abs(new - x) / (np.abs(new) + nominal))
-        x = new
+            change = np.max(np.abs(new - x) / (np.abs(new) + nominal), initial=0.0)
+        x[:] = new
         if not change > 1e-13:
             break
     if not change < 1e-9:
@@ -116,6 +121,34 @@ def _settle(
             " likely cause: check them."
         )
     return x
+
+
+class _Call:
+    """One function with dense results, evaluated in place: `results` follow from the `arguments`.
+
+    An ordinary call takes five times as long, most of it for its arguments. A call belongs to one
+    thread.
+    """
+
+    def __init__(self, function: ca.Function, arguments: Sequence[FloatArray]) -> None:
+        self._arguments = arguments
+        self._buffer: Any
+        self._buffer, self._run = function.buffer()
+        shapes = [function.size_out(i) for i in range(function.n_out())]
+        self.results = [np.zeros(shape, order="F") for shape in shapes]
+        for i, argument in enumerate(arguments):
+            self._buffer.set_arg(i, _memory(argument))
+        for i, result in enumerate(self.results):
+            self._buffer.set_res(i, _memory(result))
+
+    def __call__(self) -> list[FloatArray]:
+        self._run()
+        return self.results
+
+
+def _memory(array: FloatArray) -> Any:
+    """Return the numbers of an array as CasADi takes them, column by column."""
+    return array.reshape(-1, order="F").data
 
 
 @cache
@@ -127,14 +160,16 @@ def _functions(structure: Structure) -> tuple[ca.Function, ca.Function]:
     deviation = ca.SX.sym("deviation", len(memory))
     settled = _newton(s, settling, _placed(s, s.x, memory, deviation, settled=False))
     start = _newton(s, fast, _placed(s, settled, memory, deviation, settled=True))
-    rest = ca.Function("rest", [s.time, s.x, s.u, s.p, deviation], [start])
+    rest = ca.Function("rest", [s.time, s.x, s.u, s.p, deviation], [ca.densify(start)])
     rate = ca.SX.sym("rate", len(s.inputs))
     moving: Expression = start
     for _ in range(2):
         moving = _in_motion(s, start, moving, fast, memory, rate)
     derivatives: list[Expression] = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
     return rest, ca.Function(
-        "moving", [s.time, s.x, s.u, rate, s.p, deviation], [moving, *derivatives]
+        "moving",
+        [s.time, s.x, s.u, rate, s.p, deviation],
+        [ca.densify(e) for e in (moving, *derivatives)],
     )
 
 

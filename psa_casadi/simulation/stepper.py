@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from psa_casadi.errors import Problems, PsaError
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.codegen import generate_c
-from psa_casadi.simulation.compiler import shared_library
+from psa_casadi.simulation.codegen import fingerprint, generate_c
+from psa_casadi.simulation.compiler import generated_library
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -69,7 +69,9 @@ class Steps:
 
 @cache
 def _library(structure: Structure) -> ctypes.CDLL:
-    path = shared_library(generate_c(structure, sensitivities=True), SOURCES)
+    path = generated_library(
+        fingerprint(structure), lambda: generate_c(structure, sensitivities=True), SOURCES
+    )
     library = ctypes.CDLL(str(path))
     library.psa_run.argtypes = [ctypes.POINTER(_Run)]
     library.psa_run.restype = ctypes.c_int
