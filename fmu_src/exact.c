@@ -170,14 +170,20 @@ static void check_port(psa_state *state, psa_trial *trial, int j, real sigma, in
 }
 
 /* The response to a chord's driver beyond the parabola */
-static inline void respond_beyond(const psa_level *level, int c, const real *l, const real *v0, const real *dv,
+static inline void respond_beyond(const psa_state *state, const psa_trial *trial, const psa_level *level, int c,
                                   real *sum) {
     for (int i = 0; i < ROWS; ++i) sum[i] = level->chord_c[c][i];
     for (int k = 0; k < ex_reads[ex_chord_driver[c]]; ++k)
-        for (int i = 0; i < ROWS; ++i) sum[i] += level->chord_f[c][k][i] * l[k];
+        for (int i = 0; i < ROWS; ++i) sum[i] += level->chord_f[c][k][i] * trial->l[k];
     for (int q = 0; q < EX_NU; ++q)
         for (int i = 0; i < ROWS; ++i)
-            sum[i] += level->chord_a1[c][q][i] * v0[q] + level->chord_a2[c][q][i] * dv[q];
+            sum[i] += level->chord_a1[c][q][i] * trial->v0[q] + level->chord_a2[c][q][i] * trial->dv[q];
+    for (int k = 0; k < EX_NFEED && ex_feed[c][k] >= 0; ++k) {
+        const int j = ex_feed[c][k];
+        for (int i = 0; i < ROWS; ++i)
+            sum[i] += level->chord_w[c][k][0][i] * state->port[j] + level->chord_w[c][k][1][i] * trial->port[HALF][j] +
+                      level->chord_w[c][k][2][i] * trial->port[WHOLE][j];
+    }
 }
 
 static void do_port(psa_state *state, psa_trial *trial, int j, int slopes) {
@@ -200,7 +206,7 @@ static void do_port(psa_state *state, psa_trial *trial, int j, int slopes) {
     trial->chord[c] = sigma;
     const psa_level *const level = trial->level;
     real sum[ROWS];
-    respond_beyond(level, c, trial->l, trial->v0, trial->dv, sum);
+    respond_beyond(state, trial, level, c, sum);
     for (int i = 0; i < NL; ++i) {
         trial->beyond[c][i] = sum[i];
         trial->x[WHOLE][ex_linear[i]] += sigma * sum[i];
@@ -576,7 +582,7 @@ static void matrix_columns(psa_state *state, int n, int j, const double *sigma, 
         } else {
             const double n0 = state->port[j], n1 = trial->port[HALF][j], n2 = trial->port[WHOLE][j];
             if (sigma) {
-                respond_beyond(trial->level + m + 1, c, trial->l, trial->v0, trial->dv, sum);
+                respond_beyond(state, trial, trial->level + m + 1, c, sum);
                 for (int i = 0; i < ROWS; ++i) sum[i] *= *sigma;
             } else
                 for (int i = 0; i < ROWS; ++i) sum[i] = 0.0;
@@ -654,6 +660,13 @@ static void do_port_columns(psa_state *state, int j) {
                 column sum = beyond * dsigma[b];
                 for (int q = 0; q < ex_reads[ex_chord_driver[c]]; ++q)
                     sum += sigma * trial->level->chord_f[c][q][i] * ROW(state->s, ex_linear[q])[b];
+                for (int q = 0; q < EX_NFEED && ex_feed[c][q] >= 0; ++q) {
+                    const real(*const w)[ROWS] = trial->level->chord_w[c][q];
+                    const int f = ex_feed[c][q];
+                    sum += sigma * (w[0][i] * ROW(state->sport, f)[b] +
+                                    w[1][i] * ROW(state->snode_port, HALF * (EX_NPORT + 1) + f)[b] +
+                                    w[2][i] * ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + f)[b]);
+                }
                 out[b] += sum;
             }
         }

@@ -52,7 +52,8 @@ typedef struct {
 typedef struct {
     psa_node node[3]; /* whole, half, quarter */
     real chord_f[EX_NCH + 1][NL][ROWS], chord_a1[EX_NCH + 1][EX_NU + 1][ROWS],
-        chord_a2[EX_NCH + 1][EX_NU + 1][ROWS], chord_c[EX_NCH + 1][ROWS];
+        chord_a2[EX_NCH + 1][EX_NU + 1][ROWS], chord_c[EX_NCH + 1][ROWS],
+        chord_w[EX_NCH + 1][EX_NFEED + 1][3][ROWS]; /* of the ports that feed the driver */
 } psa_level;
 
 /* Directions: [chord or 0][parameter or 0]; the algebra in which parameters and chords square to zero */
@@ -324,6 +325,23 @@ static void fill_level(const psa_ladder *ladder, int level, int t, const double 
             double rest = dw[1][i] * base[1]->v[C1][u] + dw[2][i] * base[0]->v[C1][u];
             if (t > 0) rest += w[1][i] * node[1]->v[C1][u] + w[2][i] * node[0]->v[C1][u];
             SET_LANE(out->chord_c[c][i], lane, (s->v[C1][i] - rest) * unit * scale[i]);
+        }
+        for (int k = 0; k < EX_NFEED; ++k) {
+            const int j = ex_feed[c][k];
+            if (j < 0) break;
+            double own[3][NL], b0[3][NL], b1[3][NL], d0[3][NL], d1[3][NL];
+            port_weights(s, j, 1.0, own);
+            port_weights(base[0], j, 1.0, b0);
+            port_weights(base[1], j, 0.5, b1);
+            port_weights(node[0], j, 1.0, d0);
+            port_weights(node[1], j, 0.5, d1);
+            for (int q = 0; q < 3; ++q)
+                for (int i = 0; i < NL; ++i) {
+                    double seen = dw[1][i] * b1[q][u] + dw[2][i] * b0[q][u];
+                    if (t > 0) seen += w[1][i] * d1[q][u] + w[2][i] * d0[q][u];
+                    SET_LANE(out->chord_w[c][k][q][i], lane,
+                             (own[q][i] - seen) * unit * scale[i] / scale[ex_port_row[j]]);
+                }
         }
     }
 }

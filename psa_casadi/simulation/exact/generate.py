@@ -74,6 +74,11 @@ def generate(split: Split, output: str) -> str:
         "ex_group_size": [len(g.states) for g in split.groups],
         "ex_group_states": split.along,
     }
+    feeds = [
+        [j for j, q in enumerate(split.ports) if reach[place[split.ports[k].chord], place[q.state]]]
+        for k in chords
+    ]
+    sizes |= {"EX_NFEED": max((len(f) for f in feeds), default=0)}
     sizes |= {"EX_NEED": len(needed), "EX_NPATH": len(path)}
     head = ["#ifndef PSA_EXACT_MODEL_H", "#define PSA_EXACT_MODEL_H", '#include "exact_math.h"']
     head += [f"#define {name} {value}" for name, value in sizes.items()]
@@ -82,6 +87,7 @@ def generate(split: Split, output: str) -> str:
         "typedef struct { short row, kind, index; } psa_entry;",
         "typedef struct { int kind, count; const int *members; } psa_item;",
         *(_integers(name, values) for name, values in lists.items()),
+        _table("ex_feed", feeds, sizes["EX_NFEED"] + 1),
         *tables,
         *_items(split),
     ]  # fmt: skip
@@ -91,6 +97,13 @@ def generate(split: Split, output: str) -> str:
 def _integers(name: str, values: Sequence[int]) -> str:
     listed = ", ".join(str(v) for v in values) or "0"
     return f"static const int {name}[{max(1, len(values))}] = {{{listed}}};"
+
+
+def _table(name: str, rows: Sequence[Sequence[int]], width: int) -> str:
+    """Return a table of integers whose rows are filled up with -1."""
+    filled = [[*row, *[-1] * (width - len(row))] for row in rows] or [[-1] * width]
+    text = ", ".join("{" + ", ".join(str(v) for v in row) + "}" for row in filled)
+    return f"static const int {name}[{len(filled)}][{width}] = {{{text}}};"
 
 
 def _entries(name: str, entries: Sequence[_Entry]) -> str:

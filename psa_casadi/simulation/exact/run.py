@@ -8,13 +8,15 @@ import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.compiler import shared_library, vector_flags
+from psa_casadi.simulation.codegen import fingerprint
+from psa_casadi.simulation.compiler import generated_library, vector_flags
 from psa_casadi.simulation.exact.emit import Unprintable
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.split import split_of
@@ -26,7 +28,7 @@ FINEST = 12
 #: Time steps that differ by less than this share count as one, and so many may differ by more.
 _ALIKE, _LENGTHS = 1e-6, 8
 #: vectors of four numbers whatever the processor; strict C99 has no vectors
-_FLAGS = ("-std=gnu99", "-O3", "-fno-math-errno")
+_FLAGS = ("-std=gnu99", "-O2", "-ftree-vectorize", "-fno-math-errno")
 _POINTER = ctypes.c_void_p
 
 
@@ -68,34 +70,40 @@ class ExactSteps:
 
 def why_not(structure: Structure, output: str) -> str | None:
     """Return why a model's output cannot be had by exact steps; None if it can."""
-    split = split_of(structure)
-    if isinstance(split, str):
-        return split
     if output not in (o.name for o in structure.outputs):
         return f"it has no output {output}"
-    generated = _generated(structure, output)
-    return None if generated.startswith("#") else generated
+    found = _compiled(structure, output, 1)
+    return found if isinstance(found, str) else None
 
 
 @cache
-def _generated(structure: Structure, output: str) -> str:
-    split = split_of(structure)
-    if isinstance(split, str):
-        return split
+def _compiled(structure: Structure, output: str, lanes: int) -> Path | str:
+    """Return the model's library, or why there is none; the text is made where it is not cached."""
+
+    def text() -> dict[str, str]:
+        split = split_of(structure)
+        if isinstance(split, str):
+            raise NotExact(split)
+        return {"exact_model.h": generate(split, output)}
+
+    flags = (*_FLAGS, *vector_flags(), f"-DPSA_LANES={lanes}")
+    named = repr((fingerprint(structure), output, _generator()))
     try:
-        return generate(split, output)
-    except Unprintable as reason:
-        return f"it has an operation that is not printed ({reason})"
+        return generated_library(named, text, ("exact.c",), flags)
+    except (NotExact, Unprintable) as reason:
+        return str(reason)
+
+
+@cache
+def _generator() -> str:
+    """Return the text of what generates: another one makes other libraries."""
+    here = Path(__file__).parent
+    return "".join((here / f"{name}.py").read_text() for name in ("split", "emit", "generate"))
 
 
 @cache
 def _library(structure: Structure, output: str, lanes: int) -> ctypes.CDLL:
-    path = shared_library(
-        {"exact_model.h": _generated(structure, output)},
-        ("exact.c",),
-        (*_FLAGS, *vector_flags(), f"-DPSA_LANES={lanes}"),
-    )
-    library = ctypes.CDLL(str(path))
+    library = ctypes.CDLL(str(_compiled(structure, output, lanes)))
     library.psa_run_exact.argtypes = [ctypes.POINTER(_Run)]
     library.psa_run_exact.restype = ctypes.c_int
     return library
