@@ -13,9 +13,10 @@
 #include "exact_model.h"
 #include "exact_levels.h"
 
-#define SLOWS 0.1        /* a driver whose rate falls to less than this share of it may come to rest */
+#define SLOWS 0.5        /* a driver whose rate falls to less than this share of it may come to rest */
+#define FAST 1e3         /* over the driver's rate: there what a state does in time is nothing */
 #define GROWS 0.03       /* of the tolerance: the next step may be twice as long */
-#define BRIEF 2e-3       /* of its nominal size: a driver's way along which the midpoint rule does */
+#define TURNS 8          /* iterations for the instant at which a driver turns */
 #define NEWTON_LIMIT 12
 #define STILL 1e-9       /* of its nominal size: a driver's way along which nothing can be told */
 
@@ -48,8 +49,8 @@ typedef struct {
     real w[NODES + 1], turn;              /* the driver's rate at whole, half, quarter, start */
     real share[NODES];                    /* of the leg's way at the nodes */
     int on[NODES];                        /* the leg of each node; with lanes only the first counts */
-    int bracket;                          /* half of the step in which the driver turns */
-    real basis[4];                        /* Hermite's, at the turn */
+    real basis[6];                        /* Hermite's, at the turn */
+    real missed;                          /* error of the driver's value there */
     real rate_slopes[NODES + 1][EX_RATE_OUT];
 } psa_stages;
 
@@ -76,7 +77,7 @@ typedef struct {
     psa_exact *run;
     real t, x[EX_NX], port[EX_NPORT + 1], start_slopes[EX_NPORT + 1][EX_PORT_OUT];
     real p[EX_NP + 1], k[EX_NK + 1];
-    real nominal[EX_NX], inverse_nominal[NL], tolerance;
+    real nominal[EX_NX], inverse_nominal[NL], tolerance, brief;
     psa_ladder *ladders;                  /* [lengths][lanes] */
     psa_level *levels;                    /* [lengths][finest + 1][1 + thetas] */
     char *ready;                          /* [lengths][finest + 1] */
@@ -222,24 +223,44 @@ static void hermite(real s, real basis[4]) {
     basis[3] = -(s * s * r);
 }
 
-/* Where the driver turns: the zero of its rate in the half of the step in which it changes sign, on Hermite's
-   cubic, and its value there. The quarter's value tells the cubic's error, which is returned. */
-static real find_turn(psa_state *state, psa_trial *trial, psa_stages *stages, int u, real *value) {
-    const real u0 = state->x[u], u1 = trial->x[HALF][u], u2 = trial->x[WHOLE][u];
-    const real w0 = stages->w[NODES], w1 = stages->w[HALF], w2 = stages->w[WHOLE], d = 0.5 * trial->dt;
-    const int late = stages->bracket;
-    const real a = late ? u1 : u0, b = late ? u2 : u1, da = d * (late ? w1 : w0), db = d * (late ? w2 : w1);
-    /* slope of the cubic: da + s (6 (b - a) - 4 da - 2 db) + s^2 (3 da + 3 db - 6 (b - a)) = 0 */
-    const real p = 6.0 * (b - a) - 4.0 * da - 2.0 * db, q = 3.0 * (da + db) - 6.0 * (b - a);
-    const real root = v_sqrt(v_fmax(p * p - 4.0 * q * da, REAL(0.0)));
-    const real s = v_fmin(v_fmax(-2.0 * da / choose(MASK(da > 0.0), p - root, p + root), REAL(0.0)), REAL(1.0));
-    real quarter[4];
-    hermite(s, stages->basis);
-    *value = stages->basis[0] * a + stages->basis[1] * da + stages->basis[2] * b + stages->basis[3] * db;
-    stages->turn = 0.5 * (s + late);
-    hermite(REAL(0.5), quarter);
-    return v_fabs(trial->x[QUARTER][u] -
-                  (quarter[0] * u0 + quarter[1] * d * w0 + quarter[2] * u1 + quarter[3] * d * w1));
+/* Hermite's quintic through values and slopes at 0, 1/2 and 1: weights at s, or those of its slope */
+static void quintic(real s, int slope, real basis[6]) {
+    const real l[3] = {2.0 * (s - 0.5) * (s - 1.0), -4.0 * s * (s - 1.0), 2.0 * s * (s - 0.5)};
+    const real dl[3] = {4.0 * s - 3.0, 4.0 - 8.0 * s, 4.0 * s - 1.0};
+    static const double AT[3] = {0.0, 0.5, 1.0}, LEAN[3] = {6.0, 0.0, -6.0}; /* -2 l'(at itself) */
+    for (int i = 0; i < 3; ++i) {
+        const real d = s - AT[i], lean = 1.0 + LEAN[i] * d;
+        basis[2 * i] = slope ? LEAN[i] * l[i] * l[i] + 2.0 * lean * l[i] * dl[i] : lean * l[i] * l[i];
+        basis[2 * i + 1] = slope ? l[i] * l[i] + 2.0 * d * l[i] * dl[i] : d * l[i] * l[i];
+    }
+}
+
+static real combine(const real basis[6], const real *u, const real *w) {
+    return basis[0] * u[0] + basis[1] * w[0] + basis[2] * u[1] + basis[3] * w[1] + basis[4] * u[2] + basis[5] * w[2];
+}
+
+/* Where the driver turns: the zero of its rate on Hermite's quintic, and its value there. The quarter's value
+   tells the quintic's error, which is returned. */
+static real find_turn(psa_state *state, psa_trial *trial, psa_stages *stages, int u, int late, real *value) {
+    const real x[3] = {state->x[u], trial->x[HALF][u], trial->x[WHOLE][u]}, d = trial->dt;
+    const real w[3] = {stages->w[NODES] * d, stages->w[HALF] * d, stages->w[WHOLE] * d};
+    real low = REAL(0.5 * late), high = low + 0.5, wl = w[late], wh = w[late + 1], basis[6];
+    real s = low - wl * (high - low) / (wh - wl);
+    for (int k = 0; k < TURNS; ++k) { /* regula falsi, Illinois's variant */
+        quintic(s, 1, basis);
+        const real slope = combine(basis, x, w);
+        const bits right = MASK(slope * wh > 0.0);
+        wl = choose(right, 0.5 * wl, slope);
+        wh = choose(right, slope, 0.5 * wh);
+        low = choose(right, low, s);
+        high = choose(right, s, high);
+        s = choose(MASK(slope == 0.0), s, low - wl * (high - low) / choose(MASK(wh == wl), REAL(1.0), wh - wl));
+    }
+    quintic(s, 0, stages->basis);
+    *value = combine(stages->basis, x, w);
+    stages->turn = s;
+    quintic(REAL(0.25), 0, basis);
+    return v_fabs(trial->x[QUARTER][u] - combine(basis, x, w));
 }
 
 /* One Runge-Kutta step along a leg, of fourth order; where the way is short the midpoint rule */
@@ -247,7 +268,9 @@ static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int 
     static const double SHARE[4] = {0.0, 0.5, 0.5, 1.0};
     const int first = ex_group_first[g], size = ex_group_size[g];
     const real finish = leg->begin + leg->dt / trial->dt;
-    const bits brief = MASK(v_fabs(leg->way) < BRIEF * state->nominal[ex_linear[ex_group_driver[g]]]);
+    /* the midpoint rule errs by a 24th of the cube of the way: nothing beside the tolerance, where the way is
+       its root */
+    const bits brief = MASK(v_fabs(leg->way) < state->brief * state->nominal[ex_linear[ex_group_driver[g]]]);
     leg->stages = 2;
     for (int lane = 0; lane < PSA_LANES; ++lane)
         if (!LANE(brief, lane)) leg->stages = 4;
@@ -272,7 +295,7 @@ static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int 
     for (int i = 0; i < size; ++i) {
         const int q = ex_group_states[first + i];
         const real k1 = leg->out[0][i], k2 = leg->out[1][i];
-        real mean = k2, last = 2.0 * k2 - k1, e = 0.1 * BRIEF * leg->dt * v_fabs(k2 - k1) / state->nominal[q];
+        real mean = k2, last = 2.0 * k2 - k1, e = REAL(0.0);
         if (leg->stages == 4) {
             const real k3 = leg->out[2][i], k4 = leg->out[3][i];
             /* the two slopes at the middle differ in third order, the step errs in fifth: between the two */
@@ -320,14 +343,23 @@ static void group_node(psa_state *state, psa_trial *trial, int g, int n, double 
 }
 
 /* A driver that slows down may come to rest, or all but so. What its states do in time and not along its way
-   (r is not proportional to the rate there) then needs steps in which that does nothing. */
-static void check_rest(psa_state *state, psa_trial *trial, int g, real most, bits slows) {
-    real fast[EX_GROUP_OUT], slow[EX_GROUP_OUT];
-    ex_group(g, state->t, state->x, trial->v0, most, state->k, fast);
-    ex_group(g, state->t, state->x, trial->v0, SLOWS * most, state->k, slow);
+   (what is left of r when its part in proportion to the rate is taken off) is then not that at the mean rate:
+   Simpson's rule tells by how much. */
+static void check_rest(psa_state *state, psa_trial *trial, int g, const real *w, real most, bits slows) {
+    static const double WEIGHT[4] = {1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0, -1.0};
+    const int u = ex_linear[ex_group_driver[g]];
+    const real rates[4] = {w[NODES], w[HALF], w[WHOLE], (trial->x[WHOLE][u] - state->x[u]) / trial->dt};
+    real fast[EX_GROUP_OUT], out[EX_GROUP_OUT], missed[EX_NX];
+    ex_group(g, state->t, state->x, trial->v0, FAST * most, state->k, fast);
+    for (int k = 0; k < 4; ++k) {
+        ex_group(g, state->t, state->x, trial->v0, rates[k], state->k, out);
+        for (int i = 0; i < ex_group_size[g]; ++i) {
+            const real in_time = out[i] - fast[i] * (v_fabs(rates[k]) / (FAST * v_fabs(most)));
+            missed[i] = WEIGHT[k] * in_time + (k ? missed[i] : REAL(0.0));
+        }
+    }
     for (int i = 0; i < ex_group_size[g]; ++i) {
-        const real in_time = v_fabs(fast[i] - slow[i] / SLOWS) / (1.0 / SLOWS - 1.0);
-        const real e = 0.5 * in_time * trial->dt / state->nominal[ex_group_states[ex_group_first[g] + i]];
+        const real e = trial->dt * v_fabs(missed[i]) / state->nominal[ex_group_states[ex_group_first[g] + i]];
         set_error(trial, choose(slows, e / state->tolerance, REAL(0.0)));
     }
 }
@@ -359,15 +391,11 @@ static void find_legs(psa_state *state, psa_trial *trial, int g, int slopes) {
     one->begin = REAL(0.0);
     one->dt = trial->dt;
 #if PSA_LANES == 1
-    if (slows) check_rest(state, trial, g, w0 + w2 > 0.0 ? most : -most, slows);
-    if (early && late) {
-        /* it turns twice: nothing along such a way unless that is nothing */
-        set_error(trial, REAL(1e3));
-    }
+    if (slows && most > 0.0) check_rest(state, trial, g, stages->w, w0 + w2 > 0.0 ? most : -most, slows);
+    if (early && late) set_error(trial, REAL(1e3)); /* it turns twice */
     if (early || late) {
         real value;
-        stages->bracket = late && !early;
-        const real missed = find_turn(state, trial, stages, u, &value);
+        stages->missed = find_turn(state, trial, stages, u, !early, &value);
         stages->legs = 2;
         *two = *one;
         one->dt = stages->turn * trial->dt;
@@ -379,7 +407,6 @@ static void find_legs(psa_state *state, psa_trial *trial, int g, int slopes) {
         memcpy(two->from, one->to, sizeof two->from);
         two->begin = stages->turn;
         two->dt = trial->dt - one->dt;
-        stages->w[QUARTER] = missed;
     }
 #endif
     for (int k = 0; k < stages->legs; ++k) {
@@ -407,20 +434,22 @@ static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
         const int q = ex_group_states[first + i];
         trial->x[WHOLE][q] = last->to[q];
         if (stages->legs > 1) {
-            /* a turn that is off by `missed` is off by the slopes of both branches */
+            /* where the turn is missed counts as far as the branches before and after it differ */
             real slope = REAL(0.0);
             for (int k = 0; k < 2; ++k) {
                 const psa_leg *const leg = stages->leg + k;
-                const real rate = v_fabs(leg->rate);
-                slope += choose(MASK(rate > 0.0), v_fabs(leg->out[0][i]) / rate, REAL(0.0));
+                const bits moves = MASK(leg->rate != 0.0);
+                const real own = k ? leg->out[0][i] : leg->last[i];
+                slope = choose(moves, own / choose(moves, leg->rate, REAL(1.0)), REAL(0.0)) - slope;
             }
-            set_error(trial, slope * stages->w[QUARTER] / state->nominal[q] / state->tolerance);
+            set_error(trial, v_fabs(slope) * stages->missed / state->nominal[q] / state->tolerance);
         }
     }
     group_node(state, trial, g, HALF, 0.5);
     group_node(state, trial, g, QUARTER, 0.25);
 }
 
+#if EX_NLOOP > 0
 /* Entry of a port's partial derivatives by a linear state, 0 where it has none */
 static real port_by_linear(const psa_trial *trial, int n, int j, int linear) {
     real sum = REAL(0.0);
@@ -463,10 +492,9 @@ static void eliminate(int size, real *a, real *b) {
     }
 }
 
-#if EX_NLOOP > 0
 static void do_loop(psa_state *state, psa_trial *trial, const int *ports, int count) {
     static const int AT[2] = {HALF, WHOLE};
-    real without[2][EX_NX], a[4 * EX_NPORT * EX_NPORT], b[2 * EX_NPORT], first[2 * EX_NPORT];
+    real without[2][EX_NX], a[4 * EX_NPORT * EX_NPORT], b[2 * EX_NPORT];
     real change = REAL(0.0);
     for (int n = 0; n < 2; ++n) memcpy(without[n], trial->x[AT[n]], sizeof without[n]);
     for (int j = 0; j < count; ++j)
@@ -497,7 +525,6 @@ static void do_loop(psa_state *state, psa_trial *trial, const int *ports, int co
                 }
                 change = v_fmax(change, v_fabs(b[n * count + j]) * response);
             }
-        (void)first;
         int settled = 1;
         for (int lane = 0; lane < PSA_LANES; ++lane)
             if (!(LANE(change, lane) <= 1e-3 * LANE(state->tolerance, lane))) settled = 0;
@@ -675,17 +702,16 @@ static void do_port_columns(psa_state *state, int j) {
 
 /* Columns of the driver at its turn: at a zero of its rate, those at a fixed time */
 static void turn_columns(psa_state *state, int g, column *out, column *rate) {
+    static const int AT[3] = {NODES, HALF, WHOLE};
     const psa_trial *const trial = &state->trial;
     const psa_stages *const stages = trial->stages + g;
-    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]], late = stages->bracket;
-    const double d = 0.5 * trial->dt;
-    const int node[2] = {late ? HALF : NODES, late ? WHOLE : HALF};
+    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
     fill(out, nb);
-    for (int k = 0; k < 2; ++k) {
-        const column *const x = node[k] == NODES ? state->s : ROW(state->node, node[k] * EX_NX);
-        chain(state, state->rate_list[g], stages->rate_slopes[node[k]] + 1, x, NULL, rate);
+    for (int k = 0; k < 3; ++k) {
+        const column *const x = AT[k] == NODES ? state->s : ROW(state->node, AT[k] * EX_NX);
+        chain(state, state->rate_list[g], stages->rate_slopes[AT[k]] + 1, x, NULL, rate);
         axpy(stages->basis[2 * k], ROW(x, u), out, nb);
-        axpy(stages->basis[2 * k + 1] * d, rate, out, nb);
+        axpy(stages->basis[2 * k + 1] * trial->dt, rate, out, nb);
     }
 }
 
@@ -938,10 +964,7 @@ static int next_sample(psa_state *state, long sample, int *level) {
         at += units;
         run->steps++;
         state->t = run->t[sample] + h * ldexp((double)at, -finest);
-        while (*level > run->coarsest && state->trial.error < GROWS && at % (2 * (end >> *level)) == 0) {
-            --*level;
-            break;
-        }
+        if (*level > run->coarsest && state->trial.error < GROWS && at % (2 * units) == 0) --*level;
     }
     state->t = run->t[sample + 1];
     return 0;
@@ -949,7 +972,7 @@ static int next_sample(psa_state *state, long sample, int *level) {
 #endif
 
 /* The entries of one row that count here */
-static void activate(const psa_state *state, const psa_entry *entries, int count, int row, psa_active *list) {
+COLD static void activate(const psa_state *state, const psa_entry *entries, int count, int row, psa_active *list) {
     for (int e = 0; e < count; ++e) {
         if (entries[e].row != row) continue;
         const int asked = entries[e].kind == 2 ? state->column_of[entries[e].index] : entries[e].index;
@@ -959,7 +982,7 @@ static void activate(const psa_state *state, const psa_entry *entries, int count
     list->kind = -1;
 }
 
-static void activate_all(psa_state *state) {
+COLD static void activate_all(psa_state *state) {
     for (int g = 0; g < EX_NG; ++g) {
         activate(state, ex_rate_entries[g], ex_rate_count[g], 0, state->rate_list[g]);
         for (int i = 0; i < ex_group_size[g]; ++i)
@@ -970,7 +993,7 @@ static void activate_all(psa_state *state) {
     activate(state, ex_shown_entries, EX_SHOWN_OUT - 1, 0, state->shown_list);
 }
 
-static int set_up(psa_state *state) {
+COLD static int set_up(psa_state *state) {
     psa_exact *const run = state->run;
     const int one = NL * (NL + EX_NU + 1);
     for (int i = 0; i < EX_NP; ++i)
@@ -986,6 +1009,7 @@ static int set_up(psa_state *state) {
         state->inverse_nominal[i] = 1.0 / state->nominal[ex_linear[i]];
     }
     state->tolerance = run->tolerance + REAL(0.0);
+    state->brief = v_sqrt(state->tolerance);
     psa_prepare(state->p, state->k);
     for (int i = 0; i < EX_NP; ++i) state->column_of[i] = -1;
     for (int c = 0; c < run->count; ++c)
@@ -1041,7 +1065,7 @@ static int set_up(psa_state *state) {
     return status;
 }
 
-static void tear_down(psa_state *state) {
+COLD static void tear_down(psa_state *state) {
     if (state->ladders)
         for (int i = 0; i < state->run->lengths * PSA_LANES; ++i) free(state->ladders[i].blocks);
     free(state->ladders);

@@ -8,6 +8,12 @@
 #include <stdint.h>
 #include <string.h>
 
+#if defined(__GNUC__)
+#define COLD __attribute__((cold, noinline)) /* runs once: small and quickly compiled */
+#else
+#define COLD
+#endif
+
 #ifndef PSA_LANES
 #define PSA_LANES 1
 #endif

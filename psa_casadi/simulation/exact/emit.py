@@ -162,25 +162,28 @@ class Printer:
             f"static inline void {name}(real t, const real *x, const real *v, real w,"
             " const real *k, real *out) {"
         )
-        self.functions.append("\n".join([head, "    (void)t, (void)x, (void)v, (void)w, (void)k;",
-                                         *lines, "}", ""]))
+        unused = "    (void)t, (void)x, (void)v, (void)w, (void)k;"
+        self.functions.append("\n".join([head, unused, *lines, "}", ""]))
 
     def of_parameters(self, name: str, outputs: Sequence[Expression]) -> None:
         """Print `static void name(p, out)` for outputs that depend on the parameters alone."""
         numbers = self._numbers(outputs)
         lines = self._body(numbers, fixed=True)
-        lines += [f"    out[{i}] = {self._fixed_name(n)};" for i, n in enumerate(numbers)]
-        self.functions.append(
-            "\n".join([f"static void {name}(const real *p, real *out) {{", "    (void)p;",
-                       *lines, "}", ""])
-        )
+        lines += [f"    memset(out, 0, {len(numbers)} * sizeof *out);"]
+        lines += [
+            f"    out[{i}] = {self._fixed_name(n)};"
+            for i, n in enumerate(numbers)
+            if self._graph.value(n) != 0.0
+        ]
+        head = f"COLD static void {name}(const real *p, real *out) {{"
+        self.functions.append("\n".join([head, "    (void)p;", *lines, "}", ""]))
 
     def kept(self) -> tuple[int, str]:
         """Return the size of `k` and the function `psa_prepare(p, k)`; print it last."""
         numbers = list(self._kept)
         lines = self._body(numbers, fixed=True)
         lines += [f"    k[{i}] = {self._fixed_name(n)};" for n, i in self._kept.items()]
-        head = "static void psa_prepare(const real *p, real *k) {"
+        head = "COLD static void psa_prepare(const real *p, real *k) {"
         return len(numbers), "\n".join([head, "    (void)p, (void)k;", *lines, "}", ""])
 
     def _numbers(self, outputs: Sequence[Expression]) -> list[int]:

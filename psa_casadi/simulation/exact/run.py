@@ -28,7 +28,7 @@ FINEST = 12
 #: Time steps that differ by less than this share count as one, and so many may differ by more.
 _ALIKE, _LENGTHS = 1e-6, 8
 #: vectors of four numbers whatever the processor; strict C99 has no vectors
-_FLAGS = ("-std=gnu99", "-O2", "-ftree-vectorize", "-fno-math-errno")
+_FLAGS = ("-std=gnu99", "-O3", "-fno-math-errno")
 _POINTER = ctypes.c_void_p
 
 
