@@ -972,7 +972,7 @@ static int next_sample(psa_state *state, long sample, int *level) {
 #endif
 
 /* The entries of one row that count here */
-COLD static void activate(const psa_state *state, const psa_entry *entries, int count, int row, psa_active *list) {
+APART static void activate(const psa_state *state, const psa_entry *entries, int count, int row, psa_active *list) {
     for (int e = 0; e < count; ++e) {
         if (entries[e].row != row) continue;
         const int asked = entries[e].kind == 2 ? state->column_of[entries[e].index] : entries[e].index;
@@ -982,7 +982,7 @@ COLD static void activate(const psa_state *state, const psa_entry *entries, int 
     list->kind = -1;
 }
 
-COLD static void activate_all(psa_state *state) {
+APART static void activate_all(psa_state *state) {
     for (int g = 0; g < EX_NG; ++g) {
         activate(state, ex_rate_entries[g], ex_rate_count[g], 0, state->rate_list[g]);
         for (int i = 0; i < ex_group_size[g]; ++i)
@@ -993,7 +993,7 @@ COLD static void activate_all(psa_state *state) {
     activate(state, ex_shown_entries, EX_SHOWN_OUT - 1, 0, state->shown_list);
 }
 
-COLD static int set_up(psa_state *state) {
+APART static int set_up(psa_state *state) {
     psa_exact *const run = state->run;
     const int one = NL * (NL + EX_NU + 1);
     for (int i = 0; i < EX_NP; ++i)
@@ -1065,7 +1065,7 @@ COLD static int set_up(psa_state *state) {
     return status;
 }
 
-COLD static void tear_down(psa_state *state) {
+APART static void tear_down(psa_state *state) {
     if (state->ladders)
         for (int i = 0; i < state->run->lengths * PSA_LANES; ++i) free(state->ladders[i].blocks);
     free(state->ladders);

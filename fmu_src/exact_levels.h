@@ -111,7 +111,7 @@ static void next_term(int count, const double *z, const double *previous, double
 }
 
 /* One channel's vectors of a length: their place in a block, how many, and b in all directions */
-COLD static void start_channel(int count, const double *z, double d, const double *b, int first, int orders,
+APART static void start_channel(int count, const double *z, double d, const double *b, int first, int orders,
                           int stride, psa_block *blocks) {
     const size_t size = (size_t)(EX_NCH + 1) * (size_t)(count + 1) * NL;
     double *const term = malloc(2 * size * sizeof(double)), *const other = term + size;
@@ -140,7 +140,7 @@ COLD static void start_channel(int count, const double *z, double d, const doubl
 
 /* F and all vectors of the length d, where M d is small. `lin` are M, B, c and their derivatives by the
    parameters, each (NL * (NL + EX_NU + 1)) numbers, row-major one after the other. */
-COLD static void start_blocks(int count, const double *lin, double d, psa_block *blocks) {
+APART static void start_blocks(int count, const double *lin, double d, psa_block *blocks) {
     const size_t matrices = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
     double *const z = calloc(3 * matrices * NL * NL, sizeof(double));
     double *term = z + matrices * NL * NL, *other = term + matrices * NL * NL;
@@ -215,7 +215,7 @@ static const psa_block *rung(const psa_ladder *ladder, int level) {
 
 /* Fill a ladder down to `levels` at least; 0, or 1 where numbers are not finite or memory is out. `scale` are
    typical sizes of the states, by which M is balanced. */
-COLD static int build_ladder(psa_ladder *ladder, int count, const double *lin, const double *scale, double h,
+APART static int build_ladder(psa_ladder *ladder, int count, const double *lin, const double *scale, double h,
                         int levels) {
     const int one = NL * (NL + EX_NU + 1);
     const size_t each = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
@@ -255,7 +255,7 @@ COLD static int build_ladder(psa_ladder *ladder, int count, const double *lin, c
 
 /* Weights of a port's values at start, half and end in the response at the node theta of the step, from the
    vectors of the node's own length */
-COLD static void port_weights(const psa_block *b, int j, double theta, double out[3][NL]) {
+APART static void port_weights(const psa_block *b, int j, double theta, double out[3][NL]) {
     for (int i = 0; i < NL; ++i) {
         const double q1 = b->v[Q(0, j)][i], q2 = theta * b->v[Q(1, j)][i];
         const double q3 = theta * theta * b->v[Q(2, j)][i];
@@ -266,7 +266,7 @@ COLD static void port_weights(const psa_block *b, int j, double theta, double ou
 }
 
 /* Write direction t of a level into one lane; the balance is taken back */
-COLD static void fill_level(const psa_ladder *ladder, int level, int t, const double *scale, int lane,
+APART static void fill_level(const psa_ladder *ladder, int level, int t, const double *scale, int lane,
                        psa_level *out) {
     const int count = ladder->count;
     static const double THETA[3] = {1.0, 0.5, 0.25};

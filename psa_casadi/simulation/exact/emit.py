@@ -175,7 +175,7 @@ class Printer:
             for i, n in enumerate(numbers)
             if self._graph.value(n) != 0.0
         ]
-        head = f"COLD static void {name}(const real *p, real *out) {{"
+        head = f"APART static void {name}(const real *p, real *out) {{"
         self.functions.append("\n".join([head, "    (void)p;", *lines, "}", ""]))
 
     def kept(self) -> tuple[int, str]:
@@ -183,7 +183,7 @@ class Printer:
         numbers = list(self._kept)
         lines = self._body(numbers, fixed=True)
         lines += [f"    k[{i}] = {self._fixed_name(n)};" for n, i in self._kept.items()]
-        head = "COLD static void psa_prepare(const real *p, real *k) {"
+        head = "APART static void psa_prepare(const real *p, real *k) {"
         return len(numbers), "\n".join([head, "    (void)p, (void)k;", *lines, "}", ""])
 
     def _numbers(self, outputs: Sequence[Expression]) -> list[int]:
