@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from psa_casadi.report.text import story
     from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
     from psa_casadi.simulation.stepper import run
+    from psa_casadi.simulation.timings import Timings, timed
     from psa_casadi.variables import Input, Output, Parameter, State
 
 #: Where each public name lives.
@@ -124,6 +125,10 @@ _HOMES = {
         "save_model",
     ),
     "psa_casadi.simulation.stepper": ("run",),
+    "psa_casadi.simulation.timings": (
+        "Timings",
+        "timed",
+    ),
     "psa_casadi.simulation.simulate": (
         "Trajectory",
         "simulate",
@@ -189,6 +194,8 @@ __all__ = [
     "identify",
     "diagnose",
     "Diagnosis",
+    "timed",
+    "Timings",
     "story",
     "save_figure",
     "write_report",

@@ -1,5 +1,6 @@
 """`psa diagnose`: what the simulation gets wrong, the cause, the extended model, the gain."""
 
+import time as clock
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +13,7 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     show,
+    show_table,
     tell_written,
     width,
     working,
@@ -55,6 +57,12 @@ def diagnose(
             " without it, beside the JSON or the page.",
         ),
     ] = None,
+    timings: Annotated[
+        bool,
+        typer.Option(
+            "--timings", help="Print what each stage took: time, processor time, simulations."
+        ),
+    ] = False,
     columns: ColumnsOption = None,
     origin: OriginOption = Origin.MEASURED,
     quiet: Quiet = False,
@@ -63,34 +71,46 @@ def diagnose(
 
     The exit code is 0 for every verdict.
     """
-    from psa_casadi.cli.inputs import Given
-    from psa_casadi.diagnosis.diagnose import diagnose as run
-    from psa_casadi.report.text import story
+    from psa_casadi.simulation.timings import stage, timed
 
-    given, held = Given(), holdout or []
-    given.stiffness(stiffness)
     outputs = {"--output": output, "--json": json, "--report": report, "--figure": figure}
-    given.outputs({**outputs, "--next": following}, [*records, *held, model])
-    found = given.records(records, held_out=held, columns=columns)
-    start = given.model(model)
-    given.check()
-    count = len(records)
-    with working("diagnosing", quiet) as progress:
-        d = run(
-            found[:count],
-            holdout=found[count:],
-            model=start,
-            stiffness=stiffness,
-            progress=progress,
-        )
-        d = _with_next(d, following or _beside(json or report), progress)
-        progress("writing")
-        _write(d, outputs, origin.value)
-    show(story(d, origin=origin.value, width=width()), quiet)
-    told = d.next_experiment.voltage_csv
-    tell_written(*outputs.values(), told, quiet=quiet)
+    with timed() as spent:
+        with stage("loading"):
+            from psa_casadi.cli.inputs import Given
+            from psa_casadi.diagnosis.diagnose import diagnose as run
+            from psa_casadi.report.text import story
+            from psa_casadi.report.timings import timings_table
+        with stage("reading"):
+            given, held = Given(), holdout or []
+            given.stiffness(stiffness)
+            given.outputs({**outputs, "--next": following}, [*records, *held, model])
+            found = given.records(records, held_out=held, columns=columns)
+            start = given.model(model)
+            given.check()
+        count = len(records)
+        with working("diagnosing", quiet) as progress:
+            d = run(
+                found[:count],
+                holdout=found[count:],
+                model=start,
+                stiffness=stiffness,
+                progress=progress,
+            )
+            with stage("next experiment"):
+                d = _with_next(d, following or _beside(json or report), progress)
+            progress("writing")
+            with stage("writing"):
+                _write(d, outputs, origin.value)
+        with stage("writing"):
+            told = story(d, origin=origin.value, width=width())
+    show(told, quiet)
+    tell_written(*outputs.values(), d.next_experiment.voltage_csv, quiet=quiet)
     if output is not None and not d.causes:
         show(f"nothing was added: {output} holds the base model", quiet)
+    if timings:
+        show("", quiet)
+        show_table(timings_table(spent.stages), quiet)
+        show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", quiet)
 
 
 def _beside(path: Path | None) -> Path | None:

@@ -14,8 +14,10 @@ from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.refitting import refit
+from psa_casadi.simulation.timings import stage
 
 
+@stage("causes judged again")
 def reconsidered(rounds: list[Round], task: Task) -> list[Round]:
     """Return the rounds with every cause but the last judged again beside the later ones.
 

@@ -33,6 +33,7 @@ from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import chosen_start
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
+from psa_casadi.simulation.timings import stage
 
 #: Most causes that are named for one set of records.
 MOST_CAUSES = 3
@@ -62,13 +63,14 @@ def diagnose(
     starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search; `method` can
     leave parts of the method out (for its negative controls). Raises InputError.
     """
-    table = list(effects if effects is not None else EFFECTS.values())
-    records, holdout = in_one_order(records), in_one_order(holdout)
-    experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
-    start, scale_given = chosen_start(records, model, stiffness)
-    start = start.without(c.name for c in table if c.gain is not None)
-    there = {c.name for c in start.components}
-    table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
+    with stage("preparing"):
+        table = list(effects if effects is not None else EFFECTS.values())
+        records, holdout = in_one_order(records), in_one_order(holdout)
+        experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
+        start, scale_given = chosen_start(records, model, stiffness)
+        start = start.without(c.name for c in table if c.gain is not None)
+        there = {c.name for c in start.components}
+        table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
     base = fit_base(start, experiments, progress=progress)
     experiments, stuck = without_stuck_readings(experiments, base)
     if stuck:
@@ -204,6 +206,7 @@ def _round(base: Fit, task: Task) -> Round:
     return examine(base, tuple(base.predicted(task.experiments)), task)
 
 
+@stage("causes together")
 def _settle(rounds: list[Round], task: Task) -> list[Round]:
     """Where two causes or more leave structure, fit all their parameters together once more."""
     last = rounds[-1]

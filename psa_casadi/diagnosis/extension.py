@@ -19,6 +19,7 @@ from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import FIXED
 from psa_casadi.identification.starting import ordinary_values
 from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.timings import stage
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -120,6 +121,7 @@ def extend_afresh(
     return _extension(before, final, first.effect, experiments, colour)
 
 
+@stage("fits afresh")
 def extend_any(
     before: Fit,
     experiments: Sequence[Experiment],

@@ -20,6 +20,7 @@ from psa_casadi.identification.search import search
 from psa_casadi.identification.starting import ordinary_values
 from psa_casadi.identification.starting_points import resolved
 from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.timings import stage
 
 #: A base fit from an extension's parameters counts if its rms falls to this share.
 BETTER_BASE = 0.95
@@ -40,6 +41,7 @@ _AGAIN = 1.5
 _NEAR_BAND, _SEEN, _RESONANCES = (300.0, 10_000.0), 40.0, 2
 
 
+@stage("base fit again")
 def from_extension(
     first: Fit, extension: Extension, experiments: Sequence[Experiment]
 ) -> Fit | None:
@@ -47,6 +49,7 @@ def from_extension(
     return _moved(first, extension.fit, first.unknowns.names, experiments)
 
 
+@stage("base fit again")
 def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
     """Fit the base from resonances and lags that fast records show; None if none explain more.
 
@@ -72,6 +75,7 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     return best if _short(base, best) > _CLEAR else None
 
 
+@stage("base fit again")
 def from_band(
     base: Fit, before: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
@@ -92,6 +96,7 @@ def from_band(
     return None if resonant is None else _tuned(resonant, experiments, progress)
 
 
+@stage("base fit again")
 def from_mode(
     base: Fit,
     before: Fit,
@@ -118,6 +123,7 @@ def from_mode(
     return _in_base(base, before, final, experiments)
 
 
+@stage("base fit again")
 def instead_of(
     base: Fit, extension: Extension, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:

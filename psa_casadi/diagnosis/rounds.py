@@ -29,6 +29,7 @@ from psa_casadi.diagnosis.selection import choose, leading, out_of_character
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.identification.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.timings import stage
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -62,6 +63,7 @@ class Round:
     probability: Mapping[str, float] = field(default_factory=dict)
 
 
+@stage("screening")
 def examine(
     fit: Fit, predicted: tuple[FloatArray, ...], task: Task, known: Sequence[Direction] = ()
 ) -> Round:
@@ -107,6 +109,7 @@ def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
     return screen(fit, trials, lengths, known)
 
 
+@stage("fits of candidates")
 def search_cause(current: Round, number: int, task: Task, first: Extension | None = None) -> None:
     """Fit the leading effects and what could imitate the best, and choose among them.
 
@@ -122,6 +125,7 @@ def search_cause(current: Round, number: int, task: Task, first: Extension | Non
     decide(current, number, task, first)
 
 
+@stage("choosing")
 def decide(current: Round, number: int, task: Task, first: Extension | None = None) -> None:
     """Fit the best extensions to the end and what could look like them, and choose."""
     _sort(current)
@@ -137,6 +141,7 @@ def decide(current: Round, number: int, task: Task, first: Extension | None = No
     current.chosen = ranked[0] if ranked else None
 
 
+@stage("fits afresh")
 def _afresh(current: Round, number: int, task: Task) -> None:
     """Fit extensions afresh, the best first, until one of them explains nearly everything."""
     floor = noise_rms(current.fit.residuals, current.screening.colour)
@@ -215,6 +220,7 @@ def _polish(current: Round, number: int, task: Task) -> None:
     _to_end(current, [e for e in leaders if e.evidence > limit and not e.final], number, task)
 
 
+@stage("fits to the end")
 def _to_end(current: Round, chosen: Sequence[Extension], number: int, task: Task) -> None:
     """Fit some of the extensions to the end, and sort all."""
     if chosen:
@@ -227,6 +233,7 @@ def _to_end(current: Round, chosen: Sequence[Extension], number: int, task: Task
     _sort(current)
 
 
+@stage("fits of imitators")
 def _imitators(current: Round, number: int, task: Task) -> None:
     """Fit the effects that could stand in the best one's place, and keep those fits."""
     colour = current.screening.colour

@@ -29,6 +29,7 @@ from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
+from psa_casadi.simulation.timings import stage
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -40,6 +41,7 @@ _HELD_OUT = (
 )
 
 
+@stage("judging")
 def conclude(
     rounds: Sequence[Round],
     experiments: Sequence[Experiment],

@@ -12,8 +12,6 @@ from math import exp, log, sqrt
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.experiment.filtering import filtered
-
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -29,6 +27,8 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
     x, shape (n,) or (n, k), is linear between its samples and 0 before them. A complex pole comes
     with its conjugate, so that the response is real: twice the real part.
     """
+    from scipy.signal import lfilter  # noqa: PLC0415 (half a second to load, which few records need)
+
     z = pole * h
     if abs(z) < _SERIES:
         one = 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120
@@ -43,7 +43,8 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
         lower = [1.0, -2.0 * np.real(decay), abs(decay) ** 2]
     else:
         upper, lower = np.real([now, before]), [1.0, -np.real(decay)]
-    return filtered(upper, lower, x)
+    found: FloatArray = lfilter(upper, lower, x, axis=0)
+    return found
 
 
 def first_order(time_constant: float, x: FloatArray, h: float) -> FloatArray:

@@ -21,6 +21,7 @@ from psa_casadi.identification.refitting import (
 )
 from psa_casadi.identification.starting_points import resolved, starting_points
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.timings import stage
 
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "c")
@@ -67,6 +68,7 @@ def free_parameters(model: Model) -> list[str]:
     return [n for n in CORE if n in model.values] + effects
 
 
+@stage("base fit")
 def fit_base(
     model: Model, experiments: Sequence[Experiment], *, progress: Progress = lambda _: None
 ) -> Fit:

@@ -7,6 +7,7 @@ lose little to each other.
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -16,10 +17,11 @@ Result = TypeVar("Result")
 def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Return the results for all items in their order; the first exception ends it.
 
-    What has begun is finished first, what has not is left out.
+    What has begun is finished first, what has not is left out. Context variables are the caller's.
     """
     given = list(items)
     if len(given) < 2:
         return [work(item) for item in given]
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        return list(pool.map(work, given))
+        contexts = [copy_context() for _ in given]
+        return list(pool.map(lambda own, item: own.run(work, item), contexts, given))

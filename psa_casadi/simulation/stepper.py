@@ -18,6 +18,7 @@ from psa_casadi.errors import Problems, PsaError
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import fingerprint, generate_c
 from psa_casadi.simulation.compiler import generated_library
+from psa_casadi.simulation.timings import count_run
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -113,6 +114,7 @@ def run(
     nx = len(model.state_names)
     arrays["x0"] = arrays["x0"] if nx else np.zeros(1)  # C has one unused state
     count = len(unknowns)
+    count_run(differentiated=count > 0)
     request = _Run(
         samples=len(t),
         zero_order_hold=int(hold == "zero"),

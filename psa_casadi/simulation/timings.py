@@ -1,0 +1,117 @@
+"""What the stages of long work cost: time, processor time and simulations."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from threading import Lock, get_ident
+
+#: What is spent outside every stage.
+REST = "rest"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage took: seconds, processor seconds of all threads, and runs of the stepper.
+
+    `differentiated` of the `runs` were with sensitivities. A stage within another one counts for
+    itself only.
+    """
+
+    name: str
+    wall: float = 0.0
+    processor: float = 0.0
+    runs: int = 0
+    differentiated: int = 0
+
+
+class Timings:
+    """The stages of one piece of work, in the order in which they began, then the rest.
+
+    The thread that made it tells the stages; runs count from whatever thread works for it.
+    """
+
+    def __init__(self) -> None:
+        self._spent = {REST: Stage(REST)}
+        self._within = [REST]
+        self._thread, self._lock = get_ident(), Lock()
+        self._since = (time.perf_counter(), time.process_time())
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """What every stage has taken so far."""
+        if get_ident() == self._thread:
+            self._settle()
+        named = [s for name, s in self._spent.items() if name != REST]
+        return (*named, self._spent[REST])
+
+    @contextmanager
+    def within(self, name: str) -> Iterator[None]:
+        """Count what follows for a stage; in another thread it stays the present one's."""
+        if get_ident() != self._thread:
+            yield
+            return
+        self._settle()
+        self._within.append(name)
+        self._spent.setdefault(name, Stage(name))
+        try:
+            yield
+        finally:
+            self._settle()
+            self._within.pop()
+
+    def count(self, *, differentiated: bool) -> None:
+        """Count one run of the stepper."""
+        with self._lock:
+            now = self._present()
+            more = now.differentiated + differentiated
+            self._spent[now.name] = replace(now, runs=now.runs + 1, differentiated=more)
+
+    def _present(self) -> Stage:
+        return self._spent[self._within[-1]]
+
+    def _settle(self) -> None:
+        """Add the time since the last change to the present stage."""
+        with self._lock:
+            now, since = (time.perf_counter(), time.process_time()), self._since
+            stage, self._since = self._present(), now
+            wall, processor = (b - a for a, b in zip(since, now, strict=True))
+            self._spent[stage.name] = replace(
+                stage, wall=stage.wall + wall, processor=stage.processor + processor
+            )
+
+
+_timings: ContextVar[Timings | None] = ContextVar("timings", default=None)
+
+
+@contextmanager
+def timed() -> Iterator[Timings]:
+    """Record the stages of all work within.
+
+    Processor time is that of the whole process, whatever else runs in it.
+    """
+    timings = Timings()
+    token = _timings.set(timings)
+    try:
+        yield timings
+    finally:
+        _timings.reset(token)
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Count what is done within as a stage where someone records it; also a decorator."""
+    timings = _timings.get()
+    if timings is None:
+        yield
+    else:
+        with timings.within(name):
+            yield
+
+
+def count_run(*, differentiated: bool) -> None:
+    """Count a run of the stepper for the present stage where someone records it."""
+    timings = _timings.get()
+    if timings is not None:
+        timings.count(differentiated=differentiated)

@@ -1,0 +1,85 @@
+"""The stages of long work: what each took, and the simulations of all its threads."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.components import BASE
+from psa_casadi.experiment import write_record
+from psa_casadi.experiment.excitation import time_grid, triangle
+from psa_casadi.model.compose import compose
+from psa_casadi.report.timings import timings_table
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.timings import REST, Stage, stage, timed
+
+MODEL = compose(BASE)
+
+
+def _simulate(unknowns: list[str]) -> None:
+    with stage("told by a worker"):
+        t = np.linspace(0.0, 1e-3, 5)
+        x0 = np.zeros(len(MODEL.state_names))
+        run(MODEL, t, np.zeros((5, len(MODEL.input_names))), x0, unknowns=unknowns)
+
+
+@stage("outer")
+def _work() -> None:
+    side_by_side(_simulate, [["tau"], ["tau"], []])
+    with stage("inner"):
+        time.sleep(0.05)
+        _simulate([])
+
+
+def test_stages_count_for_themselves_and_simulations_of_all_threads() -> None:
+    _work()  # compiled before
+    with timed() as spent:
+        _simulate([])
+        _work()
+        _work()
+    found = {s.name: s for s in spent.stages}
+    assert list(found) == ["told by a worker", "outer", "inner", REST]
+    assert (found["outer"].runs, found["outer"].differentiated) == (6, 4)
+    assert found["told by a worker"].runs == 3
+    assert found["inner"].wall > 0.09 > found["outer"].wall
+    assert found["inner"].processor < 0.09
+
+
+def test_a_stage_ends_with_an_error() -> None:
+    with timed() as spent:
+        with pytest.raises(ZeroDivisionError), stage("failing"):
+            _ = 1 / 0
+        with stage("next"):
+            time.sleep(0.01)
+    assert [s.name for s in spent.stages] == ["failing", "next", REST]
+    assert spent.stages[1].wall > 0.009 > spent.stages[0].wall
+
+
+def test_the_table_adds_up() -> None:
+    stages = (Stage("fits", 2.0, 3.0, 10, 8), Stage(REST, 1.0, 1.0))
+    assert timings_table(stages).rows == (
+        ("fits", "2.00 s", "3.00 s", "75 %", "10", "8"),
+        (REST, "1.00 s", "1.00 s", "25 %", "", ""),
+        ("total", "3.00 s", "4.00 s", "100 %", "10", "8"),
+    )
+
+
+def test_a_diagnosis_tells_its_stages(tmp_path: Path) -> None:
+    grid = time_grid(1.0, 4e-3)
+    voltage = triangle(grid, 0.0, 100.0, 4.0)
+    noise = 1e-8 * np.random.default_rng(5).standard_normal(grid.size)
+    moved = simulate(MODEL, grid, voltage).displacement + noise
+    path = tmp_path / "a.csv"
+    write_record(path, {"time [s]": grid, "voltage [V]": voltage, "displacement [m]": moved})
+    result = CliRunner().invoke(app, ["diagnose", str(path), "--timings"])
+    assert result.exit_code == 0, result.output
+    table = result.stdout[result.stdout.index("stage ") :].splitlines()
+    names = [line.split("  ")[0] for line in table]
+    assert {"loading", "reading", "base fit", "screening", "judging", "writing"} <= set(names)
+    assert int(next(line for line in table if line.startswith("base fit ")).split()[-2]) > 10
+    assert table[-1].startswith("processor time with the start of Python:")
