@@ -73,6 +73,12 @@ typedef struct {
     short kind, index, entry;
 } psa_active;
 
+/* Where the lanes stand within a sample, the levels of their next steps, and which have come to an end */
+typedef struct {
+    long at[PSA_LANES];
+    int level[PSA_LANES], dead[PSA_LANES];
+} psa_pace;
+
 typedef struct {
     psa_exact *run;
     real t, x[EX_NX], port[EX_NPORT + 1], start_slopes[EX_NPORT + 1][EX_PORT_OUT];
@@ -80,8 +86,9 @@ typedef struct {
     real nominal[EX_NX], inverse_nominal[NL], tolerance, brief;
     psa_ladder *ladders;                  /* [lengths][lanes] */
     psa_level *levels;                    /* [lengths][finest + 1][1 + thetas] */
+    psa_level *mixed;                     /* of lanes whose levels differ */
     char *ready;                          /* [lengths][finest + 1] */
-    double scale[NL];
+    double scale[PSA_LANES][NL];
     int thetas;                           /* unknown parameters of the linear part */
     int theta_column[EX_NTHETA + 1];
     int column_of[EX_NP + 1];             /* -1: not asked for */
@@ -93,6 +100,12 @@ typedef struct {
     psa_trial trial;
 } psa_state;
 
+static int any(bits mask) {
+    int found = 0;
+    for (int lane = 0; lane < PSA_LANES; ++lane) found |= LANE(mask, lane) != 0;
+    return found;
+}
+
 static void set_error(psa_trial *trial, real error) {
     /* a number that is not finite counts as an infinite error */
     const bits fine = MASK(error <= 1e300);
@@ -102,47 +115,56 @@ static void set_error(psa_trial *trial, real error) {
 /* ---- values ------------------------------------------------------------------------------------------ */
 
 /* sum += the response of L to its start, the input and a constant; the whole of it */
-static inline void respond(const psa_node *node, const real *l, const real *v0, const real *dv, real *sum) {
-    for (int i = 0; i < ROWS; ++i) sum[i] += node->c[i];
+static inline void respond(const psa_whole *whole, const real *l, const real *v0, const real *dv, real *sum) {
+    for (int i = 0; i < ROWS; ++i) sum[i] += whole->c[i];
     for (int j = 0; j < NL; ++j)
-        for (int i = 0; i < ROWS; ++i) sum[i] += node->f[j][i] * l[j];
+        for (int i = 0; i < ROWS; ++i) sum[i] += whole->f[j][i] * l[j];
     for (int j = 0; j < EX_NU; ++j)
-        for (int i = 0; i < ROWS; ++i) sum[i] += node->a1[j][i] * v0[j] + node->a2[j][i] * dv[j];
+        for (int i = 0; i < ROWS; ++i) sum[i] += whole->a1[j][i] * v0[j] + whole->a2[j][i] * dv[j];
+}
+
+/* The same of one row inside the step */
+static inline real respond_inside(const psa_row *row, int reads, const real *l, const real *v0, const real *dv) {
+    real sum = row->c;
+    for (int j = 0; j < reads; ++j) sum += row->f[j] * l[j];
+    for (int j = 0; j < EX_NU; ++j) sum += row->a1[j] * v0[j] + row->a2[j] * dv[j];
+    return sum;
 }
 
 /* L at a node without ports, from the start of the step */
-static inline void linear_node(const psa_state *state, psa_trial *trial, int n) {
-    const psa_node *const node = trial->level->node + n;
+static inline void linear_node(psa_trial *trial, int n) {
     if (n == WHOLE) {
         real sum[ROWS];
         for (int i = 0; i < ROWS; ++i) sum[i] = trial->l[i];
-        respond(node, trial->l, trial->v0, trial->dv, sum);
+        respond(&trial->level->whole, trial->l, trial->v0, trial->dv, sum);
         for (int i = 0; i < NL; ++i) trial->x[n][ex_linear[i]] = sum[i];
         return;
     }
     for (int r = 0; r < EX_NEED; ++r) {
         const int i = ex_need[r];
-        real sum = node->c[i];
-        for (int j = 0; j < ex_reads[i]; ++j) sum += node->f[j][i] * trial->l[j];
-        for (int j = 0; j < EX_NU; ++j) sum += node->a1[j][i] * trial->v0[j] + node->a2[j][i] * trial->dv[j];
-        trial->x[n][ex_linear[i]] = trial->l[i] + sum;
+        const psa_row *const row = &trial->level->inner[n - 1][r];
+        trial->x[n][ex_linear[i]] = trial->l[i] + respond_inside(row, ex_reads[i], trial->l, trial->v0, trial->dv);
     }
 }
 
 /* Add a port's response to L at a node */
 static inline void add_port(const psa_state *state, psa_trial *trial, int n, int j) {
-    const psa_node *const node = trial->level->node + n;
     const real n0 = state->port[j], n1 = trial->port[HALF][j], n2 = trial->port[WHOLE][j];
+    const psa_whole *const whole = &trial->level->whole;
     if (n == WHOLE)
         for (int i = ex_port_reaches[j]; i < NL; ++i)
-            trial->x[n][ex_linear[i]] += node->w[j][0][i] * n0 + node->w[j][1][i] * n1 + node->w[j][2][i] * n2;
+            trial->x[n][ex_linear[i]] += whole->w[j][0][i] * n0 + whole->w[j][1][i] * n1 + whole->w[j][2][i] * n2;
     else
         for (int r = 0; r < EX_NEED; ++r) {
             const int i = ex_need[r];
-            if (i >= ex_port_reaches[j])
-                trial->x[n][ex_linear[i]] +=
-                    node->w[j][0][i] * n0 + node->w[j][1][i] * n1 + node->w[j][2][i] * n2;
+            const real *const w = trial->level->inner[n - 1][r].w[j];
+            if (i >= ex_port_reaches[j]) trial->x[n][ex_linear[i]] += w[0] * n0 + w[1] * n1 + w[2] * n2;
         }
+}
+
+/* Weight of a port's value at the half (1) or the end (2) in a row of L that is wanted inside a step */
+static inline real weight_of(const psa_level *level, int n, int j, int value, int r) {
+    return n == WHOLE ? level->whole.w[j][value][ex_need[r]] : level->inner[n - 1][r].w[j][value];
 }
 
 static void evaluate_port(psa_state *state, psa_trial *trial, int n, int j, int slopes) {
@@ -151,6 +173,40 @@ static void evaluate_port(psa_state *state, psa_trial *trial, int n, int j, int 
                        trial->slopes[n][j]);
     else ex_port(j, trial->t[n], trial->x[n], trial->v[n], REAL(0.0), state->k, trial->slopes[n][j]);
     trial->port[n][j] = trial->slopes[n][j][0];
+}
+
+/* How much a port that is off its parabola by so much counts: as a bump of that size about the middle */
+static void set_bump(psa_state *state, psa_trial *trial, int j, real off) {
+    real response = REAL(0.0);
+    for (int i = ex_port_reaches[j]; i < NL; ++i)
+        response = v_fmax(response, v_fabs(trial->level->whole.w[j][1][i]) * state->inverse_nominal[i]);
+    set_error(trial, v_fabs(off) * response / state->tolerance);
+}
+
+/* The parabola through the values a, b and c at 0, 1/2 and 1 */
+static inline real parabola(real s, real a, real b, real c) {
+    return a + s * (4.0 * b - 3.0 * a - c + 2.0 * s * (a - 2.0 * b + c));
+}
+
+/* A port that reads the time may repeat itself at the nodes: it is asked at an odd share too. One whose driver
+   turns is asked at the turn, where what depends on the rate has a notch. */
+static void check_elsewhere(psa_state *state, psa_trial *trial, int j, int g) {
+    const psa_stages *const turned = g < 0 ? NULL : trial->stages + g;
+    real x[EX_NX], v[EX_NU + 1], out[EX_PORT_OUT] = {REAL(0.0)};
+    const real s = turned ? turned->turn : REAL(0.6180339887498949);
+    for (int i = 0; i < EX_NX; ++i) x[i] = parabola(s, state->x[i], trial->x[HALF][i], trial->x[WHOLE][i]);
+    for (int i = 0; i < EX_NU; ++i) v[i] = trial->v0[i] + s * trial->dv[i];
+    if (turned) {
+        const int u = ex_linear[ex_group_driver[g]];
+        x[u] = turned->leg[0].to[u];
+        for (int i = 0; i < ex_group_size[g]; ++i) {
+            const int q = ex_group_states[ex_group_first[g] + i];
+            x[q] = turned->leg[0].to[q];
+        }
+    }
+    ex_port(j, state->t + s * trial->dt, x, v, REAL(0.0), state->k, out);
+    const real off = out[0] - parabola(s, state->port[j], trial->port[HALF][j], trial->port[WHOLE][j]);
+    set_bump(state, trial, j, turned ? choose(MASK(s < 1.0), off, REAL(0.0)) : off);
 }
 
 /* How far a port at the quarter is off the parabola through its values, without what the chord takes */
@@ -163,11 +219,10 @@ static void check_port(psa_state *state, psa_trial *trial, int j, real sigma, in
         off -= sigma * (trial->x[QUARTER][u] - 0.375 * state->x[u] - 0.75 * trial->x[HALF][u] +
                         0.125 * trial->x[WHOLE][u]);
     }
-    real response = REAL(0.0);
-    const psa_node *const node = trial->level->node + WHOLE;
-    for (int i = ex_port_reaches[j]; i < NL; ++i)
-        response = v_fmax(response, v_fabs(node->w[j][1][i]) * state->inverse_nominal[i]);
-    set_error(trial, v_fabs(off) * response / state->tolerance);
+    set_bump(state, trial, j, off);
+    if (ex_port_timed[j]) check_elsewhere(state, trial, j, -1);
+    for (int g = 0; g < EX_NG; ++g)
+        if (ex_port_along[j][g] && trial->stages[g].legs > 1) check_elsewhere(state, trial, j, g);
 }
 
 /* The response to a chord's driver beyond the parabola */
@@ -241,11 +296,12 @@ static real combine(const real basis[6], const real *u, const real *w) {
 
 /* Where the driver turns: the zero of its rate on Hermite's quintic, and its value there. The quarter's value
    tells the quintic's error, which is returned. */
-static real find_turn(psa_state *state, psa_trial *trial, psa_stages *stages, int u, int late, real *value) {
+static real find_turn(psa_state *state, psa_trial *trial, psa_stages *stages, int u, bits late, real *value) {
     const real x[3] = {state->x[u], trial->x[HALF][u], trial->x[WHOLE][u]}, d = trial->dt;
     const real w[3] = {stages->w[NODES] * d, stages->w[HALF] * d, stages->w[WHOLE] * d};
-    real low = REAL(0.5 * late), high = low + 0.5, wl = w[late], wh = w[late + 1], basis[6];
-    real s = low - wl * (high - low) / (wh - wl);
+    real low = choose(late, REAL(0.5), REAL(0.0)), high = low + 0.5, basis[6];
+    real wl = choose(late, w[1], w[0]), wh = choose(late, w[2], w[1]);
+    real s = low - wl * (high - low) / choose(MASK(wh == wl), REAL(1.0), wh - wl);
     for (int k = 0; k < TURNS; ++k) { /* regula falsi, Illinois's variant */
         quintic(s, 1, basis);
         const real slope = combine(basis, x, w);
@@ -271,9 +327,7 @@ static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int 
     /* the midpoint rule errs by a 24th of the cube of the way: nothing beside the tolerance, where the way is
        its root */
     const bits brief = MASK(v_fabs(leg->way) < state->brief * state->nominal[ex_linear[ex_group_driver[g]]]);
-    leg->stages = 2;
-    for (int lane = 0; lane < PSA_LANES; ++lane)
-        if (!LANE(brief, lane)) leg->stages = 4;
+    leg->stages = any(~brief) ? 4 : 2;
     for (int stage = 0; stage < leg->stages; ++stage) {
         real *const x = leg->at[stage], v[EX_NU + 1];
         const double s = SHARE[stage];
@@ -349,7 +403,7 @@ static void check_rest(psa_state *state, psa_trial *trial, int g, const real *w,
     static const double WEIGHT[4] = {1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0, -1.0};
     const int u = ex_linear[ex_group_driver[g]];
     const real rates[4] = {w[NODES], w[HALF], w[WHOLE], (trial->x[WHOLE][u] - state->x[u]) / trial->dt};
-    real fast[EX_GROUP_OUT], out[EX_GROUP_OUT], missed[EX_NX];
+    real fast[EX_GROUP_OUT] = {REAL(0.0)}, out[EX_GROUP_OUT] = {REAL(0.0)}, missed[EX_NX];
     ex_group(g, state->t, state->x, trial->v0, FAST * most, state->k, fast);
     for (int k = 0; k < 4; ++k) {
         ex_group(g, state->t, state->x, trial->v0, rates[k], state->k, out);
@@ -390,29 +444,32 @@ static void find_legs(psa_state *state, psa_trial *trial, int g, int slopes) {
     memcpy(one->to, trial->x[WHOLE], sizeof one->to);
     one->begin = REAL(0.0);
     one->dt = trial->dt;
-#if PSA_LANES == 1
-    if (slows && most > 0.0) check_rest(state, trial, g, stages->w, w0 + w2 > 0.0 ? most : -most, slows);
-    if (early && late) set_error(trial, REAL(1e3)); /* it turns twice */
-    if (early || late) {
+    const bits resting = slows & MASK(most > 0.0), turned = early | late;
+    stages->missed = REAL(0.0);
+    if (any(resting)) check_rest(state, trial, g, stages->w, choose(MASK(w0 + w2 > 0.0), most, -most), resting);
+    set_error(trial, choose(early & late, REAL(1e3), REAL(0.0))); /* it turns twice */
+    if (any(turned)) {
         real value;
-        stages->missed = find_turn(state, trial, stages, u, !early, &value);
+        stages->missed = choose(turned, find_turn(state, trial, stages, u, ~early, &value), REAL(0.0));
+        stages->turn = choose(turned, stages->turn, REAL(1.0));
         stages->legs = 2;
         *two = *one;
-        one->dt = stages->turn * trial->dt;
+        one->dt = choose(turned, stages->turn * trial->dt, trial->dt);
         for (int r = 0; r < EX_NPATH; ++r) {
             const int q = ex_path[r];
-            one->to[q] = one->from[q] + stages->turn * (one->to[q] - one->from[q]);
+            const real there = one->from[q] + stages->turn * (one->to[q] - one->from[q]);
+            one->to[q] = choose(turned, there, one->to[q]);
         }
-        one->to[u] = value;
+        one->to[u] = choose(turned, value, one->to[u]);
         memcpy(two->from, one->to, sizeof two->from);
         two->begin = stages->turn;
         two->dt = trial->dt - one->dt;
     }
-#endif
     for (int k = 0; k < stages->legs; ++k) {
         psa_leg *const leg = stages->leg + k;
         leg->way = leg->to[u] - leg->from[u];
-        leg->rate = choose(MASK(leg->dt > 0.0), leg->way / leg->dt, REAL(0.0));
+        const bits lasts = MASK(leg->dt > 0.0);
+        leg->rate = choose(lasts, leg->way / choose(lasts, leg->dt, REAL(1.0)), REAL(0.0));
     }
 }
 
@@ -471,7 +528,7 @@ static void loop_matrix(const psa_trial *trial, const int *ports, int count, rea
                     for (int r = 0; r < EX_NEED; ++r) {
                         const int q = ex_need[r];
                         sum -= port_by_linear(trial, AT[n], ports[j], q) *
-                               trial->level->node[AT[n]].w[ports[i]][m + 1][q];
+                               weight_of(trial->level, AT[n], ports[i], m + 1, r);
                     }
                     a[(n * count + j) * size + m * count + i] = sum;
                 }
@@ -495,7 +552,8 @@ static void eliminate(int size, real *a, real *b) {
 static void do_loop(psa_state *state, psa_trial *trial, const int *ports, int count) {
     static const int AT[2] = {HALF, WHOLE};
     real without[2][EX_NX], a[4 * EX_NPORT * EX_NPORT], b[2 * EX_NPORT];
-    real change = REAL(0.0);
+    real change = REAL(1e300);
+    bits settled = MASK(change < 0.0);
     for (int n = 0; n < 2; ++n) memcpy(without[n], trial->x[AT[n]], sizeof without[n]);
     for (int j = 0; j < count; ++j)
         trial->port[HALF][ports[j]] = trial->port[WHOLE][ports[j]] = state->port[ports[j]];
@@ -513,22 +571,21 @@ static void do_loop(psa_state *state, psa_trial *trial, const int *ports, int co
             }
         loop_matrix(trial, ports, count, a);
         eliminate(2 * count, a, b);
-        change = REAL(0.0);
+        real moved = REAL(0.0);
         for (int n = 0; n < 2; ++n)
             for (int j = 0; j < count; ++j) {
-                trial->port[AT[n]][ports[j]] += b[n * count + j];
+                trial->port[AT[n]][ports[j]] += choose(settled, REAL(0.0), b[n * count + j]);
                 real response = REAL(0.0);
                 for (int r = 0; r < EX_NEED; ++r) {
                     const int q = ex_need[r];
-                    response = v_fmax(response, v_fabs(trial->level->node[WHOLE].w[ports[j]][n + 1][q]) /
+                    response = v_fmax(response, v_fabs(trial->level->whole.w[ports[j]][n + 1][q]) /
                                                     state->nominal[ex_linear[q]]);
                 }
-                change = v_fmax(change, v_fabs(b[n * count + j]) * response);
+                moved = v_fmax(moved, v_fabs(b[n * count + j]) * response);
             }
-        int settled = 1;
-        for (int lane = 0; lane < PSA_LANES; ++lane)
-            if (!(LANE(change, lane) <= 1e-3 * LANE(state->tolerance, lane))) settled = 0;
-        if (settled) break;
+        change = choose(settled, change, moved);
+        settled |= MASK(change <= 1e-3 * state->tolerance);
+        if (!any(~settled)) break;
     }
     set_error(trial, change / state->tolerance);
     for (int n = 0; n < 2; ++n) {
@@ -551,6 +608,7 @@ static void try_step(psa_state *state, const psa_level *level, long sample, real
     for (int i = 0; i < ROWS; ++i) trial->l[i] = i < NL ? state->x[ex_linear[i]] : REAL(0.0);
     trial->dt = length * h;
     trial->error = REAL(0.0);
+    for (int g = 0; g < EX_NG; ++g) trial->stages[g].legs = 1;
     for (int j = 0; j < EX_NU; ++j) {
         const double change = run->zero_order_hold ? 0.0 : next[j] - now[j];
         trial->v0[j] = now[j] + begin * change;
@@ -559,7 +617,7 @@ static void try_step(psa_state *state, const psa_level *level, long sample, real
     }
     for (int n = 0; n < NODES; ++n) {
         trial->t[n] = state->t + THETA[n] * trial->dt;
-        linear_node(state, trial, n);
+        linear_node(trial, n);
     }
     for (int k = 0; k < EX_NITEMS; ++k) {
         const psa_item *const item = ex_items + k;
@@ -596,36 +654,41 @@ static inline void chain(const psa_state *state, const psa_active *list, const r
     }
 }
 
-/* What the matrices' own derivatives add to the columns of L at a node goes to one column each */
-static void matrix_columns(psa_state *state, int n, int j, const double *sigma, int c) {
+/* What the matrices' own derivatives add to the columns of L at a node, each to its column: those of F and the
+   input's (j < 0), or those of a port's weights, and of its chord with the slope sigma */
+static void matrix_columns(psa_state *state, int n, int j, const double *sigma) {
     const psa_trial *const trial = &state->trial;
-    const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
+    const int nb = state->blocks;
+    const double n0 = j < 0 ? 0.0 : state->port[j], n1 = j < 0 ? 0.0 : trial->port[HALF][j];
+    const double n2 = j < 0 ? 0.0 : trial->port[WHOLE][j];
+    column *const x = ROW(state->node, n * EX_NX);
     for (int m = 0; m < state->thetas; ++m) {
-        const psa_node *const d = trial->level[m + 1].node + n;
-        double sum[ROWS];
-        if (j < 0) {
-            for (int i = 0; i < ROWS; ++i) sum[i] = 0.0;
-            respond(d, trial->l, trial->v0, trial->dv, sum);
-        } else {
-            const double n0 = state->port[j], n1 = trial->port[HALF][j], n2 = trial->port[WHOLE][j];
-            if (sigma) {
-                respond_beyond(state, trial, trial->level + m + 1, c, sum);
-                for (int i = 0; i < ROWS; ++i) sum[i] *= *sigma;
-            } else
-                for (int i = 0; i < ROWS; ++i) sum[i] = 0.0;
-            for (int i = 0; i < ROWS; ++i) sum[i] += d->w[j][0][i] * n0 + d->w[j][1][i] * n1 + d->w[j][2][i] * n2;
+        const psa_level *const d = trial->level + m + 1;
+        if (n != WHOLE) {
+            for (int r = 0; r < EX_NEED; ++r) {
+                const int i = ex_need[r];
+                const psa_row *const row = &d->inner[n - 1][r];
+                const double sum = j < 0 ? respond_inside(row, NL, trial->l, trial->v0, trial->dv)
+                                         : row->w[j][0] * n0 + row->w[j][1] * n1 + row->w[j][2] * n2;
+                add_to(ROW(x, ex_linear[i]), state->theta_column[m], sum);
+            }
+            continue;
         }
-        for (int r = 0; r < rows; ++r) {
-            const int i = n == WHOLE ? r : ex_need[r];
-            add_to(ROW(ROW(state->node, n * EX_NX), ex_linear[i]), state->theta_column[m], sum[i]);
+        double sum[ROWS] = {0.0};
+        if (j < 0) respond(&d->whole, trial->l, trial->v0, trial->dv, sum);
+        else {
+            if (sigma) respond_beyond(state, trial, d, ex_port_chord[j], sum);
+            for (int i = 0; i < ROWS; ++i)
+                sum[i] = (sigma ? *sigma * sum[i] : 0.0) + d->whole.w[j][0][i] * n0 + d->whole.w[j][1][i] * n1 +
+                         d->whole.w[j][2][i] * n2;
         }
+        for (int i = 0; i < NL; ++i) add_to(ROW(x, ex_linear[i]), state->theta_column[m], sum[i]);
     }
 }
 
 /* Columns of L at a node without ports */
 static void linear_columns(psa_state *state, int n) {
-    const psa_trial *const trial = &state->trial;
-    const psa_node *const node = trial->level->node + n;
+    const psa_level *const level = state->trial.level;
     const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
     column *const x = ROW(state->node, n * EX_NX);
     for (int r = 0; r < rows; ++r) {
@@ -634,29 +697,31 @@ static void linear_columns(psa_state *state, int n) {
         const column *const own = ROW(state->s, ex_linear[i]);
         for (int b = 0; b < nb; ++b) {
             column sum = own[b];
-            for (int j = 0; j < ex_reads[i]; ++j) sum += node->f[j][i] * ROW(state->s, ex_linear[j])[b];
+            for (int j = 0; j < ex_reads[i]; ++j)
+                sum += (n == WHOLE ? level->whole.f[j][i] : level->inner[n - 1][r].f[j]) *
+                       ROW(state->s, ex_linear[j])[b];
             out[b] = sum;
         }
     }
-    matrix_columns(state, n, -1, NULL, 0);
+    matrix_columns(state, n, -1, NULL);
 }
 
 static void add_port_columns(psa_state *state, int n, int j, const double *sigma) {
-    const psa_trial *const trial = &state->trial;
-    const psa_node *const node = trial->level->node + n;
+    const psa_level *const level = state->trial.level;
     const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
     const column *const n0 = ROW(state->sport, j), *const n1 = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
     const column *const n2 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
-    int any = 0;
+    int reached = 0;
     for (int r = 0; r < rows; ++r) {
         const int i = n == WHOLE ? r : ex_need[r];
         if (i < ex_port_reaches[j]) continue;
         column *const out = ROW(ROW(state->node, n * EX_NX), ex_linear[i]);
-        const double w0 = node->w[j][0][i], w1 = node->w[j][1][i], w2 = node->w[j][2][i];
-        for (int b = 0; b < nb; ++b) out[b] += w0 * n0[b] + w1 * n1[b] + w2 * n2[b];
-        any = 1;
+        double w[3];
+        for (int q = 0; q < 3; ++q) w[q] = n == WHOLE ? level->whole.w[j][q][i] : level->inner[n - 1][r].w[j][q];
+        for (int b = 0; b < nb; ++b) out[b] += w[0] * n0[b] + w[1] * n1[b] + w[2] * n2[b];
+        reached = 1;
     }
-    if (any) matrix_columns(state, n, j, sigma, ex_port_chord[j]);
+    if (reached) matrix_columns(state, n, j, sigma);
 }
 
 static void port_columns(psa_state *state, int n, int j) {
@@ -846,7 +911,8 @@ static void do_loop_columns(psa_state *state, const int *ports, int count) {
             column *const out = ROW(ROW(state->node, AT[n] * EX_NX), ex_linear[i]);
             for (int j = 0; j < count; ++j)
                 for (int m = 0; m < 2; ++m)
-                    axpy(trial->level->node[AT[n]].w[ports[j]][m + 1][i],
+                    axpy(AT[n] == WHOLE ? trial->level->whole.w[ports[j]][m + 1][i]
+                                        : trial->level->inner[AT[n] - 1][r].w[ports[j]][m + 1],
                          ROW(state->snode_port, AT[m] * (EX_NPORT + 1) + ports[j]), out, nb);
         }
 }
@@ -879,7 +945,7 @@ static const psa_level *level_of(psa_state *state, int step, int level) {
     if (!state->ready[at]) {
         for (int lane = 0; lane < PSA_LANES; ++lane)
             for (int t = 0; t < each; ++t)
-                fill_level(state->ladders + step * PSA_LANES + lane, level, t, state->scale, lane, found + t);
+                fill_level(state->ladders + step * PSA_LANES + lane, level, t, state->scale[lane], lane, found + t);
         state->ready[at] = 1;
     }
     return found;
@@ -901,7 +967,7 @@ static void start_ports(psa_state *state, const double *input) {
     }
 }
 
-static int write_sample(psa_state *state, long sample) {
+static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
     const psa_exact *const run = state->run;
     const int sets = run->sets;
     real v[EX_NU + 1], out[EX_SHOWN_OUT > EX_NY ? EX_SHOWN_OUT : EX_NY];
@@ -920,8 +986,8 @@ static int write_sample(psa_state *state, long sample) {
     if (run->count == 0) {
         ex_shown(state->t, state->x, v, REAL(0.0), state->k, out);
         for (int lane = 0; lane < sets; ++lane) {
-            run->shown[sample * sets + lane] = LANE(out[0], lane);
-            if (!isfinite(LANE(out[0], lane))) return 1;
+            run->shown[sample * sets + lane] = pace->dead[lane] ? NAN : LANE(out[0], lane);
+            if (PSA_LANES == 1 && !isfinite(LANE(out[0], lane))) return 1;
         }
         return 0;
     }
@@ -937,39 +1003,84 @@ static int write_sample(psa_state *state, long sample) {
 #endif
 }
 
+/* The levels of lanes that differ, put together */
+#if PSA_LANES > 1
+static const psa_level *gather(psa_state *state, int step, const int *level) {
+    const size_t count = sizeof(psa_level) / sizeof(real);
+    for (int lane = 0; lane < PSA_LANES; ++lane) {
+        const double *const from = (const double *)level_of(state, step, level[lane]) + lane;
+        double *const to = (double *)state->mixed + lane;
+        for (size_t k = 0; k < count; ++k) to[k * PSA_LANES] = from[k * PSA_LANES];
+    }
+    return state->mixed;
+}
+#endif
+
 /* Steps over one interval between samples. Positions are counted in the finest lengths; a step begins at a
-   multiple of its own length. Lanes stand side by side as long as their levels agree. */
-#if PSA_LANES == 1
-static int next_sample(psa_state *state, long sample, int *level) {
+   multiple of its own length. Every lane goes at its own pace, as it would by itself. */
+static int next_sample(psa_state *state, long sample, psa_pace *pace) {
     psa_exact *const run = state->run;
     const int step = run->which_step[sample], finest = run->finest;
     const double h = run->length[step];
     const long end = 1L << finest;
-    long at = 0, left = run->steps_limit;
-    while (at < end) {
-        const long units = end >> *level;
+    long left = run->steps_limit;
+    psa_trial *const trial = &state->trial;
+    for (int lane = 0; lane < PSA_LANES; ++lane) pace->at[lane] = pace->dead[lane] ? end : 0;
+    for (;;) {
+        int first = -1, level[PSA_LANES], same = 1;
+        real begin = REAL(0.0), length = REAL(1.0);
+        for (int lane = PSA_LANES - 1; lane >= 0; --lane)
+            if (pace->at[lane] < end) first = lane;
+        if (first < 0) break;
         if (--left < 0) return 3;
-        try_step(state, level_of(state, step, *level), sample, ldexp((double)at, -finest), ldexp(1.0, -*level),
-                 h, run->count > 0);
-        if (!(state->trial.error <= 1.0) && *level < finest) {
-            ++*level;
-            run->rejected++;
-            continue;
+        for (int lane = 0; lane < PSA_LANES; ++lane) {
+            level[lane] = pace->level[pace->at[lane] < end ? lane : first];
+            same &= level[lane] == level[first];
+            SET_LANE(begin, lane, ldexp((double)pace->at[lane], -finest));
+            SET_LANE(length, lane, ldexp(1.0, -level[lane]));
         }
-        if (!(state->trial.error <= 1.0)) run->forced++;
-        if (!(state->trial.error < 1e300)) return 1;
+#if PSA_LANES > 1
+        const psa_level *const matrices = same ? level_of(state, step, level[0]) : gather(state, step, level);
+#else
+        const psa_level *const matrices = level_of(state, step, level[0]);
+        (void)same;
+#endif
+        try_step(state, matrices, sample, begin, length, h, run->count > 0);
+        bits accepted = MASK(REAL(0.0) > 1.0);
+        for (int lane = 0; lane < PSA_LANES; ++lane) {
+            if (pace->at[lane] >= end) continue;
+            const double error = LANE(trial->error, lane);
+            if (error > 1.0 && level[lane] < finest) {
+                pace->level[lane]++;
+                run->rejected++;
+                continue;
+            }
+            if (error > 1.0) run->forced++;
+            if (!(error < 1e300)) {
+                if (PSA_LANES == 1) return 1;
+                pace->dead[lane] = 1;
+                pace->at[lane] = end;
+                continue;
+            }
+            const long units = end >> level[lane];
+            pace->at[lane] += units;
+            run->steps++;
+            if (level[lane] > run->coarsest && error < GROWS && pace->at[lane] % (2 * units) == 0)
+                pace->level[lane]--;
+            SET_LANE(state->t, lane, run->t[sample] + h * ldexp((double)pace->at[lane], -finest));
+            SET_LANE(accepted, lane, -1);
+        }
+        if (!any(accepted)) continue;
+#if PSA_LANES == 1
         if (run->count > 0) step_columns(state);
-        memcpy(state->x, state->trial.x[WHOLE], sizeof state->x);
-        memcpy(state->port, state->trial.port[WHOLE], sizeof state->port);
-        at += units;
-        run->steps++;
-        state->t = run->t[sample] + h * ldexp((double)at, -finest);
-        if (*level > run->coarsest && state->trial.error < GROWS && at % (2 * units) == 0) --*level;
+#endif
+        for (int i = 0; i < EX_NX; ++i) state->x[i] = choose(accepted, trial->x[WHOLE][i], state->x[i]);
+        for (int j = 0; j < EX_NPORT; ++j)
+            state->port[j] = choose(accepted, trial->port[WHOLE][j], state->port[j]);
     }
-    state->t = run->t[sample + 1];
+    state->t = run->t[sample + 1] + REAL(0.0);
     return 0;
 }
-#endif
 
 /* The entries of one row that count here */
 APART static void activate(const psa_state *state, const psa_entry *entries, int count, int row, psa_active *list) {
@@ -996,18 +1107,16 @@ APART static void activate_all(psa_state *state) {
 APART static int set_up(psa_state *state) {
     psa_exact *const run = state->run;
     const int one = NL * (NL + EX_NU + 1);
-    for (int i = 0; i < EX_NP; ++i)
-        for (int lane = 0; lane < PSA_LANES; ++lane)
-            SET_LANE(state->p[i], lane, run->p[i * run->sets + (lane < run->sets ? lane : 0)]);
-    for (int i = 0; i < EX_NX; ++i) {
-        state->nominal[i] = run->nominal[i] + REAL(0.0);
-        for (int lane = 0; lane < PSA_LANES; ++lane)
-            SET_LANE(state->x[i], lane, run->x0[i * run->sets + (lane < run->sets ? lane : 0)]);
+    for (int lane = 0; lane < PSA_LANES; ++lane) {
+        const int set = lane < run->sets ? lane : 0; /* lanes without a set of their own go with the first */
+        for (int i = 0; i < EX_NP; ++i) SET_LANE(state->p[i], lane, run->p[i * run->sets + set]);
+        for (int i = 0; i < EX_NX; ++i) {
+            SET_LANE(state->nominal[i], lane, run->nominal[i * run->sets + set]);
+            SET_LANE(state->x[i], lane, run->x0[i * run->sets + set]);
+        }
+        for (int i = 0; i < NL; ++i) state->scale[lane][i] = run->nominal[ex_linear[i] * run->sets + set];
     }
-    for (int i = 0; i < NL; ++i) {
-        state->scale[i] = run->nominal[ex_linear[i]];
-        state->inverse_nominal[i] = 1.0 / state->nominal[ex_linear[i]];
-    }
+    for (int i = 0; i < NL; ++i) state->inverse_nominal[i] = 1.0 / state->nominal[ex_linear[i]];
     state->tolerance = run->tolerance + REAL(0.0);
     state->brief = v_sqrt(state->tolerance);
     psa_prepare(state->p, state->k);
@@ -1026,10 +1135,11 @@ APART static int set_up(psa_state *state) {
     const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
     state->levels = calloc(levels * (size_t)(1 + state->thetas), sizeof(psa_level));
     state->ready = calloc(levels, 1);
+    state->mixed = PSA_LANES > 1 ? malloc(sizeof(psa_level)) : NULL;
     real *const plain = malloc((size_t)one * sizeof(real));
     real *const slopes = malloc((size_t)(one * (EX_NTHETA + 1)) * sizeof(real));
     double *const lin = malloc((size_t)(one * (state->thetas + 1)) * sizeof(double));
-    int status = !state->ladders || !state->levels || !state->ready || !plain || !slopes || !lin ? 2 : 0;
+    int status = (PSA_LANES > 1 && !state->mixed) || !state->ladders || !state->levels || !state->ready || !plain || !slopes || !lin ? 2 : 0;
     if (status == 0) {
         psa_linear(state->p, plain);
         if (state->thetas > 0) psa_linear_slopes(state->p, slopes);
@@ -1041,7 +1151,7 @@ APART static int set_up(psa_state *state) {
                 lin[(m + 1) * one + i] = LANE(slopes[theta[m] * one + i], lane);
         }
         for (int step = 0; step < run->lengths && status == 0; ++step)
-            status = build_ladder(state->ladders + step * PSA_LANES + lane, state->thetas, lin, state->scale,
+            status = build_ladder(state->ladders + step * PSA_LANES + lane, state->thetas, lin, state->scale[lane],
                                   run->length[step], run->finest + 2);
     }
     free(plain);
@@ -1071,6 +1181,7 @@ APART static void tear_down(psa_state *state) {
     free(state->ladders);
     free(state->levels);
     free(state->ready);
+    free(state->mixed);
     free(state->s);
 }
 
@@ -1079,18 +1190,19 @@ int psa_run_exact(psa_exact *run) {
     if (!state) return 2;
     state->run = run;
     run->steps = run->rejected = run->forced = 0;
+    psa_pace pace;
+    memset(&pace, 0, sizeof pace);
+    for (int lane = 0; lane < PSA_LANES; ++lane) pace.level[lane] = run->coarsest;
     int status = set_up(state);
     state->t = run->t[0] + REAL(0.0);
     if (status == 0) {
         start_ports(state, run->v);
-        status = write_sample(state, 0);
+        status = write_sample(state, 0, &pace);
     }
-    int level = run->coarsest;
     for (long sample = 0; sample + 1 < run->samples && status == 0; ++sample) {
         if (run->zero_order_hold && sample > 0) start_ports(state, run->v + sample * EX_NU);
-        level = level < run->coarsest ? run->coarsest : level;
-        status = next_sample(state, sample, &level);
-        if (status == 0) status = write_sample(state, sample + 1);
+        status = next_sample(state, sample, &pace);
+        if (status == 0) status = write_sample(state, sample + 1, &pace);
     }
     run->t_failed = LANE(state->t, 0);
     tear_down(state);

@@ -19,13 +19,14 @@ typedef struct {
     int sets;              /* sets of parameters, at most PSA_LANES */
     const double *p;       /* [np][sets] */
     const double *x0;      /* [nx][sets] */
-    const double *nominal; /* [nx] of the first set */
+    const double *nominal; /* [nx][sets] */
     double tolerance;      /* of one step, over the nominal sizes */
     int coarsest, finest;  /* levels: a sample is divided by at least 2^coarsest, at most 2^finest */
     long steps_limit;      /* between two samples */
     double *x;             /* [samples][nx][sets] or NULL */
     double *y;             /* [samples][ny][sets] or NULL */
-    double *shown;         /* [samples][sets] or NULL: the output whose sensitivity the model has */
+    double *shown;         /* [samples][sets] or NULL: the output whose sensitivity the model has; nan from where
+                              one of several sets cannot be integrated */
     int count;             /* unknowns of the sensitivities; 0 where there is more than one set */
     const int *which;      /* [count] parameter index, -1: initial value */
     const double *s0;      /* [nx][count] d x0 / d theta */

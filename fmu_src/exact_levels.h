@@ -42,18 +42,26 @@ typedef struct {
 #define ROWS NL
 #endif
 
-/* What a step of one length needs. Of each node (the whole, the half and the quarter of the step): F, a_1, a_2
-   (over the step's change of v), c_1, and each port's weights of its values at the start, the half and the
-   end. Of each chord: the response to sigma u(t) beyond what these weights see of it. */
-typedef struct {
-    real f[NL][ROWS], a1[EX_NU + 1][ROWS], a2[EX_NU + 1][ROWS], c[ROWS], w[EX_NPORT + 1][3][ROWS];
-} psa_node; /* by columns */
+/* What a step of one length needs. Of its whole: F, a_1, a_2, c_1, and each port's weights of its values at the
+   start, the half and the end, by columns. Of its half and its quarter: the same (a_2 over the step's whole
+   change of v) for the states that are wanted inside a step, by rows. Of each chord: the response to sigma u(t)
+   beyond what these weights see of it. */
+#define SOME(n) ((n) > 0 ? (n) : 1)
 
 typedef struct {
-    psa_node node[3]; /* whole, half, quarter */
-    real chord_f[EX_NCH + 1][NL][ROWS], chord_a1[EX_NCH + 1][EX_NU + 1][ROWS],
-        chord_a2[EX_NCH + 1][EX_NU + 1][ROWS], chord_c[EX_NCH + 1][ROWS],
-        chord_w[EX_NCH + 1][EX_NFEED + 1][3][ROWS]; /* of the ports that feed the driver */
+    real f[NL][ROWS], a1[SOME(EX_NU)][ROWS], a2[SOME(EX_NU)][ROWS], c[ROWS], w[SOME(EX_NPORT)][3][ROWS];
+} psa_whole;
+
+typedef struct {
+    real f[NL], a1[SOME(EX_NU)], a2[SOME(EX_NU)], c, w[SOME(EX_NPORT)][3];
+} psa_row;
+
+typedef struct {
+    psa_whole whole;
+    psa_row inner[2][EX_NEED]; /* half, quarter */
+    real chord_f[SOME(EX_NCH)][SOME(EX_NDRIVE)][ROWS], chord_a1[SOME(EX_NCH)][SOME(EX_NU)][ROWS],
+        chord_a2[SOME(EX_NCH)][SOME(EX_NU)][ROWS], chord_c[SOME(EX_NCH)][ROWS],
+        chord_w[SOME(EX_NCH)][SOME(EX_NFEED)][3][ROWS]; /* of the ports that feed the driver */
 } psa_level;
 
 /* Directions: [chord or 0][parameter or 0]; the algebra in which parameters and chords square to zero */
@@ -271,25 +279,42 @@ APART static void fill_level(const psa_ladder *ladder, int level, int t, const d
     const int count = ladder->count;
     static const double THETA[3] = {1.0, 0.5, 0.25};
     double w[3][NL], dw[3][NL];
+    psa_whole *const whole = &out->whole;
     for (int n = 0; n < 3; ++n) {
         const psa_block *const b = BLOCK(rung(ladder, level + n), count, 0, t);
-        psa_node *const node = out->node + n;
-        for (int i = 0; i < NL; ++i) {
-            for (int j = 0; j < NL; ++j)
-                SET_LANE(node->f[j][i], lane, b->f[i * NL + j] * scale[i] / scale[j]);
-            for (int j = 0; j < EX_NU; ++j) {
-                SET_LANE(node->a1[j][i], lane, b->v[A1(j)][i] * scale[i]);
-                SET_LANE(node->a2[j][i], lane, THETA[n] * b->v[A2(j)][i] * scale[i]);
+        const int rows = n == 0 ? NL : EX_NEED;
+        for (int r = 0; r < rows; ++r) {
+            const int i = n == 0 ? r : ex_need[r];
+            psa_row *const row = n == 0 ? NULL : &out->inner[n - 1][r];
+            for (int j = 0; j < NL; ++j) {
+                const double value = b->f[i * NL + j] * scale[i] / scale[j];
+                if (row) SET_LANE(row->f[j], lane, value);
+                else SET_LANE(whole->f[j][i], lane, value);
             }
-            SET_LANE(node->c[i], lane, b->v[C1][i] * scale[i]);
+            for (int j = 0; j < EX_NU; ++j) {
+                const double one = b->v[A1(j)][i] * scale[i], two = THETA[n] * b->v[A2(j)][i] * scale[i];
+                if (row) {
+                    SET_LANE(row->a1[j], lane, one);
+                    SET_LANE(row->a2[j], lane, two);
+                } else {
+                    SET_LANE(whole->a1[j][i], lane, one);
+                    SET_LANE(whole->a2[j][i], lane, two);
+                }
+            }
+            if (row) SET_LANE(row->c, lane, b->v[C1][i] * scale[i]);
+            else SET_LANE(whole->c[i], lane, b->v[C1][i] * scale[i]);
         }
         for (int j = 0; j < EX_NPORT; ++j) {
             /* a port adds to its row in physical units: 1 is 1/scale in the balanced ones */
             const double unit = 1.0 / scale[ex_port_row[j]];
             port_weights(b, j, THETA[n], w);
             for (int q = 0; q < 3; ++q)
-                for (int i = 0; i < NL; ++i)
-                    SET_LANE(node->w[j][q][i], lane, w[q][i] * unit * scale[i]);
+                for (int r = 0; r < rows; ++r) {
+                    const int i = n == 0 ? r : ex_need[r];
+                    const double value = w[q][i] * unit * scale[i];
+                    if (n == 0) SET_LANE(whole->w[j][q][i], lane, value);
+                    else SET_LANE(out->inner[n - 1][r].w[j][q], lane, value);
+                }
         }
     }
     for (int c = 0; c < EX_NCH; ++c) {
@@ -309,8 +334,8 @@ APART static void fill_level(const psa_ladder *ladder, int level, int t, const d
                 double seen = j == u ? dw[0][i] + dw[1][i] + dw[2][i] : 0.0;
                 seen += dw[1][i] * base[1]->f[u * NL + j] + dw[2][i] * base[0]->f[u * NL + j];
                 if (t > 0) seen += w[1][i] * node[1]->f[u * NL + j] + w[2][i] * node[0]->f[u * NL + j];
-                SET_LANE(out->chord_f[c][j][i], lane,
-                         (s->f[i * NL + j] - seen) * unit * scale[i] / scale[j]);
+                if (j < ex_reads[u])
+                    SET_LANE(out->chord_f[c][j][i], lane, (s->f[i * NL + j] - seen) * unit * scale[i] / scale[j]);
             }
             for (int j = 0; j < EX_NU; ++j) {
                 double one = dw[1][i] * base[1]->v[A1(j)][u] + dw[2][i] * base[0]->v[A1(j)][u];

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from psa_casadi.report.fit_page import write_fit_report
     from psa_casadi.report.page import write_report
     from psa_casadi.report.text import story
+    from psa_casadi.simulation.many import simulate_many
     from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
     from psa_casadi.simulation.stepper import run
     from psa_casadi.simulation.timings import Timings, timed
@@ -124,6 +125,7 @@ _HOMES = {
         "load_model",
         "save_model",
     ),
+    "psa_casadi.simulation.many": ("simulate_many",),
     "psa_casadi.simulation.stepper": ("run",),
     "psa_casadi.simulation.timings": (
         "Timings",
@@ -189,6 +191,7 @@ __all__ = [
     "Trajectory",
     "simulate",
     "simulate_record",
+    "simulate_many",
     "run",
     "Identification",
     "identify",

@@ -19,7 +19,7 @@ EXACT, STEPPER = "exact steps", "stepper"
 STEP_SHARE, SMALLEST_STEP_RTOL = 0.003, 1e-12
 #: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
 #: Each is judged by the one before.
-_LADDER = ((0.1, 0), (0.01, 1), (1e-3, 2), (1e-4, 3))
+_LADDER = ((0.1, 0), (0.01, 0), (1e-3, 1), (1e-4, 1))
 #: Loosest tolerance of exact steps: beyond it nothing is won.
 _LOOSEST = 1e-5
 #: Range below which a displacement counts as constant, over its nominal size.
@@ -57,6 +57,18 @@ def exact(model: Model, t: FloatArray, way: Way, output: str) -> bool:
     except NotExact:
         return False
     return True
+
+
+def output_of(model: Model) -> str | None:
+    """Return the name of the displacement that a model shows, None if it has none."""
+    names = ("measured_displacement", "displacement")
+    return next((n for n in names if n in model.output_names), None)
+
+
+def output_of(model: Model) -> str | None:
+    """Return the name of the displacement that a model shows, None if it has none."""
+    names = ("measured_displacement", "displacement")
+    return next((n for n in names if n in model.output_names), None)
 
 
 def trace(
@@ -104,15 +116,14 @@ def accurate(
     Exact steps are halved until two runs agree to that; where they do not, the stepper takes steps
     of 0.003 `rtol`.
     """
-    names = ("measured_displacement", "displacement")
-    output = next((n for n in names if n in model.output_names), None)
+    output = output_of(model)
     before: FloatArray | None = None
     nominal = 0.0 if output is None else model.output_nominals()[model.output_names.index(output)]
     for share, coarsest in _LADDER if output else ():
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
-                output=output or "", everything=coarsest > 0,
+                output=output or "", everything=before is not None,
             )  # fmt: skip
         except NotExact:
             break

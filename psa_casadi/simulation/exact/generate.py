@@ -61,6 +61,7 @@ def generate(split: Split, output: str) -> str:
         "ex_path": path,
         "ex_theta": thetas,
         "ex_reads": [int(np.flatnonzero(row)[-1]) + 1 for row in reach],
+        "ex_port_timed": [int(ca.depends_on(q.value, s.time)) for q in split.ports],
         "ex_port_reaches": [
             int(np.flatnonzero(reach[:, place[q.state]])[0]) for q in split.ports
         ],
@@ -78,7 +79,10 @@ def generate(split: Split, output: str) -> str:
         [j for j, q in enumerate(split.ports) if reach[place[split.ports[k].chord], place[q.state]]]
         for k in chords
     ]
-    sizes |= {"EX_NFEED": max((len(f) for f in feeds), default=0)}
+    sizes |= {
+        "EX_NFEED": max((len(f) for f in feeds), default=0),
+        "EX_NDRIVE": max((lists["ex_reads"][k] for k in lists["ex_chord_driver"]), default=0),
+    }
     sizes |= {"EX_NEED": len(needed), "EX_NPATH": len(path)}
     head = ["#ifndef PSA_EXACT_MODEL_H", "#define PSA_EXACT_MODEL_H", '#include "exact_math.h"']
     head += [f"#define {name} {value}" for name, value in sizes.items()]
@@ -88,6 +92,7 @@ def generate(split: Split, output: str) -> str:
         "typedef struct { int kind, count; const int *members; } psa_item;",
         *(_integers(name, values) for name, values in lists.items()),
         _table("ex_feed", feeds, sizes["EX_NFEED"] + 1),
+        _table("ex_port_along", _along(split), max(1, len(split.groups))),
         *tables,
         *_items(split),
     ]  # fmt: skip
@@ -217,6 +222,12 @@ def _needed(split: Split) -> tuple[list[int], list[int]]:
     for port in split.ports:
         inside |= _read(split, port.value) | ({port.chord} if port.chord >= 0 else set())
     return sorted((inside | path) - set(split.along)), sorted(path)
+
+
+def _along(split: Split) -> list[list[int]]:
+    """Return for every port which groups' drivers or states it reads."""
+    read = [_read(split, q.value) for q in split.ports]
+    return [[int(bool(r & {g.driver, *g.states})) for g in split.groups] or [0] for r in read]
 
 
 def _linear_reach(split: Split) -> npt.NDArray[np.bool_]:

@@ -25,6 +25,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: A sample is halved so many times at most; what then misses the tolerance is counted as forced.
 FINEST = 12
+#: Sets of parameters that run side by side in the vectors of one core.
+LANES = 4
 #: Time steps that differ by less than this share count as one, and so many may differ by more.
 _ALIKE, _LENGTHS = 1e-6, 8
 #: vectors of four numbers whatever the processor; strict C99 has no vectors
@@ -36,7 +38,7 @@ class NotExact(Exception):  # noqa: N818 - the stepper is taken instead, which i
     """A run that exact steps do not do; the message says why."""
 
 
-class _Run(ctypes.Structure):
+class _Request(ctypes.Structure):
     """Mirror of `psa_exact` in exact.h."""
 
     _fields_ = [
@@ -104,7 +106,7 @@ def _generator() -> str:
 @cache
 def _library(structure: Structure, output: str, lanes: int) -> ctypes.CDLL:
     library = ctypes.CDLL(str(_compiled(structure, output, lanes)))
-    library.psa_run_exact.argtypes = [ctypes.POINTER(_Run)]
+    library.psa_run_exact.argtypes = [ctypes.POINTER(_Request)]
     library.psa_run_exact.restype = ctypes.c_int
     return library
 
@@ -156,32 +158,78 @@ def run_exact(
     reason = why_not(model.structure, output)
     if reason:
         raise NotExact(reason)
-    lengths, which_step = time_steps(t)
     n, nx, count = len(t), len(model.state_names), len(unknowns)
     given = values or model.values
     names = model.parameter_names
     which = np.array([names.index(q) if isinstance(q, str) else -1 for q in unknowns], np.int32)
     start = np.zeros((nx, count)) if s0 is None else s0
     arrays: dict[str, npt.NDArray[Any]] = {
-        "t": _doubles(t), "v": _doubles(u), "length": lengths, "which_step": which_step,
         "p": np.array([given[name] for name in names]), "x0": _doubles(x0),
         "nominal": model.state_nominals(), "shown": np.empty(n), "which": which,
         "s0": _doubles(start), "dy": np.empty((n, count)),
     }  # fmt: skip
     if everything:
         arrays |= {"x": np.empty((n, nx)), "y": np.empty((n, len(model.output_names)))}
-    request = _Run(
-        samples=n, zero_order_hold=int(hold == "zero"), lengths=len(lengths), sets=1,
-        tolerance=tolerance, coarsest=coarsest, finest=max(FINEST, coarsest),
-        steps_limit=steps_limit, count=count, **{k: a.ctypes.data for k, a in arrays.items()},
-    )  # fmt: skip
-    status = _library(model.structure, output, 1).psa_run_exact(ctypes.byref(request))
-    if status:
-        raise NotExact(f"exact steps ended at t = {request.t_failed:.6g} s")
+    library = _library(model.structure, output, 1)
+    how = {"tolerance": tolerance, "coarsest": coarsest, "steps_limit": steps_limit}
+    cost = _run(library, (t, u, hold), arrays, sets=1, count=count, **how)
     return ExactSteps(
-        arrays["shown"], arrays["dy"] if count else None, arrays.get("x"), arrays.get("y"),
-        request.steps, request.rejected, request.forced,
-    )  # fmt: skip
+        arrays["shown"], arrays["dy"] if count else None, arrays.get("x"), arrays.get("y"), *cost
+    )
+
+
+def run_sets(
+    structure: Structure,
+    t: FloatArray,
+    u: FloatArray,
+    *,
+    p: FloatArray,
+    x0: FloatArray,
+    nominal: FloatArray,
+    tolerance: float,
+    hold: str = "linear",
+    steps_limit: int = 100_000,
+    output: str = "measured_displacement",
+) -> FloatArray:
+    """Return the output (n, m) of at most `LANES` sets of parameters p (np, m), run side by side.
+
+    `x0` and `nominal` are (nx, m). Every column has the bits of a run by itself; one that cannot be
+    integrated is nan from there on. Raises NotExact like `run_exact`.
+    """
+    reason = why_not(structure, output)
+    if reason:
+        raise NotExact(reason)
+    sets = p.shape[1]
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "p": _doubles(p), "x0": _doubles(x0), "nominal": _doubles(nominal),
+        "shown": np.empty((len(t), sets)),
+    }  # fmt: skip
+    how = {"tolerance": tolerance, "coarsest": 0, "steps_limit": steps_limit}
+    _run(_library(structure, output, LANES), (t, u, hold), arrays, sets=sets, count=0, **how)
+    return arrays["shown"]
+
+
+def _run(
+    library: ctypes.CDLL,
+    record: tuple[FloatArray, FloatArray, str],
+    arrays: Mapping[str, npt.NDArray[Any]],
+    **how: Any,
+) -> tuple[int, int, int]:
+    """Run the library over times, inputs and hold; return steps, rejected and forced ones."""
+    t, u, hold = record
+    lengths, which_step = time_steps(t)
+    given = {"t": _doubles(t), "v": _doubles(u), "length": lengths, "which_step": which_step}
+    request = _Request(
+        samples=len(t),
+        zero_order_hold=int(hold == "zero"),
+        lengths=len(lengths),
+        finest=max(FINEST, int(how["coarsest"])),
+        **how,
+        **{name: array.ctypes.data for name, array in {**given, **arrays}.items()},
+    )
+    if library.psa_run_exact(ctypes.byref(request)):
+        raise NotExact(f"exact steps ended at t = {request.t_failed:.6g} s")
+    return request.steps, request.rejected, request.forced
 
 
 def _doubles(values: npt.ArrayLike) -> FloatArray:

@@ -27,6 +27,13 @@ from psa_casadi.model.structure import Structure
 BoolArray = npt.NDArray[np.bool_]
 
 
+#: Operations whose value jumps.
+_JUMPS = frozenset(
+    getattr(ca, f"OP_{name}")
+    for name in ("LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "SIGN", "FLOOR", "CEIL", "FMOD")
+)
+
+
 class NoSplit(Exception):  # noqa: N818 - it says that a form does not fit, which is no mistake
     """The model does not have the form of exact steps; the message says why."""
 
@@ -93,6 +100,7 @@ def _split(s: Structure) -> Split:
         raise NoSplit("it has sampled states")
     if not s.states:
         raise NoSplit("it has no states")
+    _check_smooth(s)
     depends = _depends(s.xdot, s.x)  # [k, j]: x_k' depends on x_j
     reach = closure(depends)
     moving = [i for i in range(len(s.states)) if not _constant_slopes(s, i)]
@@ -107,6 +115,14 @@ def _split(s: Structure) -> Split:
     _check_switches(s, groups)
     split = Split(s, linear, groups, ports, (), matrices)
     return Split(s, linear, groups, ports, _order(s, split, reach), matrices)
+
+
+def _check_smooth(s: Structure) -> None:
+    """Refuse operations that jump: their derivatives do not tell that anything depends on them."""
+    equations = ca.Function("f", s.arguments, [s.xdot])
+    for k in range(equations.n_instructions()):
+        if equations.instruction_id(k) in _JUMPS:
+            raise NoSplit("its equations jump")
 
 
 def _others(s: Structure, i: int) -> Iterable[int]:
@@ -151,6 +167,8 @@ def _along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Exp
         keep = {name} if name in s.balances else set()
         slope = _resolved(s, s.der[s.states[i].name], keep)
         slope = ca.substitute(slope, s.symbols[name], rate)
+        if ca.depends_on(slope, s.time):
+            continue
         if not ca.depends_on(slope, rate):
             continue
         resting = ca.substitute(slope, rate, ca.SX(0))

@@ -1,0 +1,71 @@
+"""One record under many sets of parameters: in the lanes of a core's vectors, on all cores."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import InputError
+from psa_casadi.experiment.record import Record
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.exact.run import LANES, NotExact, run_sets
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.simulation.ways import Way, output_of, trace
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def simulate_many(
+    model: Model,
+    sets: Sequence[Mapping[str, float]],
+    record: Record,
+    *,
+    rtol: float = 1e-6,
+) -> FloatArray:
+    """Simulate a record under many sets of parameter values (SI units); returns (len(sets), n) [m].
+
+    Each set replaces values of the model. `rtol` is the tolerance of a step over the states' usual
+    sizes; the displacement errs by a few times that of its range. A row has the same bits whatever
+    stands beside it; it is nan from where its set cannot be simulated. Models and records that
+    exact steps do not fit run in the stepper, one after the other.
+
+    Raises InputError for an unknown parameter, a value out of bounds, or a model without output.
+    """
+    output = output_of(model)
+    if output is None:
+        raise InputError(["The model has no displacement; use `run` for models of other kinds."])
+    models = [model.with_values(values) for values in sets]
+    t, u = record.time - record.time[0], record_inputs(model, record, record.n)
+    rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
+
+    def start(one: Model) -> FloatArray:
+        return start_state(one, list(u[0]), rates, None, float(t[0])).x
+
+    def lanes(group: Sequence[Model]) -> FloatArray:
+        p, x0, nominal = (
+            np.array(rows).T
+            for rows in (
+                [m.parameter_vector() for m in group],
+                [start(m) for m in group],
+                [m.state_nominals() for m in group],
+            )
+        )
+        return run_sets(
+            model.structure, t, u, p=p, x0=x0, nominal=nominal, tolerance=rtol, output=output
+        ).T
+
+    def alone(one: Model) -> FloatArray:
+        try:
+            return trace(one, t, u, start(one), way=Way(rtol, stepped=True), output=output).output
+        except SimulationError:
+            return np.full(record.n, np.nan)
+
+    groups = [models[k : k + LANES] for k in range(0, len(models), LANES)]
+    try:
+        rows = side_by_side(lanes, groups)
+    except NotExact:
+        rows = [r[None] for r in side_by_side(alone, models)]
+    return np.vstack(rows) if rows else np.empty((0, record.n))
