@@ -87,13 +87,15 @@ def fit(
     evaluations: int = 40,
     tolerance: float = 1e-5,
     rtol: float = FIT_RTOL,
+    goal: float = np.inf,
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
-    those of `unknowns_of(model, ...)`, the search begins at `start`. Raises InputError when no
-    sample can be used, SimulationError when the start cannot be simulated.
+    those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
+    cost will stay above the `goal`. Raises InputError when no sample can be used, SimulationError
+    when the start cannot be simulated.
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
@@ -108,7 +110,13 @@ def fit(
     )
     evaluate = objective(model, experiments, unknowns, weights, rtol)
     minimum = minimise(
-        evaluate, theta, unknowns.bounds(), tolerance=tolerance, evaluations=evaluations
+        evaluate,
+        theta,
+        unknowns.bounds(),
+        tolerance=tolerance,
+        evaluations=evaluations,
+        goal=goal,
+        linear=[unknowns.first(r + 1) - 1 for r in range(unknowns.records)],
     )
     if minimum is None:
         raise SimulationError(
