@@ -125,7 +125,8 @@ def _response(
         own = np.zeros((int(e.used.sum()), 2))
         if force is not None:
             where = _places(e, interval)[e.used]
-            for column, zeros in enumerate(([1.0, -1.0], [0.0, 1.0, -1.0])):
-                own[:, column] = filtered(zeros, poles, force)[where]
+            rung = filtered([1.0, -1.0], poles, force)
+            own[:, 0] = rung[where]
+            own[:, 1] = np.append(0.0, rung)[where]  # a sample later
         parts.append(own)
     return np.vstack(parts)
