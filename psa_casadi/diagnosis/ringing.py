@@ -56,9 +56,12 @@ class Ringing:
 
 
 def images(tone: float, rate: float, most: int) -> list[float]:
-    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz]."""
-    found = {abs(k * rate + sign * tone) for k in range(most + 1) for sign in (1.0, -1.0)}
-    return sorted(found)
+    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz].
+
+    At half the sampling rate these are pairs, apart by rounding only.
+    """
+    found = {round(abs(k + sign * tone / rate), 9) for k in range(most + 1) for sign in (1.0, -1.0)}
+    return [share * rate for share in sorted(found)]
 
 
 def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
