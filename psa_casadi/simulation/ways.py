@@ -122,7 +122,8 @@ def accurate(
         except NotExact:
             break
         size = max(float(np.ptp(found.shown)), _STILL * nominal)
-        if before is not None and np.max(np.abs(found.shown - before)) <= rtol * size:
+        fine = before is not None and not found.forced
+        if before is not None and fine and np.max(np.abs(found.shown - before)) <= rtol * size:
             x, y = found.x, found.y
             if x is not None and y is not None:
                 empty = np.empty((len(t), 0))

@@ -54,7 +54,7 @@ class _Graph:
 
     nodes: list[_Node] = field(default_factory=list)
     numbers: dict[_Node, int] = field(default_factory=dict)
-    fixed: list[bool] = field(default_factory=list)
+    fixed: list[Any] = field(default_factory=list)
 
     def add(self, *node: object) -> int:
         if node not in self.numbers:

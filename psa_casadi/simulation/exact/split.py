@@ -185,8 +185,8 @@ def _along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Exp
 
 def _rate_name(s: Structure, i: int) -> str | None:
     """Return the name of the balance or state that is a state's derivative, if there is one."""
-    derivative = ca.SX(s.der[s.states[i].name])
-    return derivative.name() if derivative.is_symbolic() else None
+    derivative: Expression = ca.SX(s.der[s.states[i].name])
+    return str(derivative.name()) if derivative.is_symbolic() else None
 
 
 def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expression:
