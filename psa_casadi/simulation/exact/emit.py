@@ -59,7 +59,7 @@ class _Graph:
     def add(self, *node: object) -> int:
         if node not in self.numbers:
             leaf = node[0] in _LEAVES
-            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in node[1:])
+            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[int(a)] for a in node[1:])
             self.numbers[node] = len(self.nodes)
             self.nodes.append(node)
             self.fixed.append(fixed)

@@ -202,8 +202,8 @@ def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expressio
 
 
 def _is_balance(s: Structure, name: str) -> bool:
-    declared = {q.name for q in (*s.states, *s.inputs, *s.parameters, *s.sampled)}
-    return name not in declared and name != "time"
+    tables = (s.states, s.inputs, s.parameters, s.sampled)
+    return name != "time" and all(name not in [q.name for q in table] for table in tables)
 
 
 def _groups(found: dict[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
