@@ -56,7 +56,7 @@ class _Graph:
     numbers: dict[_Node, int] = field(default_factory=dict)
     fixed: list[Any] = field(default_factory=list)
 
-    def add(self, *node: object) -> int:
+    def add(self, *node: Any) -> int:
         if node not in self.numbers:
             leaf = node[0] in _LEAVES
             fixed = node[0] in ("p", "c") if leaf else all(self.fixed[int(a)] for a in node[1:])
