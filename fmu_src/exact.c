@@ -95,6 +95,7 @@ typedef struct {
     int blocks;                           /* of columns */
     column *s, *sport;                    /* [EX_NX][blocks], [EX_NPORT][blocks] */
     column *node, *snode_port, *scratch;  /* work of one step */
+    column *direct;                       /* [NL + EX_NEED][blocks]: of the matrices' own derivatives */
     psa_active group_list[EX_NX + 1][EX_GROUP_OUT + 1], port_list[EX_NPORT + 1][EX_PORT_OUT + 1],
         rate_list[EX_NG + 1][EX_RATE_OUT + 1], shown_list[EX_SHOWN_OUT + 1];
     psa_trial trial;
@@ -400,17 +401,22 @@ static void group_node(psa_state *state, psa_trial *trial, int g, int n, double 
    (what is left of r when its part in proportion to the rate is taken off) is then not that at the mean rate:
    Simpson's rule tells by how much. */
 static void check_rest(psa_state *state, psa_trial *trial, int g, const real *w, real most, bits slows) {
-    static const double WEIGHT[4] = {1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0, -1.0};
+    static const double WEIGHT[4] = {-1.0, 1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0};
     const int u = ex_linear[ex_group_driver[g]];
-    const real rates[4] = {w[NODES], w[HALF], w[WHOLE], (trial->x[WHOLE][u] - state->x[u]) / trial->dt};
     real fast[EX_GROUP_OUT] = {REAL(0.0)}, out[EX_GROUP_OUT] = {REAL(0.0)}, missed[EX_NX];
+    const real mean = (trial->x[WHOLE][u] - state->x[u]) / trial->dt;
+    const real rates[4] = {mean, w[NODES], w[HALF], w[WHOLE]};
     ex_group(g, state->t, state->x, trial->v0, FAST * most, state->k, fast);
     for (int k = 0; k < 4; ++k) {
+        bits counts = MASK(REAL(0.0) > 1.0);
         ex_group(g, state->t, state->x, trial->v0, rates[k], state->k, out);
         for (int i = 0; i < ex_group_size[g]; ++i) {
             const real in_time = out[i] - fast[i] * (v_fabs(rates[k]) / (FAST * v_fabs(most)));
             missed[i] = WEIGHT[k] * in_time + (k ? missed[i] : REAL(0.0));
+            const real largest = v_fabs(in_time) * trial->dt / state->nominal[ex_group_states[ex_group_first[g] + i]];
+            counts |= MASK(largest > 0.3 * state->tolerance);
         }
+        if (k == 0 && !any(counts & slows)) return; /* at no rate is it more */
     }
     for (int i = 0; i < ex_group_size[g]; ++i) {
         const real e = trial->dt * v_fabs(missed[i]) / state->nominal[ex_group_states[ex_group_first[g] + i]];
@@ -654,35 +660,35 @@ static inline void chain(const psa_state *state, const psa_active *list, const r
     }
 }
 
-/* What the matrices' own derivatives add to the columns of L at a node, each to its column: those of F and the
-   input's (j < 0), or those of a port's weights, and of its chord with the slope sigma */
-static void matrix_columns(psa_state *state, int n, int j, const double *sigma) {
+/* What the matrices' own derivatives add to the columns of L at the nodes: F's, the input's, the ports' weights'
+   and the chords', each in the column of its parameter */
+static void matrix_columns(psa_state *state) {
     const psa_trial *const trial = &state->trial;
     const int nb = state->blocks;
-    const double n0 = j < 0 ? 0.0 : state->port[j], n1 = j < 0 ? 0.0 : trial->port[HALF][j];
-    const double n2 = j < 0 ? 0.0 : trial->port[WHOLE][j];
-    column *const x = ROW(state->node, n * EX_NX);
     for (int m = 0; m < state->thetas; ++m) {
         const psa_level *const d = trial->level + m + 1;
-        if (n != WHOLE) {
-            for (int r = 0; r < EX_NEED; ++r) {
-                const int i = ex_need[r];
-                const psa_row *const row = &d->inner[n - 1][r];
-                const double sum = j < 0 ? respond_inside(row, NL, trial->l, trial->v0, trial->dv)
-                                         : row->w[j][0] * n0 + row->w[j][1] * n1 + row->w[j][2] * n2;
-                add_to(ROW(x, ex_linear[i]), state->theta_column[m], sum);
-            }
-            continue;
-        }
         double sum[ROWS] = {0.0};
-        if (j < 0) respond(&d->whole, trial->l, trial->v0, trial->dv, sum);
-        else {
-            if (sigma) respond_beyond(state, trial, d, ex_port_chord[j], sum);
+        respond(&d->whole, trial->l, trial->v0, trial->dv, sum);
+        for (int j = 0; j < EX_NPORT; ++j) {
+            const double n0 = state->port[j], n1 = trial->port[HALF][j], n2 = trial->port[WHOLE][j];
             for (int i = 0; i < ROWS; ++i)
-                sum[i] = (sigma ? *sigma * sum[i] : 0.0) + d->whole.w[j][0][i] * n0 + d->whole.w[j][1][i] * n1 +
-                         d->whole.w[j][2][i] * n2;
+                sum[i] += d->whole.w[j][0][i] * n0 + d->whole.w[j][1][i] * n1 + d->whole.w[j][2][i] * n2;
         }
-        for (int i = 0; i < NL; ++i) add_to(ROW(x, ex_linear[i]), state->theta_column[m], sum[i]);
+        for (int c = 0; c < EX_NCH; ++c) {
+            double beyond[ROWS];
+            if (trial->chord[c] == 0.0) continue;
+            respond_beyond(state, trial, d, c, beyond);
+            for (int i = 0; i < ROWS; ++i) sum[i] += trial->chord[c] * beyond[i];
+        }
+        for (int i = 0; i < NL; ++i) ((double *)ROW(state->direct, i))[state->theta_column[m]] = sum[i];
+        for (int r = 0; r < EX_NEED; ++r) {
+            const psa_row *const row = &d->inner[HALF - 1][r];
+            double inside = respond_inside(row, NL, trial->l, trial->v0, trial->dv);
+            for (int j = 0; j < EX_NPORT; ++j)
+                inside += row->w[j][0] * state->port[j] + row->w[j][1] * trial->port[HALF][j] +
+                          row->w[j][2] * trial->port[WHOLE][j];
+            ((double *)ROW(state->direct, NL + r))[state->theta_column[m]] = inside;
+        }
     }
 }
 
@@ -695,23 +701,22 @@ static void linear_columns(psa_state *state, int n) {
         const int i = n == WHOLE ? r : ex_need[r];
         column *const out = ROW(x, ex_linear[i]);
         const column *const own = ROW(state->s, ex_linear[i]);
+        const column *const direct = ROW(state->direct, n == WHOLE ? i : NL + r);
         for (int b = 0; b < nb; ++b) {
-            column sum = own[b];
+            column sum = own[b] + direct[b];
             for (int j = 0; j < ex_reads[i]; ++j)
                 sum += (n == WHOLE ? level->whole.f[j][i] : level->inner[n - 1][r].f[j]) *
                        ROW(state->s, ex_linear[j])[b];
             out[b] = sum;
         }
     }
-    matrix_columns(state, n, -1, NULL);
 }
 
-static void add_port_columns(psa_state *state, int n, int j, const double *sigma) {
+static void add_port_columns(psa_state *state, int n, int j) {
     const psa_level *const level = state->trial.level;
     const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
     const column *const n0 = ROW(state->sport, j), *const n1 = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
     const column *const n2 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
-    int reached = 0;
     for (int r = 0; r < rows; ++r) {
         const int i = n == WHOLE ? r : ex_need[r];
         if (i < ex_port_reaches[j]) continue;
@@ -719,9 +724,7 @@ static void add_port_columns(psa_state *state, int n, int j, const double *sigma
         double w[3];
         for (int q = 0; q < 3; ++q) w[q] = n == WHOLE ? level->whole.w[j][q][i] : level->inner[n - 1][r].w[j][q];
         for (int b = 0; b < nb; ++b) out[b] += w[0] * n0[b] + w[1] * n1[b] + w[2] * n2[b];
-        reached = 1;
     }
-    if (reached) matrix_columns(state, n, j, sigma);
 }
 
 static void port_columns(psa_state *state, int n, int j) {
@@ -735,7 +738,7 @@ static void do_port_columns(psa_state *state, int j) {
     const int nb = state->blocks, c = ex_port_chord[j];
     port_columns(state, HALF, j);
     port_columns(state, WHOLE, j);
-    add_port_columns(state, HALF, j, NULL);
+    add_port_columns(state, HALF, j);
     if (c >= 0 && trial->chord[c] != 0.0) {
         const int u = ex_linear[ex_chord_driver[c]];
         const double sigma = trial->chord[c], way = trial->x[WHOLE][u] - state->x[u];
@@ -744,7 +747,7 @@ static void do_port_columns(psa_state *state, int j) {
         const column *const n1 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
         for (int b = 0; b < nb; ++b)
             dsigma[b] = (n1[b] - n0[b] - sigma * (ROW(x, u)[b] - ROW(state->s, u)[b])) / way;
-        add_port_columns(state, WHOLE, j, &sigma);
+        add_port_columns(state, WHOLE, j);
         for (int i = 0; i < NL; ++i) {
             column *const out = ROW(x, ex_linear[i]);
             const double beyond = trial->beyond[c][i];
@@ -762,7 +765,7 @@ static void do_port_columns(psa_state *state, int j) {
                 out[b] += sum;
             }
         }
-    } else add_port_columns(state, WHOLE, j, NULL);
+    } else add_port_columns(state, WHOLE, j);
 }
 
 /* Columns of the driver at its turn: at a zero of its rate, those at a fixed time */
@@ -887,7 +890,7 @@ static void do_loop_columns(psa_state *state, const int *ports, int count) {
     for (int n = 0; n < 2; ++n)
         for (int j = 0; j < count; ++j) fill(ROW(state->snode_port, AT[n] * (EX_NPORT + 1) + ports[j]), nb);
     for (int n = 0; n < 2; ++n)
-        for (int j = 0; j < count; ++j) add_port_columns(state, AT[n], ports[j], NULL);
+        for (int j = 0; j < count; ++j) add_port_columns(state, AT[n], ports[j]);
     for (int n = 0; n < 2; ++n)
         for (int j = 0; j < count; ++j) port_columns(state, AT[n], ports[j]);
     loop_matrix(trial, ports, count, a);
@@ -919,6 +922,7 @@ static void do_loop_columns(psa_state *state, const int *ports, int count) {
 #endif
 
 static void step_columns(psa_state *state) {
+    matrix_columns(state);
     linear_columns(state, HALF);
     linear_columns(state, WHOLE);
     for (int k = 0; k < EX_NITEMS; ++k) {
@@ -1160,14 +1164,15 @@ APART static int set_up(psa_state *state) {
 #if PSA_LANES == 1
     if (run->count > 0 && status == 0) {
         const int nb = state->blocks = (run->count + COLUMNS - 1) / COLUMNS;
-        const size_t rows = EX_NX + EX_NPORT + NODES * (EX_NX + EX_NPORT + 1) + 8 * EX_NX + 2;
+        const size_t rows = EX_NX + EX_NPORT + NODES * (EX_NX + EX_NPORT + 1) + NL + EX_NEED + 8 * EX_NX + 2;
         column *const memory = calloc(rows * (size_t)nb, sizeof(column));
         if (!memory) return 2;
         state->s = memory;
         state->sport = ROW(state->s, EX_NX);
         state->node = ROW(state->sport, EX_NPORT);
         state->snode_port = ROW(state->node, NODES * EX_NX);
-        state->scratch = ROW(state->snode_port, NODES * (EX_NPORT + 1));
+        state->direct = ROW(state->snode_port, NODES * (EX_NPORT + 1));
+        state->scratch = ROW(state->direct, NL + EX_NEED);
         for (int i = 0; i < EX_NX; ++i)
             memcpy(ROW(state->s, i), run->s0 + i * run->count, sizeof(double) * (size_t)run->count);
     }

@@ -48,7 +48,11 @@ static inline real real_of(bits b) {
 
 /* a where the mask is set, else b */
 static inline real choose(bits mask, real a, real b) {
+#if PSA_LANES == 1
+    return mask ? a : b;
+#else
     return real_of((mask & bits_of(a)) | (~mask & bits_of(b)));
+#endif
 }
 
 #if PSA_LANES == 1
@@ -72,7 +76,11 @@ EACH_LANE(v_tan, tan)
 EACH_LANE(v_atan, atan)
 EACH_LANE(v_tanh, tanh)
 
+#if PSA_LANES == 1
+static inline real v_fabs(real x) { return fabs(x); }
+#else
 static inline real v_fabs(real x) { return real_of(bits_of(x) & (bits_of(REAL(0.0)) + INT64_MAX)); }
+#endif
 static inline real v_fmax(real a, real b) { return choose(MASK(a < b), b, a); }
 static inline real v_fmin(real a, real b) { return choose(MASK(b < a), b, a); }
 static inline real v_less(real a, real b) { return choose(MASK(a < b), REAL(1.0), REAL(0.0)); }
