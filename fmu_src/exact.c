@@ -163,10 +163,12 @@ static inline void add_port(const psa_state *state, psa_trial *trial, int n, int
         }
 }
 
+#if EX_NLOOP > 0
 /* Weight of a port's value at the half (1) or the end (2) in a row of L that is wanted inside a step */
 static inline real weight_of(const psa_level *level, int n, int j, int value, int r) {
     return n == WHOLE ? level->whole.w[j][value][ex_need[r]] : level->inner[n - 1][r].w[j][value];
 }
+#endif
 
 static void evaluate_port(psa_state *state, psa_trial *trial, int n, int j, int slopes) {
     if (slopes)
@@ -436,7 +438,9 @@ static void find_legs(psa_state *state, psa_trial *trial, int g, int slopes) {
         if (slopes) ex_rate_slopes(g, start ? state->t : trial->t[n], x, v, REAL(0.0), state->k,
                                    stages->rate_slopes[n]);
         else ex_rate(g, start ? state->t : trial->t[n], x, v, REAL(0.0), state->k, stages->rate_slopes[n]);
-        stages->w[n] = stages->rate_slopes[n][0];
+        /* a rate that is all but 0 is rounding, whose sign says nothing */
+        const real w = stages->rate_slopes[n][0];
+        stages->w[n] = choose(MASK(v_fabs(w) * trial->dt > STILL * state->nominal[u]), w, REAL(0.0));
     }
     const real w0 = stages->w[NODES], w1 = stages->w[HALF], w2 = stages->w[WHOLE];
     const real most = v_fmax(v_fmax(v_fabs(w0), v_fabs(w1)), v_fabs(w2));
