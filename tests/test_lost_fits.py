@@ -22,8 +22,10 @@ from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import starting_model
 from tests.plants.again import play_again
 from tests.plants.make import make_record
+from tests.tiers import slow
 
 
+@slow
 def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
     """Of 7 ms, seventy times the ordinary lag, in a triangle and steps together."""
     path = tmp_path / "triangle.csv"
@@ -41,7 +43,9 @@ def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
     assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
 
 
-@pytest.mark.parametrize("ends", [(900, 1200), (1000, 1000)], ids=["lengths", "alike"])
+@pytest.mark.parametrize(
+    "ends", [pytest.param((900, 1200), marks=slow), (1000, 1000)], ids=["lengths", "alike"]
+)
 def test_the_order_of_the_records_tells_nothing(ends: tuple[int, int], tmp_path: Path) -> None:
     truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
     play_again(truth, 4, tmp_path / "b.csv")
@@ -94,6 +98,7 @@ def test_a_needless_first_cause_leaves_the_second_as_good(tmp_path: Path) -> Non
     assert left[0].probability["charge_leakage"] > 0.9
 
 
+@slow
 def test_a_wrong_first_cause_gives_way_beside_the_second(tmp_path: Path) -> None:
     """A spring that hardens, taken for a lost preload while a mode still rang."""
     make_record(

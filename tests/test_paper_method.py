@@ -46,6 +46,7 @@ from tests.paper_cases import (
     values,
 )
 from tests.stack_models import PAPER_STACKS
+from tests.tiers import slow_but
 
 STACK = "P-885.51"
 
@@ -109,7 +110,7 @@ def test_a_zero_that_the_poles_do_not_allow_is_told() -> None:
     assert found["tau"] == pytest.approx(p["tau"], rel=1e-4)
 
 
-@pytest.mark.parametrize("leading", [False, True])
+@pytest.mark.parametrize("leading", slow_but([False], [False, True]))
 def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
     p = values(STACK)
     if leading:

@@ -29,6 +29,7 @@ from psa_casadi.bench.verification_cases import (
 from psa_casadi.bench.verification_figure import picture
 from psa_casadi.experiment import steps, time_grid
 from psa_casadi.model.stacks import STACKS
+from tests.tiers import slow
 
 RATED = STACKS["P-885.51"].values["u_rated"].value
 
@@ -187,6 +188,7 @@ def test_run_puts_the_parts_together(
     assert asked[1:] == ["PTBS200", "WYDS0808020", "P-885.51"]
 
 
+@slow
 def test_the_micromanipulator_is_judged_on_what_was_kept(
     measured_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
