@@ -97,7 +97,8 @@ def test_a_quickest_move_is_near_the_bound_of_the_linear_part(payload: float) ->
     assert voltage.max() <= 120.0 + 1e-6
 
 
-@pytest.mark.parametrize(("begin", "end"), [(2e-6, 10e-6), pytest.param(10e-6, 2e-6, marks=slow)])
+@slow
+@pytest.mark.parametrize(("begin", "end"), [(2e-6, 10e-6), (10e-6, 2e-6)])
 def test_a_quickest_move_is_near_what_hysteresis_and_creep_allow(begin: float, end: float) -> None:
     """Downward that is 21 % over the bound of the linear part; a bang-bang move has no ramps."""
     model = scanner(0.0)

@@ -78,7 +78,12 @@ FIGURES: dict[str, Callable[[Any], None]] = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but(set(EXAMPLES) - {"separate_two_causes"}, EXAMPLES))
+@pytest.mark.parametrize(
+    "name",
+    slow_but(
+        ["van_der_pol", "use_in_fmpy", "use_in_casadi", "raster_scan", "minimum_time"], EXAMPLES
+    ),
+)
 def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path.parent)
     found = run_example(name, Path(tmp_path.name))  # as `psa examples NAME -o FOLDER` is typed

@@ -25,7 +25,7 @@ MODELS = (
 @pytest.mark.parametrize(
     ("name", "fmi"),
     slow_but(
-        [(STACK, 2), (STACK, 3), ("slow_creep", 2), ("flexure", 3)],
+        [(STACK, 2), (STACK, 3), ("flexure", 3)],
         [(name, fmi) for name in MODELS for fmi in (2, 3)],
     ),
 )
@@ -89,7 +89,7 @@ def test_jump_of_the_voltage(step: float) -> None:
     assert np.max(np.abs(np.array(found) - truth)) < 1e-6 * scale
 
 
-@pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+@pytest.mark.parametrize("interface", slow_but(["CoSimulation"], ["CoSimulation", "ModelExchange"]))
 def test_fmpy_agrees(interface: str) -> None:
     """fmpy's own co-simulation master, and its CVode for model exchange, on two jumps."""
     rows = [(0.0, 0.0), (5e-3, 0.0), (5e-3, 100.0), (15e-3, 100.0), (15e-3, 20.0), (30e-3, 20.0)]

@@ -24,6 +24,7 @@ from psa_casadi.model.model_file import loads
 from psa_casadi.simulation.compiler import run_compiler, zig_command
 from psa_casadi.variables import Output
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow_but
 
 STACK = "P-885.51"
 
@@ -49,7 +50,7 @@ COMPILERS = {"gcc": ["gcc"], "zig": [*zig_command(), "-target", "x86_64-linux-gn
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("name", ["slow_creep", "flexure"])
+@pytest.mark.parametrize("name", slow_but(["flexure"], ["slow_creep", "flexure"]))
 def test_sources_compile_alone_without_warnings(compiler: str, name: str, tmp_path: Path) -> None:
     if not shutil.which(COMPILERS[compiler][0]):
         pytest.skip(f"{compiler} is not installed")

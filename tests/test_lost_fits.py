@@ -125,6 +125,7 @@ def _also(step: Round, task: Task, name: str) -> None:
     step.evidence = {**step.evidence, name: step.extensions[-1].evidence}
 
 
+@slow
 def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
     """Four effects lead the screening, none explains the data: an amplifier of 0.9 ms does."""
     path = tmp_path / "record.csv"

@@ -46,7 +46,7 @@ from tests.paper_cases import (
     values,
 )
 from tests.stack_models import PAPER_STACKS
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 
@@ -131,6 +131,7 @@ def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
     )
 
 
+@slow
 def test_the_whole_method_where_its_assumptions_hold() -> None:
     """A step without hysteresis and noise, long and dense; loops of the same stack."""
     p = values(STACK)
@@ -223,7 +224,7 @@ FAILURES: dict[str, tuple[Callable[[], list[Record]], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", FAILURES)
+@pytest.mark.parametrize("case", slow_but(set(FAILURES) - {"fast loops"}, FAILURES))
 def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
     make, expected = FAILURES[case]
     found = paper_method(make())

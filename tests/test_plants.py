@@ -27,6 +27,7 @@ from tests.plants.slow_creep import creep
 from tests.plants.stack import FloatArray, draw_stack, loop_width
 from tests.plants.structural_mode import STRUCTURAL_MODE
 from tests.plants.table import HIDDEN_EFFECTS
+from tests.tiers import slow_but
 
 CONVERGENCE = 2e-5
 """Largest change of the displacement over its range when the grid is refined by 4."""
@@ -113,7 +114,9 @@ def test_effect_vanishes_at_gain_zero(effect: HiddenEffect, run: Run) -> None:
     assert np.ptp(largest) > 1e-3 * np.ptp(part.displacement)
 
 
-@pytest.mark.parametrize("effect", [*EFFECTS, None], ids=lambda e: e.name if e else "none")
+@pytest.mark.parametrize(
+    "effect", slow_but([EFFECTS[0], None], [*EFFECTS, None]), ids=lambda e: e.name if e else "none"
+)
 def test_strength_zero_is_the_clean_record(effect: HiddenEffect | None, tmp_path: Path) -> None:
     name = None if effect is None else effect.name
     truth = make_record(name, 11, tmp_path / "effect.csv", strength=0.0)
