@@ -64,6 +64,7 @@ def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) 
     assert mine[0] == pytest.approx(tones[0], rel=0.1)
 
 
+@slow
 def test_wrong_mechanics_is_found_behind_a_right_force(tmp_path: Path) -> None:
     truth, experiments, base = _fitted(tmp_path / "a.csv", "fast", 5, 3000)
     assert base.rms > 5.0 * truth.sigma
@@ -123,9 +124,8 @@ def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     assert found is None or found.rms < 1.001 * lag.fit.rms
 
 
-@pytest.mark.parametrize(
-    ("noise", "seed"), [("white", 112316), pytest.param("ar", 112437, marks=slow)]
-)
+@slow
+@pytest.mark.parametrize(("noise", "seed"), [("white", 112316), ("ar", 112437)])
 def test_ringing_above_the_band_shows_which_resonance_was_missed(
     noise: NoiseKind, seed: int, tmp_path: Path
 ) -> None:

@@ -124,7 +124,11 @@ def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
         np.testing.assert_array_equal(outputs, base_outputs)
 
 
-@pytest.mark.parametrize("effects", [*SETS[: len(ALL)], EVERY], ids=name_of)
+@pytest.mark.parametrize(
+    "effects",
+    [SETS[0], *(pytest.param(s, marks=slow) for s in SETS[1 : len(ALL)]), EVERY],
+    ids=name_of,
+)
 def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
     """Equal to the tolerance of 1e-8: Newton's stopping test sees the norm of all states."""
     model = random_model(effects, np.random.default_rng(2), gains=False)

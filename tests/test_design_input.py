@@ -69,7 +69,11 @@ def test_trials_make_up_for_parameters_that_are_off() -> None:
 
 
 @pytest.mark.parametrize(
-    "limits", [AmplifierLimits(max_rate=11e3), AmplifierLimits(max_current=0.016)]
+    "limits",
+    [
+        AmplifierLimits(max_rate=11e3),
+        pytest.param(AmplifierLimits(max_current=0.016), marks=slow),
+    ],
 )
 def test_limits_are_kept_and_cost_accuracy(limits: AmplifierLimits) -> None:
     found = track(scanner(), a_scan(), limits, corrections=0)

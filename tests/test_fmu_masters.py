@@ -21,7 +21,7 @@ from psa_casadi.export.fmu_masters import FloatArray
 from psa_casadi.reference import simulate
 from tests.fmu_models import exported, model_named
 from tests.test_fmu_system import END, RATE, coupled, monolithic
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
@@ -63,6 +63,7 @@ def test_fmpy_co_simulation(fmi: int, tolerance: float) -> None:
     assert _error(result) < 10.0 * tolerance
 
 
+@slow
 def test_fmpy_co_simulation_with_events_and_early_return() -> None:
     """FMI 3: the importer enters event mode at the jumps and may be returned to early."""
     result = fmpy.simulate_fmu(

@@ -156,6 +156,7 @@ def test_intervals_cover_the_reference_where_the_mechanics_are_known() -> None:
     assert found.model.values["tau"] == pytest.approx(p["tau"], rel=0.02)
 
 
+@slow
 def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
     """The model's exponent is at least 1; the reference bends with 0.6."""
     p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}

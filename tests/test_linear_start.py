@@ -169,6 +169,7 @@ def test_gaps_offset_clock_and_polarity_do_not_matter() -> None:
     assert errors(start(other), values_of("PTBS200"), other)[0] < 0.05
 
 
+@slow
 def test_irregular_samples_are_put_on_a_grid() -> None:
     values, rng = values_of("WYDS0808020"), np.random.default_rng(2)
     time = np.sort(step_of("WYDS0808020").duration * rng.random(4000))
@@ -201,7 +202,7 @@ def test_a_long_record_is_cut_to_what_is_fast_and_a_coarse_whole() -> None:
     assert set(found.records) == {"long, fastest part", "long, coarse"}
 
 
-@pytest.mark.parametrize("effect", ["slow_creep", "structural_mode"])
+@pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "structural_mode"]))
 def test_what_the_model_lacks_does_not_mislead(effect: str) -> None:
     record = step("PTBS200", 1e-3, effect)
     assert min(errors(start(record), values_of("PTBS200"), record)) < 0.15

@@ -43,9 +43,8 @@ def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
     assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
 
 
-@pytest.mark.parametrize(
-    "ends", [pytest.param((900, 1200), marks=slow), (1000, 1000)], ids=["lengths", "alike"]
-)
+@slow
+@pytest.mark.parametrize("ends", [(900, 1200), (1000, 1000)], ids=["lengths", "alike"])
 def test_the_order_of_the_records_tells_nothing(ends: tuple[int, int], tmp_path: Path) -> None:
     truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
     play_again(truth, 4, tmp_path / "b.csv")
@@ -169,6 +168,7 @@ def test_each_form_of_an_effect_gets_a_start_and_near_ones_stay_rivals(tmp_path:
     assert chosen(0.5) == [name]
 
 
+@slow
 def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
     tmp_path: Path,
 ) -> None:

@@ -17,7 +17,7 @@ from tests.tiers import slow_but
 NAMES = [*STACKS, *EFFECTS, "every_effect"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_but([*list(STACKS)[:1], *EFFECTS], NAMES))
 def test_right_hand_sides_read_back_are_the_models(name: str) -> None:
     assert right_side_error(model_named(name), text_of(name)) < 1e-12
 

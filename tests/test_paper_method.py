@@ -224,7 +224,9 @@ FAILURES: dict[str, tuple[Callable[[], list[Record]], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", slow_but(set(FAILURES) - {"fast loops"}, FAILURES))
+@pytest.mark.parametrize(
+    "case", slow_but(["no step", "no loop", "ringing", "logarithms"], FAILURES)
+)
 def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
     make, expected = FAILURES[case]
     found = paper_method(make())

@@ -152,6 +152,7 @@ def test_the_matlab_script() -> None:
         assert f"% {kind}s: {listed}\n" in script.text
 
 
+@slow
 @pytest.mark.parametrize("made", ["omsimulator"], indirect=True)
 def test_the_script_for_omsimulator_pushes_the_stage(
     made: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

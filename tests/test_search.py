@@ -33,7 +33,8 @@ def run_of(name: str, seed: int) -> Run:
     return one_run(name, seed)
 
 
-@pytest.mark.parametrize("name", ["P-885.51", pytest.param("PTBS200", marks=slow)])
+@slow
+@pytest.mark.parametrize("name", ["P-885.51", "PTBS200"])
 def test_a_stack_is_found_from_its_records_alone(name: str) -> None:
     """Step, loops and multisine of the reference with 0.1 % noise; no start is given."""
     run = run_of(name, 3)

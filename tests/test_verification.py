@@ -130,6 +130,7 @@ def test_the_picture_has_a_pair_of_panels_for_everything_shown(shown: list[Compa
     assert np.isfinite(figure.axes[5].get_lines()[-2].get_ydata()).sum() == 8
 
 
+@slow
 def test_only_a_wrong_number_of_masses_shows_in_a_step(ringing: list[Match]) -> None:
     """Reciprocal data: a single mass misses, the one-way cascade fits almost as well."""
     largest = {m.model: np.abs(m.step).max() for m in ringing}
@@ -167,6 +168,7 @@ def test_the_three_plants_are_three() -> None:
         assert y == pytest.approx(100.0 / hard[plant], rel=1e-4), plant
 
 
+@slow
 def test_run_puts_the_parts_together(
     shown: list[Comparison], ringing: list[Match], monkeypatch: pytest.MonkeyPatch
 ) -> None:
