@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import fmpy
@@ -30,10 +31,11 @@ OPTIMISATION = ("-O0", "-O2")
 def compile_strictly(source: Path, include: Sequence[Path], output: Path) -> list[str]:
     """Compile one file at every level of optimisation; return the complaints."""
     complaints = []
+    made = "_".join(source.parts[-2:])  # sources of two FMUs have the same names
     for level in OPTIMISATION:
         includes = [f"-I{directory}" for directory in include]
         command = [sys.executable, "-m", "ziglang", "cc", *FLAGS, level, *includes]
-        command += ["-c", str(source), "-o", str(output / f"{source.stem}.o")]
+        command += ["-c", str(source), "-o", str(output / f"{made}.o")]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             complaints.append(f"{source.name} {level}:\n{done.stdout}{done.stderr}")
@@ -66,9 +68,13 @@ def main() -> int:
         files = sorted(sources.rglob("*.c"))
         missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")} - {f.name for f in files}
         complaints = [f"{name}: not among the written sources." for name in sorted(missing)]
-        for source in files:
-            print(f"{source.relative_to(sources)}", flush=True)
-            complaints += compile_strictly(source, (source.parent, headers), objects)
+
+        def compiled(source: Path) -> list[str]:
+            print(f"{source.relative_to(sources)}\n", end="", flush=True)
+            return compile_strictly(source, (source.parent, headers), objects)
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            complaints += [c for found in pool.map(compiled, files) for c in found]
     print("\n".join(complaints) or f"{len(files)} C files compile without a warning.")
     return 1 if complaints or not files else 0
 
