@@ -25,11 +25,12 @@ from psa_casadi.experiment import Record, multisine, sine, time_grid
 from psa_casadi.experiment.split import Experiment, split, whole
 from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.identify import Identification, identify
-from psa_casadi.identification.prediction import measured
+from psa_casadi.identification.prediction import Simulated, measured
 from psa_casadi.identification.unknowns import unknowns_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.report.series import Curve, Series
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.ways import EXACT, Way
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval, Provenance
 
@@ -89,7 +90,7 @@ def _fit(model: Model) -> Fit:
     free = ("k_L", "tau")
     empty = np.zeros((0, 2))
     return Fit(model, unknowns_of(model, free, [{}], [0.0], 1e-6), np.zeros(3), np.zeros(0), empty,
-               (NOISE,), 0.0, True, False, 1)  # fmt: skip
+               (NOISE,), 0.0, True, False, 1, Way(1e-6), (Simulated(EXACT, 0.0),))  # fmt: skip
 
 
 def diagnosis(

@@ -19,6 +19,7 @@ from psa_casadi.identification.unknowns import Unknowns, unknowns_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.ways import Way
 
 FloatArray = NDArray[np.float64]
 
@@ -92,7 +93,7 @@ def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, 
     theta, step = moved(unknowns, 4), 1e-2
 
     def predicted(point: FloatArray) -> tuple[FloatArray, FloatArray]:
-        parts = predict(model, experiments, unknowns, point, rtol=1e-9)
+        parts = predict(model, experiments, unknowns, point, way=Way(1e-9, stepped=True))
         displacement = np.concatenate([p.displacement for p in parts])
         return displacement, np.vstack([p.jacobian for p in parts])
 

@@ -97,3 +97,40 @@ def test_an_iteration_that_is_cut_off_says_so() -> None:
     np.testing.assert_array_equal(found.jacobian, jacobian)
     assert found.cost == residual @ residual
     assert found.cost < 24.2
+
+
+def shifted(x: FloatArray) -> Pair:
+    """Rosenbrock's valley above a level that is far from where a search begins."""
+    residual, jacobian = rosenbrock(x[:2])
+    far = x[2] - 1e3 + x[0] ** 2
+    slope = [2.0 * x[0], 0.0, 1.0]
+    return np.append(residual, far), np.vstack([np.column_stack([jacobian, np.zeros(2)]), slope])
+
+
+def test_linear_coordinates_are_best_from_the_first_evaluation_on() -> None:
+    start, none = np.array([-1.2, 1.0, 0.0]), (np.full(3, -np.inf), np.full(3, np.inf))
+    first = minimise(shifted, start, none, tolerance=1e-10, evaluations=1, linear=[2])
+    assert first is not None
+    assert first.theta[2] == pytest.approx(1e3 - 1.44)
+    assert first.cost == pytest.approx(float(np.sum(rosenbrock(start[:2])[0] ** 2)))
+    found = solved(minimise(shifted, start, none, tolerance=1e-10, evaluations=200, linear=[2]))
+    np.testing.assert_allclose(found.theta, [1.0, 1.0, 1e3 - 1.0], atol=1e-7)
+    assert found.evaluations < 30
+
+
+def test_a_goal_out_of_reach_ends_the_search() -> None:
+    def above(x: FloatArray) -> Pair:
+        residual, jacobian = rosenbrock(x)
+        return np.append(residual, 10.0), np.vstack([jacobian, np.zeros(2)])
+
+    start = np.array([-1.2, 1.0])
+    free, near, far = (
+        minimise(above, start, OPEN, tolerance=1e-10, evaluations=200, goal=goal)
+        for goal in (np.inf, 100.5, 50.0)
+    )
+    assert free is not None
+    assert near is not None
+    assert far is not None
+    assert near.theta.tolist() == free.theta.tolist()
+    assert not far.converged
+    assert far.evaluations < free.evaluations

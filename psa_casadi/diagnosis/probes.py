@@ -12,7 +12,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.experiment.drive import among_harmonics
 from psa_casadi.experiment.filtering import peaks as highest_peaks
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import FIT_RTOL, Fit
+from psa_casadi.identification.fit import Fit
 from psa_casadi.identification.prediction import measured, predict_record
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -163,7 +163,7 @@ def _column(
     for e, start in zip(experiments, memory, strict=True):
         states = dict.fromkeys(names, 0.0) | start
         y, by_gain, _ = predict_record(
-            changed, e.record, states, [gain], stop=e.stop, rtol=FIT_RTOL if step else _RTOL
+            changed, e.record, states, [gain], stop=e.stop, rtol=fit.way.rtol if step else _RTOL
         )
         used = e.used[: e.stop]
         count = int(used.sum())

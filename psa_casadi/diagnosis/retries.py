@@ -46,7 +46,8 @@ def from_extension(
     first: Fit, extension: Extension, experiments: Sequence[Experiment]
 ) -> Fit | None:
     """Fit the base again from an extension's parameters; None where that cannot be simulated."""
-    return _moved(first, extension.fit, first.unknowns.names, experiments)
+    names, least = first.unknowns.names, BETTER_BASE * first.rms
+    return _moved(first, extension.fit, names, experiments, least)
 
 
 @stage("base fit again")
@@ -172,11 +173,16 @@ def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experimen
 
 
 def _moved(
-    base: Fit, found: Fit, names: Sequence[str], experiments: Sequence[Experiment]
+    base: Fit,
+    found: Fit,
+    names: Sequence[str],
+    experiments: Sequence[Experiment],
+    least: float = np.inf,
 ) -> Fit | None:
     values = {n: found.model.values[n] for n in names}
     try:
-        return refit(replace(base, model=base.model.with_values(values)), experiments, names)
+        moved = replace(base, model=base.model.with_values(values))
+        return refit(moved, experiments, names, least=least)
     except PsaError:
         return None
 
@@ -214,13 +220,16 @@ def _masses(
 def _with_masses(
     before: Fit, starts: Sequence[Mapping[str, float]], experiments: Sequence[Experiment]
 ) -> Fit | None:
-    """Fit with one mass free from several starts; None where none explains clearly more."""
+    """Fit with one mass free from several starts; None where none explains clearly more.
+
+    A start is left where it does not come below the fit without the mass at once.
+    """
 
     def begun(start: Mapping[str, float]) -> Fit | None:
         free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
         return quick_from(
             before, before.model, experiments, free,
-            start_states=before.starts(), evaluations=_FIRST, start=start,
+            start_states=before.starts(), evaluations=_FIRST, start=start, goal=before.cost,
         )  # fmt: skip
 
     def further(quick: Fit) -> Fit | None:
@@ -229,13 +238,14 @@ def _with_masses(
             quick, quick.model, experiments, names, start_states=states, evaluations=_QUICK
         )
 
-    found = [f for f in side_by_side(begun, starts) if f is not None]
+    found = [f for f in side_by_side(begun, starts) if f is not None and f.cost < before.cost]
     ended = side_by_side(further, sorted(found, key=lambda f: f.cost)[:_BEST])
     best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
     if best is None:
         return None
     try:
-        final = refit(best, experiments, best.unknowns.names)
+        least = before.rms * float(np.exp(-_CLEAR / len(before.residuals)))
+        final = refit(best, experiments, best.unknowns.names, least=least)
     except PsaError:
         return None
     return final if _short(before, final) > _CLEAR else None

@@ -56,9 +56,12 @@ class Ringing:
 
 
 def images(tone: float, rate: float, most: int) -> list[float]:
-    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz]."""
-    found = {abs(k * rate + sign * tone) for k in range(most + 1) for sign in (1.0, -1.0)}
-    return sorted(found)
+    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz].
+
+    At half the sampling rate these are pairs, apart by rounding only.
+    """
+    found = {round(abs(k + sign * tone / rate), 9) for k in range(most + 1) for sign in (1.0, -1.0)}
+    return [share * rate for share in sorted(found)]
 
 
 def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
@@ -125,7 +128,8 @@ def _response(
         own = np.zeros((int(e.used.sum()), 2))
         if force is not None:
             where = _places(e, interval)[e.used]
-            for column, zeros in enumerate(([1.0, -1.0], [0.0, 1.0, -1.0])):
-                own[:, column] = filtered(zeros, poles, force)[where]
+            rung = filtered([1.0, -1.0], poles, force)
+            own[:, 0] = rung[where]
+            own[:, 1] = np.append(0.0, rung)[where]  # a sample later
         parts.append(own)
     return np.vstack(parts)

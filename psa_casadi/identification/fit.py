@@ -19,7 +19,7 @@ from psa_casadi.identification.prediction import (
 from psa_casadi.identification.unknowns import Unknowns, static_compliance, unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.simulation.ways import Way
+from psa_casadi.simulation.ways import LOOSEST, Way
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -39,8 +39,8 @@ class Fit:
     measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
-    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how each
-    record was run and how accurately.
+    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
+    each record was run and how accurately.
     """
 
     model: Model
@@ -101,13 +101,15 @@ def fit(
     evaluations: int = 40,
     tolerance: float = 1e-5,
     rtol: float = FIT_RTOL,
+    goal: float = np.inf,
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
-    those of `unknowns_of(model, ...)`, the search begins at `start`. Raises InputError when no
-    sample can be used, SimulationError when the start cannot be simulated.
+    those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
+    cost will stay above the `goal`. Raises InputError when no sample can be used, SimulationError
+    when the start cannot be simulated.
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
@@ -120,9 +122,9 @@ def fit(
     weights = np.concatenate(
         [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
     )
-    minimum, way, told = _minimum(
-        model, experiments, unknowns, weights, theta, (sigma, rtol, tolerance, evaluations)
-    )
+    linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
+    effort = _Effort(tolerance, evaluations, goal, linear)
+    minimum, way, told = _minimum(model, experiments, unknowns, weights, theta, sigma, rtol, effort)
     return Fit(
         model=model.with_values(unknowns.values(minimum.theta)),
         unknowns=unknowns,
@@ -139,35 +141,62 @@ def fit(
     )
 
 
+@dataclass(frozen=True)
+class _Effort:
+    """How far a minimum is sought: see `minimise`."""
+
+    tolerance: float
+    evaluations: int
+    goal: float
+    linear: tuple[int, ...]
+
+
 def _minimum(
     model: Model,
     experiments: Sequence[Experiment],
     unknowns: Unknowns,
     weights: FloatArray,
     theta: FloatArray,
-    how: tuple[Sequence[float], float, float, int],
+    sigma: Sequence[float],
+    rtol: float,
+    effort: _Effort,
 ) -> tuple[Minimum, Way, list[Simulated]]:
     """Return the minimum, found by a simulation that is accurate there, and how that was done."""
-    sigma, rtol, tolerance, evaluations = how
     allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
-    ways = [Way(rtol * 0.1**k) for k in range(_TENTHS)] + [Way(rtol, stepped=True)]
+    first = max(rtol, _loosest(experiments, allowed))
+    ways = [Way(first * 0.1**k) for k in range(_TENTHS)] + [Way(rtol, stepped=True)]
     spent = 0
     for way in ways:
         evaluate = objective(model, experiments, unknowns, weights, way)
-        left = max(evaluations - spent, 2)
-        minimum = minimise(
-            evaluate, theta, unknowns.bounds(), tolerance=tolerance, evaluations=left
+        found = minimise(
+            evaluate,
+            theta,
+            unknowns.bounds(),
+            tolerance=effort.tolerance,
+            evaluations=max(effort.evaluations - spent, 2),
+            goal=effort.goal,
+            linear=effort.linear,
         )
-        if minimum is None:
+        if found is None:
             raise SimulationError(
                 "The model cannot be simulated at the start of the fit; start from other values."
             )
-        spent += minimum.evaluations
-        theta = minimum.theta
+        minimum, theta = found, found.theta
+        spent += found.evaluations
         told = simulated(model, experiments, unknowns, theta, way=way)
         if minimum.interrupted or not any(t.error > a for t, a in zip(told, allowed, strict=True)):
             break
     return replace(minimum, evaluations=spent), way, told
+
+
+def _loosest(experiments: Sequence[Experiment], allowed: Sequence[float]) -> float:
+    """Return the tolerance of a step whose error, half of it (rms, measured), is allowed."""
+    shares = [
+        2.0 * a / max(float(np.ptp(measured(e.record)[e.used])), 1e-300)
+        for e, a in zip(experiments, allowed, strict=True)
+        if e.used.any()
+    ]
+    return min([*shares, LOOSEST])
 
 
 def _allowed(experiment: Experiment, sigma: float) -> float:

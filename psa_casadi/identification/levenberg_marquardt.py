@@ -5,7 +5,7 @@ sits on its bound, as the Bouc-Wen exponent n does on piezo loops, and `dogbox` 
 loop's curved valley.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
@@ -18,7 +18,7 @@ Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 
 _FIRST_RADIUS = 1.0
 _SMALLEST_RADIUS = 1e-6
-_BISECTIONS = 60
+_NEWTON_STEPS = 60
 #: Changes of the active set per coordinate; two or three are ordinary.
 _ACTIVE_SETS = 20
 
@@ -46,6 +46,8 @@ def minimise(
     *,
     tolerance: float,
     evaluations: int,
+    linear: Sequence[int] = (),
+    goal: float = np.inf,
 ) -> Minimum | None:
     """Minimise |r(theta)|^2 within bounds; None if the start cannot be evaluated.
 
@@ -54,13 +56,19 @@ def minimise(
     actual to predicted decrease.
     Converged when two steps in a row lower the cost by less than `tolerance` of it, or no radius
     lowers it at all. A keyboard interrupt ends the iteration at the best point so far.
+
+    r(theta) is exactly linear in the `linear` coordinates, which no bound holds and on which the
+    Jacobian does not depend: at every point they take their best values, without an evaluation.
+    A minimum above the `goal` is of no use: the iteration ends where as many steps as are left,
+    each as good as the last one that lowered the cost, would not lead there.
     """
     low, high = bounds
+    columns = list(linear)
     theta = np.clip(theta, low, high)
     start = evaluate(theta)
     if start is None:
         return None
-    residual, jacobian = start
+    theta, residual, jacobian = _at_best(theta, start, columns)
     cost, radius = float(residual @ residual), _FIRST_RADIUS
     count, quiet, converged, interrupted = 1, 0, False, False
     while count < evaluations and not converged:
@@ -77,18 +85,37 @@ def minimise(
             interrupted = True
             break
         count += 1
-        new = float(found[0] @ found[0]) if found is not None else np.inf
+        new = np.inf
+        if found is not None:
+            trial, *at_trial = _at_best(trial, found, columns)
+            new = float(at_trial[0] @ at_trial[0])
         ratio = (cost - new) / predicted
         if ratio < 0.25:
             radius = 0.25 * float(np.linalg.norm(move))
         elif ratio > 0.75:
             radius = max(radius, 2.0 * float(np.linalg.norm(move)))
-        if found is not None and new < cost:
+        if new < cost:
             quiet = quiet + 1 if cost - new < tolerance * cost else 0
-            theta, (residual, jacobian), cost = trial, found, new
+            hopeless = (evaluations - count) * (cost - new) < new - goal
+            theta, (residual, jacobian), cost = trial, at_trial, new
             converged = quiet == 2
+            if hopeless:
+                break
         converged = converged or radius < _SMALLEST_RADIUS
     return Minimum(theta, residual, jacobian, cost, converged, interrupted, count)
+
+
+def _at_best(
+    theta: FloatArray, found: tuple[FloatArray, FloatArray], columns: list[int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return theta, residual and Jacobian where the residual's linear coordinates are best."""
+    residual, jacobian = found
+    if not columns:
+        return theta, residual, jacobian
+    slopes = jacobian[:, columns]
+    move = np.zeros_like(theta)
+    move[columns] = -np.linalg.lstsq(slopes.T @ slopes, slopes.T @ residual)[0]
+    return theta + move, residual + slopes @ move[columns], jacobian
 
 
 def _bounded_step(
@@ -157,15 +184,12 @@ def _step(gradient: FloatArray, normal: FloatArray, radius: float) -> FloatArray
     values, vectors = np.linalg.eigh(normal)
     values = np.maximum(values, 1e-14 * max(float(values[-1]), 1e-300))
     along = -(vectors.T @ gradient)
-    if np.linalg.norm(along / values) <= radius:
-        newton: FloatArray = vectors @ (along / values)
-        return newton
-    low, high = 0.0, float(np.linalg.norm(along)) / radius
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        if np.linalg.norm(along / (values + middle)) > radius:
-            low = middle
-        else:
-            high = middle
-    damped: FloatArray = vectors @ (along / (values + high))
+    damping = 0.0
+    for _ in range(_NEWTON_STEPS):  # on 1/|step|, which grows nearly straight with the damping
+        scaled = along / (values + damping)
+        size = float(np.linalg.norm(scaled))
+        if size <= (1.0 + 1e-9) * radius:
+            break
+        damping += (size / radius - 1.0) * size**2 / float(scaled @ (scaled / (values + damping)))
+    damped: FloatArray = vectors @ scaled
     return damped

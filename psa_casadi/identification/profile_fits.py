@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import FIT_RTOL, Fit, objective
+from psa_casadi.identification.fit import Fit, objective
 from psa_casadi.identification.levenberg_marquardt import Minimum, minimise
 
 FloatArray = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.exchanges import exchanges
-from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
+from psa_casadi.identification.fit import Fit, fit
 from psa_casadi.identification.prediction import predict
 from psa_casadi.identification.refitting import Progress, differing, equal, quick_from, refit
 from psa_casadi.identification.unknowns import unknowns_of

@@ -77,15 +77,23 @@ def refit(
     free: Sequence[str],
     *,
     sigma: Sequence[float] | None = None,
+    least: float = np.inf,
 ) -> Fit:
-    """Continue a fit from where it stands, with the noise level its residuals suggest."""
+    """Continue a fit from where it stands, with the noise level its residuals suggest.
+
+    It may end early where the rms will stay above `least` [m].
+    """
+    levels = sigma or residual_noise(previous, experiments)
+    parts = zip(previous.residuals_of(experiments), levels, strict=True)
+    now = sum(float(np.sum((part / level) ** 2)) for part, level in parts)
     return fit(
         previous.model,
         experiments,
         free,
-        sigma=sigma or residual_noise(previous, experiments),
+        sigma=levels,
         start_states=previous.starts(),
         evaluations=POLISH,
+        goal=now * (least / max(previous.rms, 1e-300)) ** 2,
     )
 
 
@@ -98,6 +106,7 @@ def quick_from(
     start_states: Sequence[Mapping[str, float]],
     evaluations: int,
     start: Mapping[str, float] | None = None,
+    goal: float = np.inf,
 ) -> Fit | None:
     """Fit a little from other values, weighted as before; None if these cannot be simulated."""
     try:
@@ -110,6 +119,7 @@ def quick_from(
             start_states=start_states,
             evaluations=evaluations,
             rtol=quick_rtol(previous.sigma, experiments),
+            goal=goal,
         )
     except PsaError:
         return None
@@ -136,3 +146,8 @@ def differing(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[
     errors = np.sqrt(np.diag(covariance_of(one, experiments)))[:count]
     apart = np.abs(there - one.theta[:count]) > _APART * errors
     return tuple(n for n, far in zip(one.unknowns.names, apart, strict=True) if far)
+
+
+def same_place(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> bool:
+    """Whether two fits are equally likely and differ in no parameter beyond its interval."""
+    return equal(one, other) and not differing(one, other, experiments)

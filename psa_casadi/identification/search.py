@@ -18,6 +18,7 @@ from psa_casadi.identification.refitting import (
     quick_rtol,
     refit,
     residual_noise,
+    same_place,
 )
 from psa_casadi.identification.starting_points import resolved, starting_points
 from psa_casadi.model.compose import Model
@@ -106,6 +107,8 @@ def search(
         missed = thorough and len(polished) < _FOLLOWED and all(map(_misses, polished))
         if polished and (polished[0].interrupted or not (missed or (near and len(polished) < 2))):
             break
+        if polished and not thorough and same_place(found[0][1], quick, experiments):
+            continue
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit(quick, experiments, free, sigma=sigma)
         polished.append(ended)

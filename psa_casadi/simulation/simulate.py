@@ -116,9 +116,7 @@ def simulate_record(
     return simulate(model, record.time, record.voltage, memory=memory, rtol=rtol, **extra)
 
 
-def _trajectory(
-    model: Model, t: FloatArray, v: FloatArray, steps: Steps, way: str
-) -> Trajectory:
+def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps, way: str) -> Trajectory:
     return Trajectory(
         time=t,
         voltage=v,

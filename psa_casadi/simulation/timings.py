@@ -13,7 +13,7 @@ REST = "rest"
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage took: seconds, processor seconds of all threads, and runs of the stepper.
+    """What one stage took: seconds, processor seconds of all threads, and simulations.
 
     `differentiated` of the `runs` were with sensitivities. A stage within another one counts for
     itself only.
@@ -62,7 +62,7 @@ class Timings:
             self._within.pop()
 
     def count(self, *, differentiated: bool) -> None:
-        """Count one run of the stepper."""
+        """Count one simulation."""
         with self._lock:
             now = self._present()
             more = now.differentiated + differentiated
@@ -111,7 +111,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 def count_run(*, differentiated: bool) -> None:
-    """Count a run of the stepper for the present stage where someone records it."""
+    """Count a simulation for the present stage where someone records it."""
     timings = _timings.get()
     if timings is not None:
         timings.count(differentiated=differentiated)

@@ -21,7 +21,7 @@ STEP_SHARE, SMALLEST_STEP_RTOL = 0.003, 1e-12
 #: Each is judged by the one before.
 _LADDER = ((0.1, 0), (0.01, 0), (1e-3, 1), (1e-4, 1))
 #: Loosest tolerance of exact steps: beyond it nothing is won.
-_LOOSEST = 1e-5
+LOOSEST = 1e-5
 #: Range below which a displacement counts as constant, over its nominal size.
 _STILL = 1e-3
 
@@ -65,12 +65,6 @@ def output_of(model: Model) -> str | None:
     return next((n for n in names if n in model.output_names), None)
 
 
-def output_of(model: Model) -> str | None:
-    """Return the name of the displacement that a model shows, None if it has none."""
-    names = ("measured_displacement", "displacement")
-    return next((n for n in names if n in model.output_names), None)
-
-
 def trace(
     model: Model,
     t: FloatArray,
@@ -93,7 +87,7 @@ def trace(
     if not way.stepped:
         try:
             found = run_exact(
-                model, t, u, x0, tolerance=min(way.rtol, _LOOSEST), coarsest=halved,
+                model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=halved,
                 unknowns=unknowns, s0=s0, output=output,
             )  # fmt: skip
             slopes = none if found.sensitivity is None else found.sensitivity

@@ -1,0 +1,1 @@
+"""Exact steps of the linear part: the split of a model, its C code, and the runs."""

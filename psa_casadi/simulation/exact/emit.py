@@ -6,13 +6,16 @@ whose exponents differ by halves share one exponential; a division by a paramete
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 
 from psa_casadi.component import Expression
 
 #: (operation, arguments) or ("x", index), ("c", value), ...; equal nodes are one number.
-_Node = tuple[object, ...]
+_Node = tuple[Any, ...]
+#: (symbol's number or None, factor, shift)
+_Affine = tuple[int | None, float, float]
 
 _BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
 _CALLS = {
@@ -56,7 +59,7 @@ class _Graph:
     def add(self, *node: object) -> int:
         if node not in self.numbers:
             leaf = node[0] in _LEAVES
-            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in node[1:])  # type: ignore[call-overload]
+            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in node[1:])
             self.numbers[node] = len(self.nodes)
             self.nodes.append(node)
             self.fixed.append(fixed)
@@ -67,7 +70,7 @@ class _Graph:
 
     def value(self, number: int) -> float | None:
         node = self.nodes[number]
-        return float(node[1]) if node[0] == "c" else None  # type: ignore[arg-type]
+        return float(node[1]) if node[0] == "c" else None
 
     def operation(self, op: int, *arguments: int) -> int:
         if op == ca.OP_DIV and self.fixed[arguments[1]] and not self.fixed[arguments[0]]:
@@ -121,27 +124,32 @@ class _Graph:
         square = self.add("*", half, half)
         return self.add("*", square, base) if exponent % 2 else square
 
-    def _affine(self, number: int) -> tuple[int | None, float, float]:
+    def _affine(self, number: int) -> _Affine:
         """Return (symbol, factor, shift) of an exponent factor symbol + shift."""
         node = self.nodes[number]
         if node[0] == "c":
-            return None, 0.0, float(node[1])  # type: ignore[arg-type]
+            return None, 0.0, node[1]
         if node[0] == "neg":
-            symbol, factor, shift = self._affine(int(node[1]))  # type: ignore[call-overload]
+            symbol, factor, shift = self._affine(node[1])
             return symbol, -factor, -shift
-        if node[0] in ("+", "-", "*", "/"):
-            a, b = (self._affine(int(q)) for q in node[1:])  # type: ignore[call-overload]
-            sign = 1.0 if node[0] == "+" else -1.0
-            if node[0] in ("+", "-") and (a[0] is None or b[0] is None or a[0] == b[0]):
-                symbol = a[0] if a[0] is not None else b[0]
-                return symbol, a[1] + sign * b[1], a[2] + sign * b[2]
-            if node[0] == "*" and a[0] is None:
-                return b[0], a[2] * b[1], a[2] * b[2]
-            if node[0] == "*" and b[0] is None:
-                return a[0], b[2] * a[1], b[2] * a[2]
-            if node[0] == "/" and b[0] is None and b[2] != 0.0:
-                return a[0], a[1] / b[2], a[2] / b[2]
-        return number, 1.0, 0.0
+        found = None
+        if node[0] in _BINARY.values():
+            found = _combined(node[0], self._affine(node[1]), self._affine(node[2]))
+        return found or (number, 1.0, 0.0)
+
+
+def _combined(operation: str, a: _Affine, b: _Affine) -> _Affine | None:
+    """Return the affine form of an operation on two, None if it is none."""
+    if operation in ("+", "-") and (a[0] is None or b[0] is None or a[0] == b[0]):
+        sign = 1.0 if operation == "+" else -1.0
+        return a[0] if a[0] is not None else b[0], a[1] + sign * b[1], a[2] + sign * b[2]
+    if operation == "*" and a[0] is None:
+        return b[0], a[2] * b[1], a[2] * b[2]
+    if operation == "*" and b[0] is None:
+        return a[0], b[2] * a[1], b[2] * a[2]
+    if operation == "/" and b[0] is None and b[2] != 0.0:
+        return a[0], a[1] / b[2], a[2] / b[2]
+    return None
 
 
 class Printer:
@@ -200,9 +208,7 @@ class Printer:
                 )
             elif op == ca.OP_INPUT:
                 argument, element = function.instruction_input(k)
-                slots[function.instruction_output(k)[0]] = self._graph.add(
-                    names[argument], element
-                )
+                slots[function.instruction_output(k)[0]] = self._graph.add(names[argument], element)
             elif op == ca.OP_OUTPUT:
                 found[function.instruction_output(k)[1]] = slots[function.instruction_input(k)[0]]
             else:
@@ -220,7 +226,7 @@ class Printer:
             if n in needed or node[0] in _LEAVES or (self._graph.fixed[n] and not fixed):
                 continue
             needed.add(n)
-            stack += [int(a) for a in node[1:]]  # type: ignore[call-overload]
+            stack += [int(a) for a in node[1:]]
         name = self._fixed_name if fixed else self._name
         return [f"    const real s{n} = {self._text(n, name)};" for n in sorted(needed)]
 
@@ -247,7 +253,7 @@ class Printer:
     def _text(self, number: int, name: Callable[[int], str]) -> str:
         node = self._graph.nodes[number]
         operation = str(node[0])
-        arguments = [name(a) for a in node[1:]]  # type: ignore[arg-type]
+        arguments = [name(a) for a in node[1:]]
         if operation == "neg":
             return f"-{arguments[0]}"
         if operation in ("+", "-", "*", "/"):

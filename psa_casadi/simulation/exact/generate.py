@@ -1,4 +1,4 @@
-"""The generated half of the C code of exact steps: a model's functions and the tables of its split."""
+"""The generated half of the C code of exact steps: a model's functions, its split as tables."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -62,9 +62,7 @@ def generate(split: Split, output: str) -> str:
         "ex_theta": thetas,
         "ex_reads": [int(np.flatnonzero(row)[-1]) + 1 for row in reach],
         "ex_port_timed": [int(ca.depends_on(q.value, s.time)) for q in split.ports],
-        "ex_port_reaches": [
-            int(np.flatnonzero(reach[:, place[q.state]])[0]) for q in split.ports
-        ],
+        "ex_port_reaches": [int(np.flatnonzero(reach[:, place[q.state]])[0]) for q in split.ports],
         "ex_port_row": [place[q.state] for q in split.ports],
         "ex_port_chord": [chords.index(k) if k in chords else -1 for k in range(len(split.ports))],
         "ex_chord_port": chords,
@@ -146,9 +144,7 @@ def _partials(
 
 def _dispatch(name: str, count: int) -> str:
     """Return a function that calls the one with the number it is given."""
-    cases = "".join(
-        f"    case {k}: {name}_{k}(t, x, v, w, k, out); break;\n" for k in range(count)
-    )
+    cases = "".join(f"    case {k}: {name}_{k}(t, x, v, w, k, out); break;\n" for k in range(count))
     return (
         f"static inline void {name}(int which, real t, const real *x, const real *v, real w,\n"
         f"        const real *k, real *out) {{\n"
@@ -157,9 +153,7 @@ def _dispatch(name: str, count: int) -> str:
     )
 
 
-def _groups(
-    split: Split, printer: Printer, rate: Expression, tables: list[str]
-) -> tuple[int, int]:
+def _groups(split: Split, printer: Printer, rate: Expression, tables: list[str]) -> tuple[int, int]:
     s, counts, rate_counts, largest, rate_size = split.structure, [], [], 1, 1
     for k, group in enumerate(split.groups):
         slopes = ca.substitute(group.slopes, group.rate, rate)
@@ -213,7 +207,7 @@ def _read(split: Split, expression: Expression) -> set[int]:
 
 
 def _needed(split: Split) -> tuple[list[int], list[int]]:
-    """Return the linear states that are wanted inside a step, and those along whose way groups go."""
+    """Return the linear states wanted inside a step, and those along whose way groups go."""
     path: set[int] = set()
     inside: set[int] = set()
     for group in split.groups:

@@ -20,6 +20,7 @@ from psa_casadi.simulation.compiler import generated_library, vector_flags
 from psa_casadi.simulation.exact.emit import Unprintable
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.split import split_of
+from psa_casadi.simulation.timings import count_run
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -217,8 +218,11 @@ def _run(
 ) -> tuple[int, int, int]:
     """Run the library over times, inputs and hold; return steps, rejected and forced ones."""
     t, u, hold = record
+    count_run(differentiated=how["count"] > 0)
     lengths, which_step = time_steps(t)
-    given = {"t": _doubles(t), "v": _doubles(u), "length": lengths, "which_step": which_step}
+    given: dict[str, npt.NDArray[Any]] = {
+        "t": _doubles(t), "v": _doubles(u), "length": lengths, "which_step": which_step,
+    }  # fmt: skip
     request = _Request(
         samples=len(t),
         zero_order_hold=int(hold == "zero"),

@@ -108,8 +108,12 @@ def _split(s: Structure) -> Split:
     found = {i: g for i in alone if (g := _along(s, i, reach)) is not None}
     groups = _groups(found)
     # what feeds comes before what it feeds: M is block triangular
-    linear = tuple(sorted((i for i in range(len(s.states)) if i not in found),
-                          key=lambda i: (int(reach[i].sum()), i)))
+    linear = tuple(
+        sorted(
+            (i for i in range(len(s.states)) if i not in found),
+            key=lambda i: (int(reach[i].sum()), i),
+        )
+    )
     matrices, remainders = _linear_part(s, linear)
     ports = _ports(s, linear, remainders, groups, reach)
     _check_switches(s, groups)
@@ -225,14 +229,17 @@ def _linear_part(
     m, b, c = (ca.densify(q) for q in ca.substitute(blocks, [everything], [origin]))
     given, coefficients = ca.vertcat(x, s.u), ca.horzcat(m, b)
     remainders = [
-        _remainder(xdot[k], given, coefficients[k, :].T, c[k], everything)
-        for k in range(len(rows))
+        _remainder(xdot[k], given, coefficients[k, :].T, c[k], everything) for k in range(len(rows))
     ]
     return (m, b, c), remainders
 
 
 def _remainder(
-    row: Expression, given: Expression, linear: Expression, constant: Expression, everything: Expression
+    row: Expression,
+    given: Expression,
+    linear: Expression,
+    constant: Expression,
+    everything: Expression,
 ) -> Expression:
     """Return what `linear` and `constant` leave of a row.
 
@@ -280,9 +287,7 @@ def _check_switches(s: Structure, groups: Sequence[Group]) -> None:
             raise NoSplit(f"its equations have a kink of their own ({name})")
 
 
-def _order(
-    s: Structure, split: Split, reach: BoolArray
-) -> tuple[tuple[str, tuple[int, ...]], ...]:
+def _order(s: Structure, split: Split, reach: BoolArray) -> tuple[tuple[str, tuple[int, ...]], ...]:
     """Return the order in which groups and ports are evaluated, each after what feeds it."""
     items: list[tuple[str, tuple[int, ...]]] = [("group", (k,)) for k in range(len(split.groups))]
     _, label = connected_components(reach & reach.T, directed=False)
@@ -300,9 +305,7 @@ def _order(
         ready = [
             k
             for k in waiting
-            if not any(
-                reach[r, f] for o in waiting if o != k for f in feeds[o] for r in reads[k]
-            )
+            if not any(reach[r, f] for o in waiting if o != k for f in feeds[o] for r in reads[k])
         ]
         if not ready:
             raise NoSplit("its nonlinear parts feed each other in a loop")
@@ -323,6 +326,6 @@ def _reads(s: Structure, split: Split, item: tuple[str, tuple[int, ...]]) -> lis
     if kind == "group":
         group = split.groups[members[0]]
         inside = np.any(_depends(group.slopes, s.x), axis=0)
-        return [j for j in np.flatnonzero(inside) if j not in group.states] + [group.driver]
+        return [int(j) for j in np.flatnonzero(inside) if j not in group.states] + [group.driver]
     inside = np.any([_depends(split.ports[k].value, s.x)[0] for k in members], axis=0)
     return [int(j) for j in np.flatnonzero(inside)]
