@@ -189,7 +189,7 @@ def simulated(
     *,
     way: Way,
 ) -> list[Simulated]:
-    """Tell of every record how it is run; a tenth of the tolerance and half the step show its error."""
+    """Tell how every record is run; a tenth of the tolerance and half the step show its error."""
     current = model.with_values(unknowns.values(theta))
 
     def one(index: int) -> Simulated:

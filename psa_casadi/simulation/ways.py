@@ -20,6 +20,8 @@ STEP_SHARE, SMALLEST_STEP_RTOL = 0.003, 1e-12
 #: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
 #: Each is judged by the one before.
 _LADDER = ((0.1, 0), (0.01, 0), (1e-3, 1), (1e-4, 1))
+#: Below this tolerance two runs may share an error that is of its size: the stepper is taken.
+_TIGHTEST = 1e-6
 #: Loosest tolerance of exact steps: beyond it nothing is won.
 LOOSEST = 1e-5
 #: Range below which a displacement counts as constant, over its nominal size.
@@ -107,13 +109,13 @@ def accurate(
 ) -> tuple[Steps, str]:
     """Return a run whose displacement errs by less than `rtol` of its range, and the way taken.
 
-    Exact steps are halved until two runs agree to that; where they do not, the stepper takes steps
-    of 0.003 `rtol`.
+    Exact steps get finer until two runs agree to that; where they do not, or for tolerances below
+    1e-6, the stepper takes steps of 0.003 `rtol`.
     """
     output = output_of(model)
     before: FloatArray | None = None
     nominal = 0.0 if output is None else model.output_nominals()[model.output_names.index(output)]
-    for share, coarsest in _LADDER if output else ():
+    for share, coarsest in _LADDER if output and rtol >= _TIGHTEST else ():
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
@@ -122,7 +124,8 @@ def accurate(
         except NotExact:
             break
         size = max(float(np.ptp(found.shown)), _STILL * nominal)
-        if before is not None and np.max(np.abs(found.shown - before)) <= rtol * size:
+        fine = before is not None and not found.forced
+        if before is not None and fine and np.max(np.abs(found.shown - before)) <= rtol * size:
             x, y = found.x, found.y
             if x is not None and y is not None:
                 empty = np.empty((len(t), 0))

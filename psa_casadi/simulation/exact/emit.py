@@ -54,12 +54,12 @@ class _Graph:
 
     nodes: list[_Node] = field(default_factory=list)
     numbers: dict[_Node, int] = field(default_factory=dict)
-    fixed: list[bool] = field(default_factory=list)
+    fixed: list[Any] = field(default_factory=list)
 
-    def add(self, *node: object) -> int:
+    def add(self, *node: Any) -> int:
         if node not in self.numbers:
             leaf = node[0] in _LEAVES
-            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in node[1:])
+            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[int(a)] for a in node[1:])
             self.numbers[node] = len(self.nodes)
             self.nodes.append(node)
             self.fixed.append(fixed)

@@ -185,8 +185,8 @@ def _along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Exp
 
 def _rate_name(s: Structure, i: int) -> str | None:
     """Return the name of the balance or state that is a state's derivative, if there is one."""
-    derivative = ca.SX(s.der[s.states[i].name])
-    return derivative.name() if derivative.is_symbolic() else None
+    derivative: Expression = ca.SX(s.der[s.states[i].name])
+    return str(derivative.name()) if derivative.is_symbolic() else None
 
 
 def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expression:
@@ -202,8 +202,8 @@ def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expressio
 
 
 def _is_balance(s: Structure, name: str) -> bool:
-    declared = {q.name for q in (*s.states, *s.inputs, *s.parameters, *s.sampled)}
-    return name not in declared and name != "time"
+    tables = (s.states, s.inputs, s.parameters, s.sampled)
+    return name != "time" and all(name not in [q.name for q in table] for table in tables)
 
 
 def _groups(found: dict[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
