@@ -88,8 +88,15 @@ def with_effect(name: str, stack_name: str = "P-885.51") -> Model:
     return model.with_values({gain.name: float(np.clip(size, *gain.bounds))})
 
 
+def times(samples: int, step: float) -> FloatArray:
+    """Return instants (n,) [s] that are `step` apart, from 0 on."""
+    found: FloatArray = step * np.arange(samples, dtype=np.float64)
+    return found
+
+
 def voltage(kind: str, share: FloatArray) -> FloatArray:
     """Return a voltage over the rated one at shares (n,) of the record."""
+    corners, levels = [0.0, 0.1, 0.3, 0.5, 0.6, 0.8, 1.0], [0.0, 0.0, 0.8, 0.8, 0.3, 0.3, 0.0]
     tones = ((3, 0.3), (11, 2.0), (37, 4.0), (90, 1.0))
     shapes = {
         "sine": 0.4 * (1.0 - np.cos(10.0 * np.pi * share)),
@@ -97,7 +104,7 @@ def voltage(kind: str, share: FloatArray) -> FloatArray:
         "triangle": 0.8 * (1.0 - np.abs(2.0 * ((4.0 * share + 0.003) % 1.0) - 1.0)),
         "steps": np.select([share < 0.1, share < 0.4, share < 0.7], [0.0, 0.7, 0.2], 0.9),
         "multisine": 0.4 + 0.1 * sum(np.sin(2 * np.pi * k * share + q) for k, q in tones),
-        "ramps": np.interp(share, [0.0, 0.1, 0.3, 0.5, 0.6, 0.8, 1.0], [0, 0, 0.8, 0.8, 0.3, 0.3, 0]),
+        "ramps": np.interp(share, corners, levels),
     }  # fmt: skip
     return np.asarray(shapes[kind], dtype=np.float64)
 

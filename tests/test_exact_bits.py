@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from build_scripts.compile_c import write_exact
 from psa_casadi.simulation.compiler import run_compiler, vector_flags, zig_command
 from psa_casadi.simulation.exact import run as exact
-from tests.exact_cases import composite, inputs, start, with_effect
+from tests.exact_cases import composite, inputs, start, times, with_effect
 
 FloatArray = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ def _plain_vectors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def results(name: str) -> list[FloatArray]:
     """Return displacement, derivatives, states and outputs of a run."""
     model = with_effect(name)
-    t = 1e-4 * np.arange(400)
+    t = times(400, 1e-4)
     u = inputs(model, t, composite(400))
     unknowns: list[str | int] = ["k_L", "A", "R_s", "tau", "k_P"]
     found = exact.run_exact(

@@ -14,7 +14,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.stepper import run
-from tests.exact_cases import OUTPUT, composite, inputs, start, with_effect
+from tests.exact_cases import OUTPUT, composite, inputs, start, times, with_effect
 
 FloatArray = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ def unknowns_of(name: str, model: Model) -> list[str | int]:
 
 
 def record(model: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
-    t = STEP * np.arange(SAMPLES)
+    t = times(SAMPLES, STEP)
     u = inputs(model, t, composite(SAMPLES))
     return t, u, start(model, t, u)
 
@@ -71,7 +71,6 @@ def off(found: FloatArray, true: FloatArray) -> float:
 def test_derivatives_are_the_stepper_s(name: str) -> None:
     unknowns, found, own = columns(name, 1e-8)
     gaps = {q: off(found[:, k], own[:, k]) for k, q in enumerate(unknowns)}
-    print("SENS", name, max(gaps.items(), key=lambda item: item[1]))
     for unknown, gap in gaps.items():
         assert gap < (OF_DELTA if unknown == "delta" else ALLOWED), unknown
 
@@ -99,7 +98,6 @@ def test_derivatives_are_differences_of_the_stepper(name: str) -> None:
                 values = {**model.values, unknown: model.values[unknown] + sign * step}
                 ends.append(run(model, t, u, x0, rtol=1e-11, values=values).y[:, shown])
         gap = off(found[:, column], (ends[0] - ends[1]) / (2 * step))
-        print("DIFF", name, unknown, f"{gap:.1e}")
         assert gap < (OF_DELTA if unknown == "delta" else ALLOWED), unknown
 
 
@@ -107,7 +105,6 @@ def test_derivatives_are_differences_of_the_stepper(name: str) -> None:
 def test_derivatives_at_the_tolerance_of_fits(name: str) -> None:
     unknowns, found, own = columns(name, 1e-6)
     gaps = {q: off(found[:, k], own[:, k]) for k, q in enumerate(unknowns)}
-    print("LOOSE", name, max(gaps.items(), key=lambda item: item[1]))
     assert all(gap < 2e-2 for gap in gaps.values()), gaps
 
 

@@ -113,7 +113,7 @@ def test_what_feeds_comes_before_what_it_feeds() -> None:
     def order(effect: str) -> list[tuple[str, list[str]]]:
         split = parts((*BASE, EFFECTS[effect]))
         rows = {"group": [g.driver for g in split.groups]}
-        rows |= dict.fromkeys(("port", "loop"), [p.state for p in split.ports])
+        rows |= {kind: [p.state for p in split.ports] for kind in ("port", "loop")}
         return [(k, names(split, [rows[k][m] for m in ms])) for k, ms in split.order]
 
     hysteresis = [("group", ["u"]), ("port", ["f_out"])]
