@@ -96,6 +96,7 @@ def main() -> int:
         missing -= {f.name for f in (*files, *exact)}
         complaints = [f"{name}: not among the written sources." for name in sorted(missing)]
         exactly = [(*EXACT_FLAGS, f"-DPSA_LANES={lanes}") for lanes in LANES]
+        work: list[tuple[Path, tuple[Path, ...], tuple[str, ...]]]
         work = [(f, (f.parent, headers), FLAGS) for f in files]
         work += [(f, (f.parent,), flags) for f in exact for flags in exactly]
 

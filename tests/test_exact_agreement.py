@@ -93,10 +93,11 @@ def test_the_error_keeps_to_other_tolerances(name: str, rtol: float) -> None:
 
 @pytest.mark.parametrize("name", ["base", "backlash", "voltage_saturation"])
 def test_held_inputs_agree(name: str) -> None:
+    """Every sample begins with a jump; the stepper takes over where its turns are not settled."""
     relative = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
     found, way = compare(with_effect(name), times(600, 1e-4), relative, hold="zero")
     assert found <= RTOL
-    assert way == EXACT
+    assert way == (STEPPER if name == "voltage_saturation" else EXACT)
 
 
 @pytest.mark.parametrize("name", ["base", "backlash"])
@@ -185,10 +186,7 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
     assert error(found.outputs["displacement"][every], true.displacement) <= RTOL
 
 
-REST = pytest.mark.xfail(reason="1.4e-6: a rest on a stair is seen from 1e-9 a step", strict=True)
-
-
-@pytest.mark.parametrize("hold", ["linear", pytest.param("zero", marks=REST)])
+@pytest.mark.parametrize("hold", ["linear", "zero"])
 def test_the_base_agrees_with_the_reference_between_and_at_kinks(hold: str) -> None:
     """120 coarse samples with a corner at each of them."""
     p = stack_values("P-885.51", "cascade")
