@@ -13,10 +13,13 @@
 #include "exact_model.h"
 #include "exact_levels.h"
 
-#define SLOWS 0.5        /* a driver whose rate falls to less than this share of it may come to rest */
+#define SLOWS 0.8        /* a driver whose rate falls to less than this share of it may come to rest */
 #define FAST 1e3         /* over the driver's rate: there what a state does in time is nothing */
 #define GROWS 0.03       /* of the tolerance: the next step may be twice as long */
 #define TURNS 8          /* iterations for the instant at which a driver turns */
+#define LOST 1e6         /* times the tolerance: an error of the finest step from which nothing can be told */
+#define BENDS 0.05       /* of its way: a driver's course that bends by more is not a smooth one */
+#define UNEVEN 0.02      /* share of its way by which a driver is off the middle at the half of a step */
 #define NEWTON_LIMIT 12
 #define STILL 1e-9       /* of its nominal size: a driver's way along which nothing can be told */
 
@@ -51,6 +54,8 @@ typedef struct {
     int on[NODES];                        /* the leg of each node; with lanes only the first counts */
     real basis[6];                        /* Hermite's, at the turn */
     real missed;                          /* error of the driver's value there */
+    int drifts;                           /* what the states do in time is told apart at the nodes */
+    real drift[EX_NX], fast[EX_GROUP_OUT]; /* their slopes in time, and all slopes at a great rate */
     real rate_slopes[NODES + 1][EX_RATE_OUT];
 } psa_stages;
 
@@ -62,6 +67,8 @@ typedef struct {
     real l[ROWS], x[NODES][EX_NX];
     real port[NODES][EX_NPORT + 1];       /* values */
     real slopes[NODES][EX_NPORT + 1][EX_PORT_OUT]; /* values and partial derivatives */
+    real chord_over[EX_NCH + 1];          /* what sigma is a ratio over: the driver's way, or its bend */
+    int chord_bends[EX_NCH + 1];
     real chord[EX_NCH + 1], beyond[EX_NCH + 1][NL]; /* sigma, and the response to u(t) beyond the parabola */
     psa_stages stages[EX_NG + 1];
     real error;                           /* over the tolerance */
@@ -245,20 +252,28 @@ static inline void respond_beyond(const psa_state *state, const psa_trial *trial
     }
 }
 
+/* How a port goes with its driver: over the whole step or, where the driver's course bends by more than a little
+   of its way (it dies away, and the port may go on in time), by how both bend. 0 where the driver turns. */
+static real chord_slope(psa_state *state, psa_trial *trial, int j, int c, int u) {
+    const real way = trial->x[WHOLE][u] - state->x[u];
+    const real bend = trial->x[HALF][u] - 0.5 * (trial->x[WHOLE][u] + state->x[u]);
+    const real change = trial->port[WHOLE][j] - state->port[j];
+    const real bent = trial->port[HALF][j] - 0.5 * (trial->port[WHOLE][j] + state->port[j]);
+    const bits bends = MASK(v_fabs(bend) > BENDS * v_fabs(way));
+    trial->chord_over[c] = choose(bends, bend, way);
+    trial->chord_bends[c] = LANE(bends, 0) != 0;
+    bits moves = MASK(v_fabs(trial->chord_over[c]) > STILL * state->nominal[u]);
+    for (int g = 0; g < EX_NG; ++g)
+        if (ex_linear[ex_group_driver[g]] == u) moves &= MASK(trial->stages[g].turn >= 1.0);
+    return choose(moves, choose(bends, bent, change) / choose(moves, trial->chord_over[c], REAL(1.0)), REAL(0.0));
+}
+
 static void do_port(psa_state *state, psa_trial *trial, int j, int slopes) {
     const int c = ex_port_chord[j], driver = c >= 0 ? ex_chord_driver[c] : -1;
     real sigma = REAL(0.0);
     evaluate_port(state, trial, HALF, j, slopes);
     evaluate_port(state, trial, WHOLE, j, slopes);
-    if (c >= 0) {
-        const int u = ex_linear[driver];
-        const real way = trial->x[WHOLE][u] - state->x[u];
-        bits moves = MASK(v_fabs(way) > STILL * state->nominal[u]);
-        for (int g = 0; g < EX_NG; ++g)
-            if (ex_group_driver[g] == driver) moves &= MASK(trial->stages[g].turn >= 1.0);
-        sigma = choose(moves, (trial->port[WHOLE][j] - state->port[j]) / choose(moves, way, REAL(1.0)),
-                       REAL(0.0));
-    }
+    if (c >= 0) sigma = chord_slope(state, trial, j, c, ex_linear[driver]);
     check_port(state, trial, j, sigma, driver);
     for (int n = 0; n < NODES; ++n) add_port(state, trial, n, j);
     if (c < 0) return;
@@ -403,6 +418,7 @@ static void group_node(psa_state *state, psa_trial *trial, int g, int n, double 
                            basis[k][2] * leg->to[q] + basis[k][3] * leg->dt * leg->last[i];
             trial->x[n][q] = k ? choose(second, x, trial->x[n][q]) : x;
         }
+        if (stages->drifts) trial->x[n][q] += (theta - stages->share[n]) * trial->dt * stages->drift[i];
     }
 }
 
@@ -412,13 +428,20 @@ static void group_node(psa_state *state, psa_trial *trial, int g, int n, double 
 static void check_rest(psa_state *state, psa_trial *trial, int g, const real *w, real most, bits slows) {
     static const double WEIGHT[4] = {-1.0, 1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0};
     const int u = ex_linear[ex_group_driver[g]];
-    real fast[EX_GROUP_OUT] = {REAL(0.0)}, out[EX_GROUP_OUT] = {REAL(0.0)}, missed[EX_NX];
     const real mean = (trial->x[WHOLE][u] - state->x[u]) / trial->dt;
     const real rates[4] = {mean, w[NODES], w[HALF], w[WHOLE]};
-    ex_group(g, state->t, state->x, trial->v0, FAST * most, state->k, fast);
+    const real *const at[4] = {NULL, state->x, trial->x[HALF], trial->x[WHOLE]};
+    const real *const v[4] = {trial->v[HALF], trial->v0, trial->v[HALF], trial->v[WHOLE]};
+    real fast[EX_GROUP_OUT] = {REAL(0.0)}, out[EX_GROUP_OUT] = {REAL(0.0)}, missed[EX_NX], x[EX_NX];
+    memcpy(x, state->x, sizeof x);
     for (int k = 0; k < 4; ++k) {
         bits counts = MASK(REAL(0.0) > 1.0);
-        ex_group(g, state->t, state->x, trial->v0, rates[k], state->k, out);
+        for (int r = 0; r < EX_NPATH; ++r) {
+            const int q = ex_path[r];
+            x[q] = at[k] ? at[k][q] : 0.5 * (state->x[q] + trial->x[WHOLE][q]);
+        }
+        ex_group(g, state->t, x, v[k], FAST * most, state->k, fast);
+        ex_group(g, state->t, x, v[k], rates[k], state->k, out);
         for (int i = 0; i < ex_group_size[g]; ++i) {
             const real in_time = out[i] - fast[i] * (v_fabs(rates[k]) / (FAST * v_fabs(most)));
             missed[i] = WEIGHT[k] * in_time + (k ? missed[i] : REAL(0.0));
@@ -490,6 +513,24 @@ static void find_legs(psa_state *state, psa_trial *trial, int g, int slopes) {
     }
 }
 
+/* Where the driver is far on its way at the half of the step (it dies away), what its states do in time is not:
+   their slopes at a great rate tell the two apart */
+static void find_drift(psa_state *state, psa_trial *trial, int g, int slopes) {
+    psa_stages *const stages = trial->stages + g;
+    const psa_leg *const leg = stages->leg;
+    const int u = ex_linear[ex_group_driver[g]];
+    const bits moves = MASK(v_fabs(leg->way) > STILL * state->nominal[u]);
+    const real share = (trial->x[HALF][u] - leg->from[u]) / choose(moves, leg->way, REAL(1.0));
+    const bits uneven = moves & MASK(v_fabs(share - 0.5) > UNEVEN) & MASK(stages->turn >= 1.0);
+    stages->drifts = any(uneven);
+    if (!stages->drifts) return;
+    const real rate = FAST * leg->rate;
+    if (slopes) ex_group_slopes(g, state->t, leg->at[0], trial->v0, rate, state->k, stages->fast);
+    else ex_group(g, state->t, leg->at[0], trial->v0, rate, state->k, stages->fast);
+    for (int i = 0; i < ex_group_size[g]; ++i)
+        stages->drift[i] = choose(uneven, leg->out[0][i] - stages->fast[i] / FAST, REAL(0.0));
+}
+
 static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
     psa_stages *const stages = trial->stages + g;
     const int first = ex_group_first[g], size = ex_group_size[g];
@@ -519,6 +560,7 @@ static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
             set_error(trial, v_fabs(slope) * stages->missed / state->nominal[q] / state->tolerance);
         }
     }
+    find_drift(state, trial, g, slopes);
     group_node(state, trial, g, HALF, 0.5);
     group_node(state, trial, g, QUARTER, 0.25);
 }
@@ -752,12 +794,18 @@ static void do_port_columns(psa_state *state, int j) {
     add_port_columns(state, HALF, j);
     if (c >= 0 && trial->chord[c] != 0.0) {
         const int u = ex_linear[ex_chord_driver[c]];
-        const double sigma = trial->chord[c], way = trial->x[WHOLE][u] - state->x[u];
+        const double sigma = trial->chord[c], over = trial->chord_over[c];
+        /* weights of start, half and end in what sigma is the ratio of */
+        const double w0 = trial->chord_bends[c] ? -0.5 : -1.0, w1 = trial->chord_bends[c] ? 1.0 : 0.0;
+        const double w2 = trial->chord_bends[c] ? -0.5 : 1.0;
+        const column *const half = ROW(state->node, HALF * EX_NX + u);
+        const column *const n2 = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
         column *const x = ROW(state->node, WHOLE * EX_NX), *const dsigma = state->scratch;
         const column *const n0 = ROW(state->sport, j);
         const column *const n1 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
         for (int b = 0; b < nb; ++b)
-            dsigma[b] = (n1[b] - n0[b] - sigma * (ROW(x, u)[b] - ROW(state->s, u)[b])) / way;
+            dsigma[b] = (w2 * n1[b] + w1 * n2[b] + w0 * n0[b] -
+                         sigma * (w2 * ROW(x, u)[b] + w1 * half[b] + w0 * ROW(state->s, u)[b])) / over;
         add_port_columns(state, WHOLE, j);
         for (int i = 0; i < NL; ++i) {
             column *const out = ROW(x, ex_linear[i]);
@@ -797,7 +845,7 @@ static void turn_columns(psa_state *state, int g, column *out, column *rate) {
 /* Columns along one leg: `from` and `to` are those of the path variables, `x` those of the states at its
    start, which become those at its end; `k` holds the four slopes' */
 static void leg_columns(psa_state *state, int g, const psa_leg *leg, const column *from, const column *to,
-                        column *start, column *x, column *k) {
+                        column *start, column *x, column *k, column *drift) {
     static const double SHARE[4] = {0.0, 0.5, 0.5, 1.0};
     const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
     const int first = ex_group_first[g], size = ex_group_size[g];
@@ -822,6 +870,15 @@ static void leg_columns(psa_state *state, int g, const psa_leg *leg, const colum
             column *const out = ROW(k, stage * size + i);
             chain(state, state->group_list[first + i], leg->out[stage] + size, x, rate, out);
         }
+        if (stage == 0 && state->trial.stages[g].drifts) {
+            column *const great = ROW(drift, size);
+            for (int b = 0; b < nb; ++b) great[b] = FAST * rate[b];
+            for (int i = 0; i < size; ++i) {
+                column *const out = ROW(drift, i);
+                chain(state, state->group_list[first + i], state->trial.stages[g].fast + size, x, great, out);
+                for (int b = 0; b < nb; ++b) out[b] = ROW(k, i)[b] - out[b] / FAST;
+            }
+        }
     }
     for (int i = 0; i < size; ++i) {
         const column *const k1 = ROW(k, i), *const k2 = ROW(k, size + i), *const k3 = ROW(k, 2 * size + i);
@@ -838,12 +895,13 @@ static void leg_columns(psa_state *state, int g, const psa_leg *leg, const colum
 
 /* Columns of a group's states at the half of the step, if that lies on this leg */
 static void half_columns(psa_state *state, int g, const psa_leg *leg, const column *from, const column *to,
-                         const column *begin, const column *end, const column *k) {
+                         const column *begin, const column *end, const column *k, const column *drift) {
     const psa_trial *const trial = &state->trial;
     const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
     const int first = ex_group_first[g], size = ex_group_size[g];
     const double s = trial->stages[g].share[HALF], dt = leg->dt;
     const int inside = s > 0.0 && s < 1.0 && fabs(leg->way) > STILL * state->nominal[u];
+    const int drifts = trial->stages[g].drifts;
     column *const half = ROW(state->node, HALF * EX_NX);
     real basis[4];
     hermite(s, basis);
@@ -855,9 +913,11 @@ static void half_columns(psa_state *state, int g, const psa_leg *leg, const colu
         for (int b = 0; b < nb; ++b) {
             column sum = basis[0] * ROW(begin, i)[b] + basis[1] * dt * k1[b] + basis[2] * ROW(end, i)[b] +
                          basis[3] * dt * k4[b];
+            const double slope = by_share - (drifts ? trial->dt * trial->stages[g].drift[i] : 0.0);
             if (inside)
-                sum += by_share / leg->way *
+                sum += slope / leg->way *
                        (ROW(half, u)[b] - ROW(from, u)[b] - s * (ROW(to, u)[b] - ROW(from, u)[b]));
+            if (drifts) sum += (0.5 - s) * trial->dt * ROW(drift, i)[b];
             ROW(half, q)[b] = sum;
         }
     }
@@ -869,7 +929,7 @@ static void do_group_columns(psa_state *state, int g) {
     const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
     const int first = ex_group_first[g], size = ex_group_size[g];
     column *const x = state->scratch, *const k = ROW(x, EX_NX), *const turn = ROW(k, 4 * size + 1);
-    column *const begin = ROW(turn, EX_NX), *const end = ROW(begin, size);
+    column *const begin = ROW(turn, EX_NX), *const end = ROW(begin, size), *const drift = ROW(end, size);
     const column *from = state->s, *to = ROW(state->node, WHOLE * EX_NX);
     for (int i = 0; i < size; ++i) copy(ROW(state->s, ex_group_states[first + i]), ROW(end, i), nb);
     if (stages->legs > 1) {
@@ -884,8 +944,8 @@ static void do_group_columns(psa_state *state, int g) {
     for (int n = 0; n < stages->legs; ++n) {
         const column *const a = n == 0 ? from : turn, *const b = n + 1 == stages->legs ? to : turn;
         memcpy(begin, end, sizeof(column) * (size_t)(size * nb));
-        leg_columns(state, g, stages->leg + n, a, b, end, x, k);
-        if (stages->on[HALF] == n) half_columns(state, g, stages->leg + n, a, b, begin, end, k);
+        leg_columns(state, g, stages->leg + n, a, b, end, x, k, drift);
+        if (stages->on[HALF] == n) half_columns(state, g, stages->leg + n, a, b, begin, end, k, drift);
     }
     for (int i = 0; i < size; ++i)
         copy(ROW(end, i), ROW(state->node, WHOLE * EX_NX + ex_group_states[first + i]), nb);
@@ -1070,13 +1130,13 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
                 run->rejected++;
                 continue;
             }
-            if (error > 1.0) run->forced++;
-            if (!(error < 1e300)) {
+            if (!(error < LOST)) {
                 if (PSA_LANES == 1) return 1;
                 pace->dead[lane] = 1;
                 pace->at[lane] = end;
                 continue;
             }
+            if (error > 1.0) run->forced++;
             const long units = end >> level[lane];
             pace->at[lane] += units;
             run->steps++;
@@ -1175,7 +1235,7 @@ APART static int set_up(psa_state *state) {
 #if PSA_LANES == 1
     if (run->count > 0 && status == 0) {
         const int nb = state->blocks = (run->count + COLUMNS - 1) / COLUMNS;
-        const size_t rows = EX_NX + EX_NPORT + NODES * (EX_NX + EX_NPORT + 1) + NL + EX_NEED + 8 * EX_NX + 2;
+        const size_t rows = EX_NX + EX_NPORT + NODES * (EX_NX + EX_NPORT + 1) + NL + EX_NEED + 9 * EX_NX + 3;
         column *const memory = calloc(rows * (size_t)nb, sizeof(column));
         if (!memory) return 2;
         state->s = memory;

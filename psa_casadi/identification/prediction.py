@@ -75,7 +75,6 @@ def trace_record(
     *,
     stop: int,
     way: Way,
-    halved: int = 0,
 ) -> Traced:
     """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
     names = model.state_names
@@ -97,9 +96,8 @@ def trace_record(
     s0 = np.hstack([found.by_parameter[:, columns], by_start])
     unknowns: list[str | int] = [*wanted, *searched]
     return trace(
-        model, t, u, x0, way=way, output=OUTPUT, unknowns=unknowns, s0=s0, halved=halved,
-        steps_limit=_STEPS,
-    )  # fmt: skip
+        model, t, u, x0, way=way, output=OUTPUT, unknowns=unknowns, s0=s0, steps_limit=_STEPS
+    )
 
 
 def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
@@ -193,10 +191,8 @@ def simulated(
         experiment, start = experiments[index], unknowns.start(theta, index)
         used = experiment.used[: experiment.stop]
         plain, finer = (
-            trace_record(
-                current, experiment.record, start, (), stop=experiment.stop, way=w, halved=h
-            )
-            for w, h in ((way, 0), (way.finer, 1))
+            trace_record(current, experiment.record, start, (), stop=experiment.stop, way=w)
+            for w in (way, way.finer)
         )
         gap = (plain.output - finer.output)[used]
         error = float(np.sqrt(np.mean(gap**2))) if gap.size else 0.0

@@ -35,17 +35,18 @@ _STILL = 1e-3
 class Way:
     """How a record is run: tolerance of an exact step, and of a step of the stepper.
 
-    `stepped` rules exact steps out.
+    Exact steps divide every sample by 2^`halved` at least; `stepped` rules them out.
     """
 
     rtol: float
     step_rtol: float
+    halved: int = 0
     stepped: bool = False
 
     @property
     def finer(self) -> "Way":
         """A way whose error is far smaller: what this one's is judged by."""
-        return Way(0.1 * self.rtol, 0.1 * self.step_rtol, self.stepped)
+        return Way(0.1 * self.rtol, 0.1 * self.step_rtol, self.halved + 1, self.stepped)
 
 
 @dataclass(frozen=True)
@@ -73,19 +74,18 @@ def trace(
     output: str,
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
-    halved: int = 0,
     steps_limit: int = 0,
 ) -> Traced:
     """Return one output of a run and its derivatives by `unknowns` (see `run`).
 
-    Exact steps divide every sample by 2^`halved` at least. `steps_limit` bounds the stepper's work
-    between two samples. Raises SimulationError where both ways fail.
+    `steps_limit` bounds the stepper's work between two samples. Raises SimulationError where both
+    ways fail.
     """
     none = np.zeros((len(t), 0))
     if not way.stepped:
         try:
             found = run_exact(
-                model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=halved,
+                model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
                 unknowns=unknowns, s0=s0, output=output,
             )  # fmt: skip
             slopes = none if found.sensitivity is None else found.sensitivity
