@@ -19,7 +19,7 @@
 #define TURNS 8          /* iterations for the instant at which a driver turns */
 #define LOST 1e6         /* times the tolerance: an error of the finest step from which nothing can be told */
 #define BENDS 0.05       /* of its way: a driver's course that bends by more is not a smooth one */
-#define UNEVEN 0.02      /* share of its way by which a driver is off the middle at the half of a step */
+#define UNEVEN 2e-3      /* share of its way by which a driver is off the middle at the half of a step */
 #define NEWTON_LIMIT 12
 #define STILL 1e-9       /* of its nominal size: a driver's way along which nothing can be told */
 
@@ -59,6 +59,11 @@ typedef struct {
     real rate_slopes[NODES + 1][EX_RATE_OUT];
 } psa_stages;
 
+/* Change over a step and bend inside it of a driver and of a port, and what sigma is a ratio over */
+typedef struct {
+    real way, bend, change, bent, over;
+} psa_chord;
+
 /* Everything of one step under trial */
 typedef struct {
     const psa_level *level;
@@ -67,8 +72,7 @@ typedef struct {
     real l[ROWS], x[NODES][EX_NX];
     real port[NODES][EX_NPORT + 1];       /* values */
     real slopes[NODES][EX_NPORT + 1][EX_PORT_OUT]; /* values and partial derivatives */
-    real chord_over[EX_NCH + 1];          /* what sigma is a ratio over: the driver's way, or its bend */
-    int chord_bends[EX_NCH + 1];
+    psa_chord chords[EX_NCH + 1];
     real chord[EX_NCH + 1], beyond[EX_NCH + 1][NL]; /* sigma, and the response to u(t) beyond the parabola */
     psa_stages stages[EX_NG + 1];
     real error;                           /* over the tolerance */
@@ -252,20 +256,22 @@ static inline void respond_beyond(const psa_state *state, const psa_trial *trial
     }
 }
 
-/* How a port goes with its driver: over the whole step or, where the driver's course bends by more than a little
-   of its way (it dies away, and the port may go on in time), by how both bend. 0 where the driver turns. */
+/* How a port goes with its driver: the slope sigma that meets best how both change over the step and how both
+   bend inside it. What bends is the driver that dies away, while the port may go on in time. The changes count
+   with the weight at which a bend of BENDS of the way counts as much. 0 where the driver turns. */
 static real chord_slope(psa_state *state, psa_trial *trial, int j, int c, int u) {
-    const real way = trial->x[WHOLE][u] - state->x[u];
-    const real bend = trial->x[HALF][u] - 0.5 * (trial->x[WHOLE][u] + state->x[u]);
-    const real change = trial->port[WHOLE][j] - state->port[j];
-    const real bent = trial->port[HALF][j] - 0.5 * (trial->port[WHOLE][j] + state->port[j]);
-    const bits bends = MASK(v_fabs(bend) > BENDS * v_fabs(way));
-    trial->chord_over[c] = choose(bends, bend, way);
-    trial->chord_bends[c] = LANE(bends, 0) != 0;
-    bits moves = MASK(v_fabs(trial->chord_over[c]) > STILL * state->nominal[u]);
+    psa_chord *const chord = trial->chords + c;
+    chord->way = trial->x[WHOLE][u] - state->x[u];
+    chord->bend = trial->x[HALF][u] - 0.5 * (trial->x[WHOLE][u] + state->x[u]);
+    chord->change = trial->port[WHOLE][j] - state->port[j];
+    chord->bent = trial->port[HALF][j] - 0.5 * (trial->port[WHOLE][j] + state->port[j]);
+    chord->over = BENDS * BENDS * chord->way * chord->way + chord->bend * chord->bend;
+    const real least = STILL * BENDS * state->nominal[u];
+    bits moves = MASK(chord->over > least * least);
     for (int g = 0; g < EX_NG; ++g)
         if (ex_linear[ex_group_driver[g]] == u) moves &= MASK(trial->stages[g].turn >= 1.0);
-    return choose(moves, choose(bends, bent, change) / choose(moves, trial->chord_over[c], REAL(1.0)), REAL(0.0));
+    const real both = BENDS * BENDS * chord->way * chord->change + chord->bend * chord->bent;
+    return choose(moves, both / choose(moves, chord->over, REAL(1.0)), REAL(0.0));
 }
 
 static void do_port(psa_state *state, psa_trial *trial, int j, int slopes) {
@@ -794,18 +800,21 @@ static void do_port_columns(psa_state *state, int j) {
     add_port_columns(state, HALF, j);
     if (c >= 0 && trial->chord[c] != 0.0) {
         const int u = ex_linear[ex_chord_driver[c]];
-        const double sigma = trial->chord[c], over = trial->chord_over[c];
-        /* weights of start, half and end in what sigma is the ratio of */
-        const double w0 = trial->chord_bends[c] ? -0.5 : -1.0, w1 = trial->chord_bends[c] ? 1.0 : 0.0;
-        const double w2 = trial->chord_bends[c] ? -0.5 : 1.0;
+        const psa_chord *const chord = trial->chords + c;
+        const double sigma = trial->chord[c], weight = BENDS * BENDS;
         const column *const half = ROW(state->node, HALF * EX_NX + u);
-        const column *const n2 = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
+        const column *const nh = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
         column *const x = ROW(state->node, WHOLE * EX_NX), *const dsigma = state->scratch;
         const column *const n0 = ROW(state->sport, j);
         const column *const n1 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
-        for (int b = 0; b < nb; ++b)
-            dsigma[b] = (w2 * n1[b] + w1 * n2[b] + w0 * n0[b] -
-                         sigma * (w2 * ROW(x, u)[b] + w1 * half[b] + w0 * ROW(state->s, u)[b])) / over;
+        for (int b = 0; b < nb; ++b) {
+            const column u0 = ROW(state->s, u)[b], u1 = ROW(x, u)[b];
+            const column dway = u1 - u0, dbend = half[b] - 0.5 * (u0 + u1);
+            const column dchange = n1[b] - n0[b], dbent = nh[b] - 0.5 * (n0[b] + n1[b]);
+            dsigma[b] = (weight * (chord->way * dchange + chord->change * dway) + chord->bend * dbent +
+                         chord->bent * dbend -
+                         2.0 * sigma * (weight * chord->way * dway + chord->bend * dbend)) / chord->over;
+        }
         add_port_columns(state, WHOLE, j);
         for (int i = 0; i < NL; ++i) {
             column *const out = ROW(x, ex_linear[i]);

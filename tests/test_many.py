@@ -18,14 +18,12 @@ FloatArray = NDArray[np.float64]
 
 def record(uneven: bool = False) -> Record:
     """Return two cycles, a ramp and a hold; with other time steps throughout if `uneven`."""
-    t = np.arange(600) * 2e-4
+    t: FloatArray = np.arange(600, dtype=np.float64) * 2e-4
     if uneven:
         t = t + 1e-5 * np.random.default_rng(1).standard_normal(600)
     s = np.arange(600) / 600
-    v: FloatArray = np.where(
-        s < 0.6, 40.0 * (1.0 - np.cos(2 * np.pi * s / 0.3)), np.minimum(400 * s - 240, 80)
-    )
-    return Record("sets", t, v)
+    v = np.where(s < 0.6, 40.0 * (1.0 - np.cos(2 * np.pi * s / 0.3)), np.minimum(400 * s - 240, 80))
+    return Record("sets", t, np.asarray(v, dtype=np.float64))
 
 
 def sets(model: Model, count: int) -> list[dict[str, float]]:

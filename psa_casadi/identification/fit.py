@@ -19,7 +19,7 @@ from psa_casadi.identification.prediction import (
 from psa_casadi.identification.unknowns import Unknowns, static_compliance, unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.simulation.ways import LOOSEST, Way
+from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -163,8 +163,7 @@ def _minimum(
 ) -> tuple[Minimum, Way, list[Simulated]]:
     """Return the minimum, found by a simulation that is accurate there, and how that was done."""
     allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
-    first = max(rtol, _loosest(experiments, allowed)) if rtol >= FIT_RTOL else rtol
-    ways = [Way(first * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
+    ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
     ways.append(Way(rtol, 0.1 * rtol, stepped=True))
     spent = 0
     for way in ways:
@@ -188,16 +187,6 @@ def _minimum(
         if minimum.interrupted or not any(t.error > a for t, a in zip(told, allowed, strict=True)):
             break
     return replace(minimum, evaluations=spent), way, told
-
-
-def _loosest(experiments: Sequence[Experiment], allowed: Sequence[float]) -> float:
-    """Return the tolerance of a step whose error, half of it (rms, measured), is allowed."""
-    shares = [
-        2.0 * a / max(float(np.ptp(measured(e.record)[e.used])), 1e-300)
-        for e, a in zip(experiments, allowed, strict=True)
-        if e.used.any()
-    ]
-    return min([*shares, LOOSEST])
 
 
 def _allowed(experiment: Experiment, sigma: float) -> float:

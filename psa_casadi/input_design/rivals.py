@@ -15,13 +15,11 @@ from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.experiment.record import Record
 from psa_casadi.experiment.split import Experiment
 from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.prediction import OUTPUT, predict_record
+from psa_casadi.identification.prediction import predict_record
 from psa_casadi.identification.unknowns import MEMORY_PRIOR, Unknowns, unknowns_of
 from psa_casadi.input_design.limits import Limits
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.simulation.start import memory_names, start_state
-from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.start import memory_names
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 
@@ -31,7 +29,6 @@ _CAUTION, _LOSS = 1.0, 0.75
 _FARTHEST = 1.0
 #: Tolerance of trajectories: far below what a step of the gradient changes.
 RTOL = 1e-6
-_STEPS = 4000
 _OFFSET = 1e-6
 
 
@@ -114,12 +111,9 @@ class Rival:
     def predict(self, record: Record, delta: FloatArray) -> FloatArray:
         """Return the displacement (n,) [m] that the rival predicts at delta."""
         model, start = self.moved(delta)
-        u = record_inputs(model, record, record.n)
-        x0 = start_state(model, list(u[0]), None, start, 0.0).x
-        t = record.time - record.time[0]
-        steps = run(model, t, u, x0, rtol=RTOL, steps_limit=_STEPS)
-        y: FloatArray = steps.y[:, model.output_names.index(OUTPUT)] + _OFFSET * delta[-1]
-        return y
+        y, *_ = predict_record(model, record, start, (), stop=record.n, rtol=RTOL)
+        shown: FloatArray = y + _OFFSET * delta[-1]
+        return shown
 
     def sensitivities(self, record: Record, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the displacement (n,) [m] and its exact derivative by delta (n, size) [m]."""
