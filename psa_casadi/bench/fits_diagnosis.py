@@ -1,0 +1,201 @@
+"""Whole fits and diagnoses with exact steps: wall and processor time, and simulations.
+
+The demonstration is also diagnosed by the stepper alone, which is the peer of the same run.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.bench.hidden_cases import plants
+from psa_casadi.bench.outcome import Progress, TitledTable
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.errors import InputError
+from psa_casadi.experiment import (
+    Record,
+    concatenate,
+    decaying_triangle,
+    read_record,
+    steps,
+    time_grid,
+    triangle,
+)
+from psa_casadi.identification.identify import identify
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.report.phrases import number, plain
+from psa_casadi.report.tables import Table
+from psa_casadi.simulation import ways
+from psa_casadi.simulation.exact.run import NotExact
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.timings import timed
+
+#: Causes hidden in the records of the plants, one each.
+HIDDEN = (
+    "slow_creep", "saturation_of_strain", "drive_lag", "structural_mode", "charge_leakage",
+    "sensor_nonlinearity",
+)  # fmt: skip
+_FIRST_SEED, _NOISE, _SAMPLE_TIME = 271828, 1e-3, 1e-4
+_LONG, _QUICK_LONG = 180_000, 12_000
+_HEAD = (
+    "work", "samples", "wall [s]", "processor [s]", "processor, over the stepper's",
+    "simulations", "with derivatives", "found",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Spent:
+    """A piece of work: times [s], simulations, those with derivatives, and what it found.
+
+    `peer` is the processor time by the stepper alone, None where it was not tried.
+    """
+
+    work: str
+    samples: str
+    wall: float
+    processor: float
+    runs: int
+    differentiated: int
+    found: str
+    peer: float | None = None
+
+
+def diagnosis_table(demo: Record, progress: Progress, quick: bool) -> TitledTable:
+    """Diagnose the demonstration and hidden causes, identify a long record."""
+    notes = []
+    rows = [*_demonstration(demo, progress)]
+    try:
+        rows.append(_hidden(HIDDEN[:1] if quick else HIDDEN, progress))
+    except InputError as why:
+        notes.append(f"Hidden causes are skipped. {why}")
+    rows.append(_long(_QUICK_LONG if quick else _LONG, progress))
+    return spent_table(rows, notes)
+
+
+def spent_table(rows: Sequence[Spent], notes: Sequence[str] = ()) -> TitledTable:
+    """Return the work with its times, and its share of the stepper's where that was tried."""
+    cells = tuple(
+        (
+            r.work, r.samples, number(r.wall), number(r.processor),
+            "" if r.peer is None else number(r.processor / r.peer, 2),
+            str(r.runs), str(r.differentiated), r.found,
+        )
+        for r in rows
+    )  # fmt: skip
+    said = [
+        f"{r.work} takes 1/{number(r.peer / r.processor, 2)} of the stepper's processor time."
+        for r in rows
+        if r.peer is not None and r.peer != r.processor
+    ]
+    note = " ".join((*said, "Models compiled once (cached afterwards) do not count.", *notes))
+    return TitledTable("Whole fits and diagnoses", Table(_HEAD, cells), note)
+
+
+@contextmanager
+def stepper_alone() -> Iterator[None]:
+    """Leave exact steps out: every model counts as one that they do not fit."""
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise NotExact("left out for a benchmark")
+
+    kept = ways.run_exact, ways.why_not
+    ways.run_exact = refuse
+    ways.why_not = lambda *_: "left out for a benchmark"
+    try:
+        yield
+    finally:
+        ways.run_exact, ways.why_not = kept
+
+
+def _spent(work: str, samples: str, do: Callable[[], str]) -> Spent:
+    wall, processor = time.perf_counter(), time.process_time()
+    with timed() as timings:
+        found = do()
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    runs, differentiated = (
+        sum(getattr(s, of) for s in timings.stages) for of in ("runs", "differentiated")
+    )
+    return Spent(work, samples, wall, processor, runs, differentiated, found)
+
+
+def _diagnosed(records: Sequence[Record]) -> str:
+    found = diagnose(records)
+    return ", ".join(plain(c.effect) for c in found.causes) or str(found.verdict)
+
+
+def _demonstration(record: Record, progress: Progress) -> list[Spent]:
+    """Diagnose the demonstration both ways, each once before it counts (models get compiled)."""
+    found = []
+    for work in ("diagnose, demonstration", "the same by the stepper alone"):
+
+        def once(work: str = work) -> Spent:
+            return _spent(work, str(record.n), lambda: _diagnosed([record]))
+
+        progress(work)
+        if not found:
+            once()
+            found.append(once())
+        else:
+            with stepper_alone():
+                found.append(once())
+    ours, theirs = found
+    return [_beside(ours, theirs.processor), _beside(theirs, theirs.processor)]
+
+
+def _beside(spent: Spent, peer: float) -> Spent:
+    fields = {**vars(spent), "peer": peer}
+    return Spent(**fields)
+
+
+def _hidden(causes: Sequence[str], progress: Progress) -> Spent:
+    """Diagnose one record of the independent plants for each cause."""
+    make_record, _, _ = plants()
+    records = []
+    with tempfile.TemporaryDirectory() as folder:
+        for k, cause in enumerate(causes):
+            path = Path(folder) / f"{cause}.csv"
+            make_record(cause, _FIRST_SEED + k, path, visible=(1.0, 3.0))
+            records.append(read_record(path))
+
+    def every() -> str:
+        named = []
+        for cause, record in zip(causes, records, strict=True):
+            progress(f"diagnose: hidden {plain(cause)}")
+            named.append(_diagnosed([record]) == plain(cause))
+        return f"{sum(named)} of {len(named)} named"
+
+    sizes = "/".join(sorted({str(r.n) for r in records}))
+    return _spent(f"diagnose, {len(causes)} hidden causes", f"{len(causes)} x {sizes}", every)
+
+
+def long_record(samples: int) -> Record:
+    """Return loops and steps with noise, of this package's own simulation."""
+    model = stack_model("WYDS0808020")
+    top, part = model.values["u_rated"], samples // 3
+    t = time_grid(part * _SAMPLE_TIME, _SAMPLE_TIME)
+    levels = top * np.array([0.0, 0.6, 0.2, 0.9, 0.4, 0.0])
+    parts = [
+        triangle(t, 0.0, top, 4.0 / (part * _SAMPLE_TIME)),
+        decaying_triangle(t, 0.0, top, 6, centre=0.0),
+        steps(t, levels),
+    ]
+    wave = concatenate(parts, _SAMPLE_TIME)
+    x = simulate(model, wave.time, wave.voltage).displacement
+    noise = _NOISE * np.ptp(x) * np.random.default_rng(1).standard_normal(x.size)
+    return Record(f"{x.size} samples", wave.time, wave.voltage, x + noise)
+
+
+def _long(samples: int, progress: Progress) -> Spent:
+    record = long_record(samples)
+    progress(f"identify: {record.n} samples")
+
+    def fit() -> str:
+        found = identify([record]).fit
+        return f"rms {number(100.0 * found.rms / record.range_m, 2)} % of range"
+
+    return _spent("identify, loops and steps", str(record.n), fit)
