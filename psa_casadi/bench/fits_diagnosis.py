@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,13 +103,15 @@ def stepper_alone() -> Iterator[None]:
     def refuse(*_: Any, **__: Any) -> Any:
         raise NotExact("left out for a benchmark")
 
-    kept = ways.run_exact, ways.why_not
-    ways.run_exact = refuse
-    ways.why_not = lambda *_: "left out for a benchmark"
+    mine: dict[str, Any] = {"run_exact": refuse, "why_not": lambda *_: "left out for a benchmark"}
+    kept = {name: getattr(ways, name) for name in mine}
     try:
+        for name, function in mine.items():
+            setattr(ways, name, function)
         yield
     finally:
-        ways.run_exact, ways.why_not = kept
+        for name, function in kept.items():
+            setattr(ways, name, function)
 
 
 def _spent(work: str, samples: str, do: Callable[[], str]) -> Spent:
@@ -130,26 +132,16 @@ def _diagnosed(records: Sequence[Record]) -> str:
 
 def _demonstration(record: Record, progress: Progress) -> list[Spent]:
     """Diagnose the demonstration both ways, each once before it counts (models get compiled)."""
-    found = []
-    for work in ("diagnose, demonstration", "the same by the stepper alone"):
 
-        def once(work: str = work) -> Spent:
-            return _spent(work, str(record.n), lambda: _diagnosed([record]))
-
+    def once(work: str) -> Spent:
         progress(work)
-        if not found:
-            once()
-            found.append(once())
-        else:
-            with stepper_alone():
-                found.append(once())
-    ours, theirs = found
-    return [_beside(ours, theirs.processor), _beside(theirs, theirs.processor)]
+        return _spent(work, str(record.n), lambda: _diagnosed([record]))
 
-
-def _beside(spent: Spent, peer: float) -> Spent:
-    fields = {**vars(spent), "peer": peer}
-    return Spent(**fields)
+    once("diagnose, demonstration (first use)")
+    ours = once("diagnose, demonstration")
+    with stepper_alone():
+        theirs = once("the same by the stepper alone")
+    return [replace(spent, peer=theirs.processor) for spent in (ours, theirs)]
 
 
 def _hidden(causes: Sequence[str], progress: Progress) -> Spent:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
 _FONT = 10.5
@@ -54,10 +53,7 @@ def picture(points: Sequence[Measured]) -> Figure:
     axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=_FONT - 1.5)
-    handles = [h for h in axes.get_lines() if isinstance(h, Line2D)]
-    figure.legend(
-        handles=handles, fontsize=_FONT - 1, loc="outside lower center", ncols=2, frameon=False
-    )
+    figure.legend(fontsize=_FONT - 1, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 

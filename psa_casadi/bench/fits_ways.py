@@ -98,14 +98,14 @@ def ways_tables(progress: Progress, quick: bool) -> list[TitledTable]:
 
 def voltage(record: str, top: float, sample_time: float) -> tuple[FloatArray, FloatArray]:
     """Return times and voltages of a record up to 0.8 or 0.9 of the rated voltage."""
-    t = np.arange(_SAMPLES) * sample_time
-    s = np.arange(_SAMPLES) / (_SAMPLES - 1)
+    s = np.linspace(0.0, 1.0, _SAMPLES, dtype=np.float64)
+    t = np.asarray(np.arange(_SAMPLES) * sample_time, dtype=np.float64)
     if record == MIXED:
         v = 0.4 * (1.0 - np.cos(2.0 * np.pi * 10.0 * s))
         v = np.where(s < 0.4, v, np.interp(s, (0.4, 0.6, 0.8), (0.0, 0.7, 0.7)))
-        return t, top * np.where(s < 0.8, v, 0.3)
+        return t, np.asarray(top * np.where(s < 0.8, v, 0.3), dtype=np.float64)
     corners = np.array(KINKED[record])
-    return t, top * np.interp(s, corners[:, 0], corners[:, 1])
+    return t, np.asarray(top * np.interp(s, corners[:, 0], corners[:, 1]), dtype=np.float64)
 
 
 def with_one_effect(stack: str, effect: str) -> Model:
