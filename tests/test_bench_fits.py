@@ -33,7 +33,7 @@ POINTS = [
     Point(STEPPER, 1e-7, 1e-6, 2e-7, 22.0, 10.0, 2.8),
 ]
 TRIAL = Trial("demo", "slow_creep", MIXED, 1e-3)
-FINE = Reached(TRIAL, 1e-6, EXACT, 5e-7, 1.0, 1e-7, 4.0, 1e-9)
+FINE = Reached(TRIAL, 1e-6, EXACT, 5e-7, 1.0, 1e-7, 4.0, 1e-9, EXACT, 2e-6)
 FOUND = [
     replace(FINE, trial=replace(TRIAL, effect="base")),
     FINE,
@@ -71,9 +71,13 @@ def test_lanes_are_told_over_one_set_by_itself() -> None:
 
 
 def test_the_base_is_no_effect_that_takes_a_way() -> None:
-    table = effects_table(FOUND[:3])
-    assert table.note.startswith("1 of 2 effects take the exact way")
-    assert table.table.rows[1] == ("slow creep", EXACT, "5.0e-7", "0.50", "0.25")
+    loose = [replace(r, rtol=1e-4, way=EXACT) for r in FOUND[:3]]
+    table = effects_table([*loose, *FOUND[:3]])
+    assert table.note.startswith("Of 2 effects 2 take the exact way in a fit")
+    assert "in `simulate` 2 at 1e-04, 1 at 1e-06." in table.note
+    assert table.table.rows[2][0] == "sensor delay"
+    assert table.table.rows[2][1:5] == (EXACT, "2.0e-6", EXACT, STEPPER)
+    assert table.table.rows[1][5:] == ("5.0e-7", "0.50", "0.25")
 
 
 def test_errors_above_the_tolerance_are_counted_and_listed() -> None:

@@ -24,7 +24,7 @@ from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import input_samples, simulate
 from psa_casadi.simulation.start import initial_slope, start_state
 from psa_casadi.simulation.stepper import run
-from psa_casadi.simulation.ways import EXACT, STEP_SHARE, STEPPER
+from psa_casadi.simulation.ways import EXACT, STEP_SHARE, STEPPER, Way, trace
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -38,7 +38,9 @@ KINKED: dict[str, tuple[tuple[float, float], ...]] = {
     "ramps and holds": ((0, 0), (0.1, 0), (0.3, 0.8), (0.5, 0.8), (0.6, 0.3), (0.8, 0.3), (1, 0)),
 }  # fmt: skip
 MIXED = "sine, ramp, hold, step"
-_SAMPLES, _ONE_RTOL = 1500, 1e-6
+_SAMPLES, _OUTPUT = 1500, "measured_displacement"
+#: Tolerance of a step of a fit.
+_FIT_RTOL = 1e-6
 _RTOLS = (1e-4, 1e-5, 1e-6)
 _TRUTH, _CHECK = 1e-11, 1e-10
 _LISTED = 20
@@ -60,6 +62,8 @@ class Reached:
 
     `stepper_error` and `stepper_seconds` are those of the stepper at the share of the tolerance
     that `simulate` gives it; `doubt` is how far the truth at 1e-10 is from that at 1e-11.
+    `fit_way` and `fit_error` are those of a run as a fit makes it, whose steps have a tolerance of
+    1e-6 at all tolerances.
     """
 
     trial: Trial
@@ -70,6 +74,8 @@ class Reached:
     stepper_error: float
     stepper_seconds: float
     doubt: float
+    fit_way: str
+    fit_error: float
 
     @property
     def over(self) -> float:
@@ -80,12 +86,12 @@ class Reached:
 def ways_tables(progress: Progress, quick: bool) -> list[TitledTable]:
     """Return the way of each effect, and the errors over stacks, effects and records."""
     names = (BASE_NAME, *EFFECTS)
-    alone = []
+    alone: list[Reached] = []
     for name in names:
         progress(f"ways: {plain(name)}")
-        alone += tried((_ONE_RTOL,), 3, Trial("demo", name, MIXED, 1e-3))
+        alone += tried(_RTOLS, 3, Trial("demo", name, MIXED, 1e-3))
     stacks = tuple(STACKS)[:3] if quick else tuple(STACKS)
-    records = ("steps",) if quick else tuple(KINKED)
+    records = ("steps",) if quick else (*KINKED, MIXED)
     sample_times = (1e-3,) if quick else (2e-5, 1e-3)
     everywhere: list[Reached] = []
     for stack in stacks:
@@ -131,7 +137,7 @@ def tried(rtols: Sequence[float], repeats: int, trial: Trial) -> list[Reached]:
         given["temperature"] = 293.15 + 2.0 * np.sin(3.0 * t / t[-1])
     u = input_samples(model, len(t), given)
     x0 = start_state(model, list(u[0]), [initial_slope(t, c) for c in u.T]).x
-    shown = model.output_names.index("measured_displacement")
+    shown = model.output_names.index(_OUTPUT)
 
     def stepped(rtol: float) -> FloatArray:
         return run(model, t, u, x0, rtol=rtol).y[:, shown]
@@ -141,6 +147,8 @@ def tried(rtols: Sequence[float], repeats: int, trial: Trial) -> list[Reached]:
         doubt = _error(stepped(_CHECK), truth)
     except PsaError:
         return []
+    fit = trace(model, t, u, x0, way=Way(_FIT_RTOL), output=_OUTPUT)
+    fitted = fit.way, _error(fit.output, truth)
     found = []
     for rtol in rtols:
         ours = theirs = inf
@@ -151,10 +159,8 @@ def tried(rtols: Sequence[float], repeats: int, trial: Trial) -> list[Reached]:
             peer = stepped(STEP_SHARE * rtol)
             end = time.thread_time()
             ours, theirs = min(ours, middle - begin), min(theirs, end - middle)
-        errors = (_error(x, truth) for x in (result.displacement, peer))
-        found.append(
-            Reached(trial, rtol, result.way, next(errors), ours, next(errors), theirs, doubt)
-        )
+        reached, peers = (_error(x, truth) for x in (result.displacement, peer))
+        found.append(Reached(trial, rtol, result.way, reached, ours, peers, theirs, doubt, *fitted))
     return found
 
 
@@ -163,26 +169,32 @@ def _error(x: FloatArray, truth: FloatArray) -> float:
 
 
 def effects_table(found: Sequence[Reached]) -> TitledTable:
-    """Return the way and the error of the base and of each effect beside it."""
-    rows = tuple(
-        (
-            plain(r.trial.effect), r.way, number(r.error, 2), number(r.over, 2),
-            number(r.seconds / r.stepper_seconds, 2),
-        )
-        for r in found
+    """Return the ways and errors of the base and of each effect beside it."""
+    rtols = sorted({r.rtol for r in found}, reverse=True)
+    rows, tight = [], [r for r in found if r.rtol == rtols[-1]]
+    for r in tight:
+        ways = [o.way for o in found if o.trial == r.trial]
+        figures = (r.error, r.over, r.seconds / r.stepper_seconds)
+        cells = (plain(r.trial.effect), r.fit_way, number(r.fit_error, 2), *ways)
+        rows.append((*cells, *(number(f, 2) for f in figures)))
+    head = (
+        "effect", "in a fit", "its error / range", *(f"way at {rtol:.0e}" for rtol in rtols),
+        "largest error / range", "error / tolerance", "time over the stepper's",
     )  # fmt: skip
     effects = [r for r in found if r.trial.effect != BASE_NAME]
-    exact = sum(r.way == EXACT for r in effects)
-    head = (
-        "effect", "way", "largest error / range", "error / tolerance", "time over the stepper's"
-    )  # fmt: skip
+    names = {r.trial for r in effects}
+    fits = sum(r.fit_way == EXACT for r in effects if r.rtol == rtols[-1])
+    counts = [
+        f"{sum(r.way == EXACT for r in effects if r.rtol == rtol)} at {rtol:.0e}" for rtol in rtols
+    ]
     return TitledTable(
-        f"Ways of `simulate` at {_ONE_RTOL:.0e}: {MIXED} ({_SAMPLES} samples)",
-        Table(head, rows),
-        f"{exact} of {len(effects)} effects take the exact way here; the others fall back on the"
-        f" stepper, at {STEP_SHARE:g} of the tolerance, which is also the peer of the last column."
-        " Its time includes the runs that judge the error. Errors are against the stepper at"
-        f" {_TRUTH:.0e}.",
+        f"Ways of the effects, one at a time: {MIXED} ({_SAMPLES} samples)",
+        Table(head, tuple(rows)),
+        f"Of {len(names)} effects {fits} take the exact way in a fit (tolerance of a step"
+        f" {_FIT_RTOL:.0e}); in `simulate` {', '.join(counts)}. The others fall back on the"
+        f" stepper at {STEP_SHARE:g} of the tolerance, which is also the peer of the last column."
+        f" The last three columns are of `simulate` at {rtols[-1]:.0e}; its time includes the runs"
+        f" that judge the error. Errors are against the stepper at {_TRUTH:.0e}.",
     )
 
 
