@@ -49,6 +49,11 @@ _HEAD = (
     "work", "samples", "wall [s]", "processor [s]", "processor, over the stepper's",
     "simulations", "with derivatives", "found",
 )  # fmt: skip
+_NOTE = (
+    "Models are compiled and cached before the diagnoses that count. The hidden causes are in the"
+    f" first {_CUT} samples of records of independent plants. Wall times are those of a machine"
+    " that other work may share."
+)
 
 
 @dataclass(frozen=True)
@@ -95,15 +100,7 @@ def spent_table(rows: Sequence[Spent], notes: Sequence[str] = ()) -> TitledTable
         for r in rows
         if r.peer is not None and r.peer != r.processor
     ]
-    note = " ".join(
-        (
-            *said,
-            "Models are compiled and cached before the diagnoses that count. The hidden causes are"
-            f" in the first {_CUT} samples of records of independent plants. Wall times are those of a"
-            " machine that other work may share.",
-            *notes,
-        )
-    )
+    note = " ".join((*said, _NOTE, *notes))
     return TitledTable("Whole fits and diagnoses", Table(_HEAD, cells), note)
 
 
