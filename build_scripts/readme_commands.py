@@ -2,8 +2,9 @@ r"""Run the commands that README.md shows, so that what the reader sees is execu
 
 Executable are the lines that begin with `$ ` in a fenced block marked `console`. Lines that end in
 a backslash go on in the next one; all other lines are output and are left alone. Each block runs
-in an empty directory of its own, with the checkout's environment first in PATH. A comment on its
-own line before a block changes that:
+in an empty directory of its own, with the checkout's environment first in PATH, two blocks side by
+side; what a command says is shown when it has ended. A comment on its own line before a block
+changes that:
 
     <!-- run: skip -->        the block is not run (installation, for example)
     <!-- run: needs-data -->  the block runs where the measured records are, in $PSA_CASADI_DATA
@@ -19,6 +20,7 @@ import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +28,8 @@ from build_scripts.measured_data import ROOT, measured_data_directory, must_be_p
 
 MARKS = ("skip", "needs-data", "continue", "python")
 LIMIT_S = 900
+#: Blocks that run side by side; those that need the measured records are the longest by far.
+AT_ONCE = 2
 
 _FENCE = re.compile(r"^```(?P<language>\w*)\s*$")
 _MARK = re.compile(r"^<!--\s*run:\s*(?P<mark>[\w-]+)\s*-->\s*$")
@@ -96,44 +100,67 @@ def run_block(block: Block, directory: Path) -> str | None:
         "PSA_CASADI_DATA": str(measured_data_directory()),
     }
     for command in block.commands:
-        print(f"$ {command.partition(chr(10))[0]}", flush=True)
         started = time.monotonic()
         try:
-            code = subprocess.run(
+            done = subprocess.run(
                 ["bash", "-euo", "pipefail", "-c", command],
                 cwd=directory,
                 env=environment,
                 stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
                 timeout=LIMIT_S,
                 check=False,
-            ).returncode
-        except subprocess.TimeoutExpired:
+            )
+        except subprocess.TimeoutExpired as ended:
+            _tell(command, ended.stdout, f"ended after {LIMIT_S} s")
             return f"README.md line {block.line}: '{command}' ran longer than {LIMIT_S} s."
-        print(f"  [exit code {code}, {time.monotonic() - started:.1f} s]", flush=True)
+        code, took = done.returncode, time.monotonic() - started
+        _tell(command, done.stdout, f"exit code {code}, {took:.1f} s")
         if code != 0:
             return f"README.md line {block.line}: '{command}' ended with exit code {code}."
     return None
 
 
-def run_text(text: str) -> list[str]:
-    """Run the blocks of a Markdown text and return one sentence for each that failed."""
+def _tell(command: str, said: bytes | None, end: str) -> None:
+    """Print a command and what it said at once, so that two do not mix."""
+    text = (said or b"").decode("utf-8", "replace")
+    print(f"$ {command.partition(chr(10))[0]}\n{text}  [{end}]\n", end="", flush=True)
+
+
+def chains_of(blocks: Sequence[Block]) -> list[list[Block]]:
+    """Return the blocks to run, those together that share a directory."""
+    chains: list[list[Block]] = []
+    for block in blocks:
+        if "skip" in block.marks or not block.commands:
+            continue
+        if "continue" in block.marks and chains:
+            chains[-1].append(block)
+        else:
+            chains.append([block])
+    return chains
+
+
+def run_chain(chain: Sequence[Block]) -> list[str]:
+    """Run blocks one after the other in a new directory; return a sentence for each that failed."""
     failures: list[str] = []
-    with tempfile.TemporaryDirectory() as scratch:
-        directory = Path(scratch)
-        for number, block in enumerate(find_blocks(text)):
-            if "skip" in block.marks or not block.commands:
-                continue
+    with tempfile.TemporaryDirectory() as directory:
+        for block in chain:
             if "needs-data" in block.marks and not measured_data_directory().is_dir():
                 sentence = f"README.md line {block.line}: the measured records are not here."
                 print(f"{sentence} Set PSA_CASADI_DATA to their directory.")
                 failures.extend([sentence] if must_be_present() else [])
                 continue
-            if "continue" not in block.marks:
-                directory = Path(scratch, str(number))
-                directory.mkdir()
-            failure = run_block(block, directory)
+            failure = run_block(block, Path(directory))
             failures.extend([failure] if failure else [])
     return failures
+
+
+def run_text(text: str) -> list[str]:
+    """Run the blocks of a Markdown text and return one sentence for each that failed."""
+    chains = chains_of(find_blocks(text))
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        return [failure for failures in pool.map(run_chain, chains) for failure in failures]
 
 
 def main() -> int:

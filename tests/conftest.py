@@ -1,8 +1,43 @@
+import os
+from collections.abc import Sequence
 from pathlib import Path
+
+# before NumPy is loaded: several threads in each of the test processes get in each other's way
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
 from build_scripts.measured_data import measured_data_directory, must_be_present
+
+#: Groups of tests that share something long, the longest first.
+LONG_GROUPS = ("platforms", "identification", "demo", "search", "verification", "browser")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let a test file that is named run whole: the quick tier is of all files together."""
+    if hasattr(config, "workerinput"):  # a process of pytest-xdist does what the first one says
+        return
+    chosen = any(str(word).startswith("-m") for word in config.invocation_params.args)
+    if not chosen and all(".py" in arg for arg in config.args):
+        config.option.markexpr = ""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes long, so that at the end no process waits for another."""
+    items.sort(key=_turn)
+
+
+def _turn(item: pytest.Item) -> int:
+    """Return when a test's turn comes: long groups, other groups, slow tests, quick ones."""
+    group = item.get_closest_marker("xdist_group")
+    if group is None:
+        slow = item.get_closest_marker("slow") is not None
+        return len(LONG_GROUPS) + (1 if slow else 2)
+    return _place(LONG_GROUPS, group.args[0])
+
+
+def _place(names: Sequence[str], name: str) -> int:
+    return names.index(name) if name in names else len(names)
 
 
 @pytest.fixture(scope="session")

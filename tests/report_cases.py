@@ -90,7 +90,8 @@ def _fit(model: Model) -> Fit:
     free = ("k_L", "tau")
     empty = np.zeros((0, 2))
     return Fit(model, unknowns_of(model, free, [{}], [0.0], 1e-6), np.zeros(3), np.zeros(0), empty,
-               (NOISE,), 0.0, True, False, 1, Way(1e-6), (Simulated(EXACT, 0.0),))  # fmt: skip
+               (NOISE,), 0.0, True, False, 1, Way(1e-6, 1e-6),
+               (Simulated(EXACT, 0.0),))  # fmt: skip
 
 
 def diagnosis(

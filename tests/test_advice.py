@@ -12,6 +12,7 @@ from psa_casadi.identification.plans import plans, quantity
 from psa_casadi.identification.scenarios import scenarios
 from tests.loop_fits import FREE, NOISE, loops, measured
 from tests.stack_models import stack
+from tests.tiers import slow_but
 
 
 def advised(name: str) -> tuple[Advice, ...]:
@@ -37,7 +38,7 @@ def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
     assert [a.sentence for a in given] == [a.sentence for a in results[:-1]]
 
 
-@pytest.mark.parametrize("name", ["PTBS200", "P-885.51"])
+@pytest.mark.parametrize("name", slow_but(["P-885.51"], ["PTBS200", "P-885.51"]))
 def test_following_the_advice_determines_what_it_promises(name: str) -> None:
     """The truth beyond the loops is not known to the advice: PTBS200 rings, the other does not."""
     model = stack(name)

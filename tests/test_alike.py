@@ -21,6 +21,7 @@ from psa_casadi.input_design.experiment import resolving_experiment
 from psa_casadi.model.compose import compose
 from psa_casadi.simulation.simulate import simulate
 from tests.plants.make import make_record
+from tests.tiers import slow
 
 TABLE = tuple(EFFECTS.values())
 BENDS = ("load_stiffness", "sensor_nonlinearity")
@@ -53,8 +54,10 @@ def test_bends_are_alike_where_no_resonance_shows(
 @pytest.mark.parametrize(
     ("hidden", "seed", "rho"),
     [
-        ("preload_loss", 61007, (0.3, 3.0)),  # its own entry is left out
-        ("guide_stiffness", 93278, (0.3, 3.0)),  # a foreign one
+        # its own entry is left out
+        pytest.param("preload_loss", 61007, (0.3, 3.0), marks=slow),
+        # a foreign one
+        pytest.param("guide_stiffness", 93278, (0.3, 3.0), marks=slow),
         ("sensor_nonlinearity", 1, (2.0, 2.5)),  # an arc tangent is no polynomial
     ],
 )

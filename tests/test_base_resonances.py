@@ -25,6 +25,7 @@ from psa_casadi.simulation.simulate import simulate_record
 from tests.plants.excitations import ExcitationKind
 from tests.plants.make import Truth, make_record
 from tests.plants.noise import NoiseKind
+from tests.tiers import slow
 
 
 def _fitted(
@@ -63,6 +64,7 @@ def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) 
     assert mine[0] == pytest.approx(tones[0], rel=0.1)
 
 
+@slow
 def test_wrong_mechanics_is_found_behind_a_right_force(tmp_path: Path) -> None:
     truth, experiments, base = _fitted(tmp_path / "a.csv", "fast", 5, 3000)
     assert base.rms > 5.0 * truth.sigma
@@ -70,6 +72,7 @@ def test_wrong_mechanics_is_found_behind_a_right_force(tmp_path: Path) -> None:
     assert found.rms < 1.03 * truth.sigma
 
 
+@slow
 def test_mechanics_is_sought_again_where_another_model_is_nearer(tmp_path: Path) -> None:
     """Two resonances at 5.5 and 5.8 kHz, one of them missed: 3 % above the noise, unnoticed.
 
@@ -91,6 +94,7 @@ def test_mechanics_is_sought_again_where_another_model_is_nearer(tmp_path: Path)
     assert instead_of(found, mode, experiments, _quietly) is None
 
 
+@slow
 def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Path) -> None:
     """1.69 kHz sampled at 2 kHz, seen at 0.33 kHz, where it decays as fast in time."""
     make_record(None, 19, tmp_path / "a.csv", excitation="short")
@@ -100,7 +104,10 @@ def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("hidden", "seed", "like", "own"),
-    [(None, 93180, "sensor_lag", True), ("sensor_delay", 93099, "sensor_delay", False)],
+    [
+        pytest.param(None, 93180, "sensor_lag", True, marks=slow),
+        ("sensor_delay", 93099, "sensor_delay", False),
+    ],
 )
 def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     hidden: str | None, seed: int, like: str, own: bool, tmp_path: Path
@@ -117,6 +124,7 @@ def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     assert found is None or found.rms < 1.001 * lag.fit.rms
 
 
+@slow
 @pytest.mark.parametrize(("noise", "seed"), [("white", 112316), ("ar", 112437)])
 def test_ringing_above_the_band_shows_which_resonance_was_missed(
     noise: NoiseKind, seed: int, tmp_path: Path
@@ -142,6 +150,7 @@ def test_ringing_above_the_band_shows_which_resonance_was_missed(
     assert left.decrease < 0.2 * seen.decrease
 
 
+@slow
 def test_a_missed_resonance_is_no_cause(tmp_path: Path) -> None:
     """Before its ringing was sought, this clean record was said to be unexplained."""
     make_record(None, 118254, tmp_path / "a.csv", noise="ar")
@@ -149,6 +158,7 @@ def test_a_missed_resonance_is_no_cause(tmp_path: Path) -> None:
     assert diagnose([read_record(tmp_path / "a.csv")], effects=effects).verdict == "adequate"
 
 
+@slow
 def test_a_missed_resonance_is_sought_before_a_second_cause(tmp_path: Path) -> None:
     """Two resonances above the band, 1.27 and 1.46 kHz at 0.6 kHz; nothing was named before."""
     visible = (0.3, 3.0)
@@ -160,6 +170,7 @@ def test_a_missed_resonance_is_sought_before_a_second_cause(tmp_path: Path) -> N
     assert found.extended_errors.holdout_rms_m < 1.06 * truth.sigma
 
 
+@slow
 def test_ringing_is_seen_across_missing_rows(tmp_path: Path) -> None:
     make_record(None, 112437, tmp_path / "a.csv", noise="ar")
     whole = read_record(tmp_path / "a.csv")
@@ -181,6 +192,7 @@ def _lowest(p: Mapping[str, float], *masses: str) -> float:
     return min(float(np.sqrt(p[m.replace("m", "k")] / p[m])) / (2.0 * np.pi) for m in masses)
 
 
+@slow
 def test_a_base_that_misses_nothing_shows_no_ringing(tmp_path: Path) -> None:
     for seed in (1, 2, 3):
         _, experiments, base = _fitted(tmp_path / "a.csv", "rich", seed)

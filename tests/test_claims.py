@@ -23,6 +23,7 @@ from psa_casadi.simulation.stepper import run
 from psa_casadi.units import convert
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 from tests.random_models import Point, random_model, random_point
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
@@ -33,6 +34,8 @@ SETS = [
     *(tuple(_draw.sample(ALL, size)) for size in (2, 3) for _ in range(15)),
     ALL,
 ]
+#: All effects at once take long to compile.
+EVERY = pytest.param(ALL, marks=slow)
 every_effect = pytest.mark.parametrize("effect", ALL, ids=lambda e: e.name)
 
 
@@ -121,7 +124,11 @@ def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
         np.testing.assert_array_equal(outputs, base_outputs)
 
 
-@pytest.mark.parametrize("effects", [*SETS[: len(ALL)], ALL], ids=name_of)
+@pytest.mark.parametrize(
+    "effects",
+    [SETS[0], *(pytest.param(s, marks=slow) for s in SETS[1 : len(ALL)]), EVERY],
+    ids=name_of,
+)
 def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
     """Equal to the tolerance of 1e-8: Newton's stopping test sees the norm of all states."""
     model = random_model(effects, np.random.default_rng(2), gains=False)
@@ -222,7 +229,9 @@ def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
         assert convert(1.0, variable.unit, unit) > 0.0
 
 
-@pytest.mark.parametrize("effects", [(), *SETS[: len(ALL)], ALL], ids=name_of)
+@pytest.mark.parametrize(
+    "effects", [(), *(pytest.param((e,), marks=slow) for e in ALL), EVERY], ids=name_of
+)
 def test_c_value_is_the_casadi_value(effects: tuple[Component, ...]) -> None:
     generator = np.random.default_rng(4)
     for gains in (True, True, True, False):

@@ -14,6 +14,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.experiment import read_record, sine, time_grid, write_record
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.simulation.simulate import simulate_record
+from tests.tiers import slow
 
 
 def psa(*arguments: str | Path) -> Result:
@@ -72,6 +73,7 @@ def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> No
     assert psa_casadi.check_fmu(str(fmu), stack_model("P-885.51")).passed
 
 
+@slow
 def test_model_files_and_fmus_are_also_named_by_text(tmp_path: Path) -> None:
     path, fmu = str(tmp_path / "model.json"), str(tmp_path / "stack.fmu")
     psa_casadi.save_model(stack_model("PTBS200"), path)

@@ -13,10 +13,12 @@ from psa_casadi.input_design.experiment import usual_records
 from psa_casadi.input_design.limits import Limits, excess
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.simulate import simulate
+from tests.tiers import slow
 
 STACK = "P-885.51"
 
 
+@slow
 def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None:
     output, page = tmp_path / "voltage.csv", tmp_path / "page.html"
     arguments = [

@@ -27,6 +27,7 @@ from psa_casadi.input_design.targets import Target, raster_scan, read_target
 from psa_casadi.input_design.tracking import TrackedInput, track
 from psa_casadi.input_design.verification import error_of, uncompensated
 from tests.fmu_models import exported
+from tests.tiers import slow
 
 
 @cache
@@ -68,7 +69,11 @@ def test_trials_make_up_for_parameters_that_are_off() -> None:
 
 
 @pytest.mark.parametrize(
-    "limits", [AmplifierLimits(max_rate=11e3), AmplifierLimits(max_current=0.016)]
+    "limits",
+    [
+        AmplifierLimits(max_rate=11e3),
+        pytest.param(AmplifierLimits(max_current=0.016), marks=slow),
+    ],
 )
 def test_limits_are_kept_and_cost_accuracy(limits: AmplifierLimits) -> None:
     found = track(scanner(), a_scan(), limits, corrections=0)
@@ -96,6 +101,7 @@ def test_a_quickest_move_is_near_the_bound_of_the_linear_part(payload: float) ->
     assert voltage.max() <= 120.0 + 1e-6
 
 
+@slow
 @pytest.mark.parametrize(("begin", "end"), [(2e-6, 10e-6), (10e-6, 2e-6)])
 def test_a_quickest_move_is_near_what_hysteresis_and_creep_allow(begin: float, end: float) -> None:
     """Downward that is 21 % over the bound of the linear part; a bang-bang move has no ramps."""

@@ -29,6 +29,7 @@ from tests.effect_runs import (
 )
 from tests.random_models import random_model, random_point
 from tests.stack_models import stack
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
@@ -101,7 +102,9 @@ def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> Non
 
 
 @pytest.mark.parametrize("effect", PLANT[:-1], ids=lambda e: e.name)
-@every_base
+@pytest.mark.parametrize(
+    "base", [BASE, pytest.param(SIMPLIFIED, marks=slow)], ids=["cascade", "single mass"]
+)
 def test_a_held_voltage_holds_the_output(effect: Component, base: tuple[Component, ...]) -> None:
     """The start at 100 V is an equilibrium of the extended model; ageing alone goes on."""
     model = linear(effect, 0.3, base, **HYSTERESIS)

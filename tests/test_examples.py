@@ -13,6 +13,7 @@ import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.examples import use_in_casadi, van_der_pol
 from psa_casadi.examples.index import examples, run_example
+from tests.tiers import slow_but
 
 EXAMPLES = [e.name for e in examples().values() if e.kind == "example"]
 
@@ -77,7 +78,12 @@ FIGURES: dict[str, Callable[[Any], None]] = {
 }
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize(
+    "name",
+    slow_but(
+        ["van_der_pol", "use_in_fmpy", "use_in_casadi", "raster_scan", "minimum_time"], EXAMPLES
+    ),
+)
 def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path.parent)
     found = run_example(name, Path(tmp_path.name))  # as `psa examples NAME -o FOLDER` is typed

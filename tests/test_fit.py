@@ -93,7 +93,7 @@ def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, 
     theta, step = moved(unknowns, 4), 1e-2
 
     def predicted(point: FloatArray) -> tuple[FloatArray, FloatArray]:
-        parts = predict(model, experiments, unknowns, point, way=Way(1e-9, stepped=True))
+        parts = predict(model, experiments, unknowns, point, way=Way(1e-9, 1e-9, stepped=True))
         displacement = np.concatenate([p.displacement for p in parts])
         return displacement, np.vstack([p.jacobian for p in parts])
 

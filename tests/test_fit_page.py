@@ -19,6 +19,7 @@ from psa_casadi.report.tables import parameter_table
 from psa_casadi.report.theme import DARK
 from tests.html_page import Page, figures, numbers
 from tests.report_cases import diagnosis, identification, long_fit
+from tests.tiers import slow_but
 
 pytestmark = pytest.mark.xdist_group("fit-page")
 
@@ -148,7 +149,10 @@ def test_pairs_that_are_known_only_together_are_named() -> None:
     assert "No two estimates correlate" in pairs_sentence([])
 
 
-@pytest.mark.parametrize(("records", "samples"), [(1, 1_000_000), (8, 250_000), (20, 5_000)])
+LONG = [(1, 1_000_000), (8, 250_000), (20, 5_000)]
+
+
+@pytest.mark.parametrize(("records", "samples"), slow_but([(1, 1_000_000)], LONG))
 def test_long_and_many_records_stay_below_8_mb_and_keep_their_spikes(
     records: int, samples: int
 ) -> None:

@@ -17,12 +17,13 @@ from psa_casadi.export.model_description3 import model_description3
 from psa_casadi.export.variable_table import variable_table
 from psa_casadi.model.stacks import STACKS
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow_but
 
 NAMES = (*STACKS, "every_effect", "single_mass", "flexure")
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_but(["P-885.51", "flexure"], NAMES))
 def test_archives_are_valid(
     name: str, fmi: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

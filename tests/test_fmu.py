@@ -13,6 +13,7 @@ from psa_casadi.export.fmu_instance import CO_SIMULATION, Fmu
 from psa_casadi.export.fmu_masters import FloatArray, Signals, co_simulate
 from psa_casadi.reference import from_samples, simulate
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow_but
 
 STACK = "P-885.51"
 MODELS = (
@@ -21,8 +22,13 @@ MODELS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    ("name", "fmi"),
+    slow_but(
+        [(STACK, 2), (STACK, 3), ("flexure", 3)],
+        [(name, fmi) for name in MODELS for fmi in (2, 3)],
+    ),
+)
 def test_check_passes(name: str, fmi: int) -> None:
     report = check_fmu(exported(name, fmi), model_named(name))
     assert report.compared
@@ -58,7 +64,7 @@ def test_smooth_inputs(signal: Callable[[FloatArray], FloatArray]) -> None:
     assert np.max(np.abs(found - truth)) < 1e-6 * np.ptp(truth)
 
 
-@pytest.mark.parametrize("step", [1e-6, 1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("step", slow_but([1e-4], [1e-6, 1e-4, 1e-3, 1e-2]))
 def test_jump_of_the_voltage(step: float) -> None:
     """The voltage jumps at 10 ms and back at 20 ms; inputs are held over a communication step."""
     count = min(round(3e-2 / step), 30000) if step > 1e-6 else 2000
@@ -83,7 +89,7 @@ def test_jump_of_the_voltage(step: float) -> None:
     assert np.max(np.abs(np.array(found) - truth)) < 1e-6 * scale
 
 
-@pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+@pytest.mark.parametrize("interface", slow_but(["CoSimulation"], ["CoSimulation", "ModelExchange"]))
 def test_fmpy_agrees(interface: str) -> None:
     """fmpy's own co-simulation master, and its CVode for model exchange, on two jumps."""
     rows = [(0.0, 0.0), (5e-3, 0.0), (5e-3, 100.0), (15e-3, 100.0), (15e-3, 20.0), (30e-3, 20.0)]

@@ -19,8 +19,11 @@ from psa_casadi.reference import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow_but
 
 STACKS = ("PTBS200", "WYDS0808020", "P-885.51", "manipulator", "slow_creep")
+#: The one of the quick tier.
+ONE = "P-885.51"
 TOLERANCES = (1e-3, 1e-5, 1e-7)
 FACTOR = 10.0
 
@@ -85,7 +88,7 @@ def _scale(name: str, expected: FloatArray) -> float:
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 @pytest.mark.parametrize("kind", SIGNALS)
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize("name", slow_but([ONE], STACKS))
 def test_error_is_within_ten_tolerances(name: str, kind: str, tolerance: float) -> None:
     expected = _expected(name, kind)
     with Fmu(exported(name)) as fmu:
@@ -97,7 +100,7 @@ def test_error_is_within_ten_tolerances(name: str, kind: str, tolerance: float) 
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize("name", slow_but([ONE], STACKS))
 def test_time_axis_cut_differently(name: str, tolerance: float) -> None:
     """Steps of 0.5 ms, a third of it, and of random length give the same values every 0.5 ms."""
     inputs = _signals(name, "ramps")
@@ -146,7 +149,7 @@ def _after_jumps(name: str) -> FloatArray:
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
-@pytest.mark.parametrize("name", ["PTBS200", "P-885.51", "manipulator"])
+@pytest.mark.parametrize("name", slow_but(["PTBS200"], ["PTBS200", ONE, "manipulator"]))
 def test_jumps_and_steps_from_a_microsecond_to_a_quarter_hour(name: str, tolerance: float) -> None:
     """The voltage jumps at every communication point; the steps span nine decades."""
     expected = _after_jumps(name)
@@ -183,7 +186,7 @@ def test_input_derivatives_raise_the_order() -> None:
     assert sloped[0] < held[0] / 30.0
 
 
-@pytest.mark.parametrize("name", ["PTBS200", "P-885.51", "slow_creep", "flexure"])
+@pytest.mark.parametrize("name", slow_but([ONE], ["PTBS200", ONE, "slow_creep", "flexure"]))
 def test_output_derivatives_are_those_of_the_outputs(name: str) -> None:
     """Against differences of fourth order over 4 us of a run with the same ramps as inputs."""
     model = model_named(name).plant()

@@ -19,6 +19,7 @@ from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Parameter, State
 from tests.modelica_runs import simulated
+from tests.tiers import slow, slow_but
 
 _X, _U, _P, _T = (ca.SX.sym(name) for name in "xupt")
 
@@ -60,13 +61,14 @@ MODELS: dict[str, Callable[[], Model]] = {
 }
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+@pytest.mark.parametrize("name", slow_but(["switch by a state", "no output"], MODELS))
 def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) -> None:
     report = check_fmu(export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
     assert report.passed, report.failures
 
 
+@slow
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_a_wired_system_passes_the_check(fmi: int, tmp_path: Path) -> None:
     """Its switches follow states and held commands, not the inputs."""

@@ -13,10 +13,10 @@ import pytest
 from psa_casadi.component import Component, Equations
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.fmu import MODEL_ENTRY, export_fmu
 from psa_casadi.export.model_description import model_description, time_scale
-from psa_casadi.export.platforms import PLATFORMS, chosen_platforms
+from psa_casadi.export.platforms import PLATFORMS, chosen_platforms, compile_library
 from psa_casadi.export.sources import STRICT, write_sources
 from psa_casadi.export.variable_table import rate_unit, variable_table
 from psa_casadi.model.compose import compose
@@ -24,6 +24,7 @@ from psa_casadi.model.model_file import loads
 from psa_casadi.simulation.compiler import run_compiler, zig_command
 from psa_casadi.variables import Output
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 
@@ -48,8 +49,8 @@ def test_token_follows_the_model() -> None:
 COMPILERS = {"gcc": ["gcc"], "zig": [*zig_command(), "-target", "x86_64-linux-gnu.2.17"]}
 
 
-@pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("name", ["slow_creep", "flexure"])
+@pytest.mark.parametrize("compiler", slow_but(["zig"], COMPILERS))
+@pytest.mark.parametrize("name", slow_but(["flexure"], ["slow_creep", "flexure"]))
 def test_sources_compile_alone_without_warnings(compiler: str, name: str, tmp_path: Path) -> None:
     if not shutil.which(COMPILERS[compiler][0]):
         pytest.skip(f"{compiler} is not installed")
@@ -85,6 +86,7 @@ def test_model_is_inside() -> None:
     assert inside.output_names == plant.output_names
 
 
+@slow
 def test_sensor_stays_out_unless_wanted(tmp_path: Path) -> None:
     model = compose((*BASE, EFFECTS["sensor_delay"], EFFECTS["offset_drift"]))
     plain = fmpy.read_model_description(str(export_fmu(model, tmp_path / "plant.fmu")))
@@ -192,3 +194,37 @@ def test_platforms() -> None:
     assert [p.name for p in chosen_platforms(["all"])] == list(PLATFORMS)
     assert len(chosen_platforms(["host", "all", "host"])) == 6
     assert len({p.folder for p in PLATFORMS.values()}) == 6
+
+
+def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For each source, name, platform and version of the compiler, and never half of one."""
+    calls = []
+
+    def compiled(command: list[str], directory: Path) -> None:
+        calls.append(command)
+        (directory / command[-1]).write_bytes(b"binary %d" % len(calls))
+
+    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
+    monkeypatch.setattr("psa_casadi.export.platforms.run_compiler", compiled)
+    texts, linux = {"model.c": "int a;"}, PLATFORMS["x86_64-linux"]
+    first = compile_library(texts, "psa", linux)
+    assert compile_library(dict(texts), "psa", linux) == first == b"binary 1"
+    others = [
+        compile_library({"model.c": "int b;"}, "psa", linux),
+        compile_library(texts, "other", linux),
+        compile_library(texts, "psa", PLATFORMS["aarch64-linux"]),
+    ]
+    monkeypatch.setattr("psa_casadi.export.platforms.version", lambda _: "99")
+    others.append(compile_library(texts, "psa", linux))
+    assert len({first, *others}) == len(calls) == 5
+    own = replace(linux, target=None)  # a machine's own compiler may change without a new name
+    assert compile_library(texts, "psa", own) != compile_library(texts, "psa", own)
+
+    def fails(command: list[str], directory: Path) -> None:
+        raise PsaError("no compiler")
+
+    monkeypatch.setattr("psa_casadi.export.platforms.run_compiler", fails)
+    for _ in range(2):
+        with pytest.raises(PsaError, match="no compiler"):
+            compile_library({"model.c": "int c;"}, "psa", linux)
+    assert compile_library(texts, "psa", linux) == others[-1]

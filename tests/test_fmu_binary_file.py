@@ -9,8 +9,9 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.binary_file import Binary, read_binary
 from psa_casadi.export.platforms import PLATFORMS
 from tests.c_host.build import VERSIONS, binary
+from tests.tiers import slow
 
-pytestmark = pytest.mark.xdist_group("platforms")
+pytestmark = [pytest.mark.xdist_group("platforms"), slow]
 
 FORMATS = {".so": "ELF", ".dll": "PE", ".dylib": "Mach-O"}
 

@@ -25,8 +25,9 @@ from tests.c_host.build import (
     native,
     tool,
 )
+from tests.tiers import slow
 
-pytestmark = pytest.mark.xdist_group("platforms")
+pytestmark = [pytest.mark.xdist_group("platforms"), slow]
 
 LINUX = ("x86_64-linux", "aarch64-linux")
 WINDOWS = ("x86_64-windows", "x86-windows")

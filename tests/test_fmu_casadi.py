@@ -18,6 +18,7 @@ import pytest
 from psa_casadi.model.compose import Model
 from psa_casadi.variables import nominal_value
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow_but
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,7 +65,9 @@ def by_expression(f: ca.Function, model: Model) -> FloatArray:
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.parametrize("name", ["P-885.51", "slow_creep", "single_mass", "flexure"])
+@pytest.mark.parametrize(
+    "name", slow_but(["P-885.51"], ["P-885.51", "slow_creep", "single_mass", "flexure"])
+)
 def test_jacobians(name: str, fmi: int, tmp_path: Path) -> None:
     model = model_named(name).plant()
     expected, found = (blocks(f, model) for f in (symbolic(model), imported(name, fmi, tmp_path)))

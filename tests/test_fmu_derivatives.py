@@ -14,6 +14,7 @@ from psa_casadi.export.fmu_instance3 import Update
 from psa_casadi.export.variable_table import variable_table
 from tests.fmi3_instances import Instance3, loaded
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow_but
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -70,7 +71,7 @@ def _worst(found: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
     return float((np.abs((found - truth) * scales) / rows[:, None]).max())
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", slow_but(MODELS[:1], MODELS))
 def test_point_derivatives_in_model_exchange_are_exact(name: str) -> None:
     kinds, point = _names(name), _point(name)
     unknowns = [*kinds["derivative"], *kinds["output"], *kinds["indicator"]]
@@ -165,7 +166,7 @@ def _stepped(
     return instance
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", slow_but(MODELS[:1], MODELS))
 def test_step_sensitivity_is_that_of_the_numbers_returned(name: str) -> None:
     """Against differences of eighth order of whole steps from changed starts."""
     kinds, point = _names(name), _point(name)

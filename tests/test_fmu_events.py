@@ -15,6 +15,7 @@ from psa_casadi.export.fmu_instance import CO_SIMULATION, ERROR, MODEL_EXCHANGE,
 from psa_casadi.export.variable_table import variable_table
 from tests import fmi3_instances as fmi3
 from tests.fmu_models import exported, model_named
+from tests.tiers import slow_but
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -97,7 +98,7 @@ def test_a_held_voltage_makes_no_events(fmi: int) -> None:
     assert np.count_nonzero(np.diff(path["time"]) == 0.0) <= 4
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_importer_locates_reversals_where_they_are(fmi: int) -> None:
     """After a corner of a triangle, u turns R_s C_p ln 2 later: the drive is of first order."""
     signal = np.zeros(len(CORNERS), dtype=[("time", "f8"), ("voltage", "f8"), ("load_force", "f8")])
@@ -160,7 +161,7 @@ def test_loose_solver_without_events_is_right_too(
     assert np.abs(np.array(found) - truth).max() < 10.0 * tolerance * np.ptp(truth)
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_fmpy_integrates_a_moving_voltage_at_the_default_tolerance(fmi: int) -> None:
     """fmpy 0.3.32 moves the input in the root function only; the events bear that."""
     time = np.linspace(0.0, 0.05, 2001)

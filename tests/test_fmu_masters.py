@@ -21,6 +21,7 @@ from psa_casadi.export.fmu_masters import FloatArray
 from psa_casadi.reference import simulate
 from tests.fmu_models import exported, model_named
 from tests.test_fmu_system import END, RATE, coupled, monolithic
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
@@ -52,7 +53,7 @@ def _error(result: Any) -> float:
 
 
 @VERSIONS
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("tolerance", slow_but([1e-6], [1e-4, 1e-6, 1e-8]))
 def test_fmpy_co_simulation(fmi: int, tolerance: float) -> None:
     result = fmpy.simulate_fmu(
         str(exported(STACK, fmi)), stop_time=0.03, fmi_type="CoSimulation",
@@ -62,6 +63,7 @@ def test_fmpy_co_simulation(fmi: int, tolerance: float) -> None:
     assert _error(result) < 10.0 * tolerance
 
 
+@slow
 def test_fmpy_co_simulation_with_events_and_early_return() -> None:
     """FMI 3: the importer enters event mode at the jumps and may be returned to early."""
     result = fmpy.simulate_fmu(
@@ -72,7 +74,7 @@ def test_fmpy_co_simulation_with_events_and_early_return() -> None:
     assert _error(result) < 1e-6
 
 
-@VERSIONS
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_fmpy_cvode(fmi: int) -> None:
     errors = []
     for tolerance in (1e-4, 1e-9):

@@ -18,9 +18,10 @@ from tests.c_host.build import (
     linked,
     native,
 )
+from tests.tiers import slow
 
 #: Each of them compiles two archives for six platforms: one process shall do it.
-pytestmark = pytest.mark.xdist_group("platforms")
+pytestmark = [pytest.mark.xdist_group("platforms"), slow]
 
 EMULATED = ("aarch64-linux", "x86_64-windows")
 HALF = STEPS // 2

@@ -36,6 +36,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Interval
 from tests.fmu_models import assert_valid, entries, exported, model_named
+from tests.tiers import slow_but
 
 STACK = "P-885.51"
 Table = Mapping[str, npt.NDArray[np.float64]]
@@ -131,7 +132,9 @@ def _errors(found: npt.NDArray[np.float64], expected: Table) -> dict[str, float]
     }
 
 
-@pytest.mark.parametrize("name", ["PTBS200", STACK, "manipulator", "single_mass"])
+@pytest.mark.parametrize(
+    "name", slow_but([STACK, "single_mass"], ["PTBS200", STACK, "manipulator", "single_mass"])
+)
 def test_reference_outputs_agree_with_the_independent_reference(name: str) -> None:
     model = model_named(name).plant()
     inside = reference_entries(model)

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from tests.c_host.build import VERSIONS, everywhere, linked, tool
+from tests.tiers import slow
 
-pytestmark = pytest.mark.xdist_group("platforms")
+pytestmark = [pytest.mark.xdist_group("platforms"), slow]
 
 #: Files of the sequences for each version of FMI.
 FILES = {

@@ -22,6 +22,7 @@ from psa_casadi.experiment import Record, read_record, read_records, write_recor
 from psa_casadi.experiment.column_map import parse_columns
 from psa_casadi.experiment.columns import Source
 from tests.record_files import HEADER, ROWS, write
+from tests.tiers import slow
 
 N = 24
 T = np.arange(N) / 8.0
@@ -354,6 +355,7 @@ def test_half_an_hour_at_10_hz_one_sided_and_bipolar(
     np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + t / 1800.0, rtol=1e-14)
 
 
+@slow
 def test_a_million_rows_with_decimal_commas_are_read_quickly(tmp_path: Path) -> None:
     rows = [
         f"{k / 10000:.4f};{k % 1000 / 10};{k % 1000 / 100}".replace(".", ",") for k in range(10**6)

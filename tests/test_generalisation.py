@@ -22,6 +22,7 @@ from psa_casadi.model.compose import compose
 from psa_casadi.simulation.simulate import simulate
 from tests.plants.again import play_again
 from tests.plants.make import make_record
+from tests.tiers import slow, slow_but
 
 FloatArray = NDArray[np.float64]
 SAMPLES, LEVEL = 2000, 2e-8
@@ -49,7 +50,7 @@ def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> fl
     return held_out_excess(seen, experiments, (clean,), colour, noise).factor
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.7])
+@pytest.mark.parametrize("correlation", slow_but([0.0], [0.0, 0.7]))
 def test_noise_is_no_reason_to_doubt(
     fitted: tuple[Fit, FloatArray, FloatArray], correlation: float
 ) -> None:
@@ -99,6 +100,7 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
     assert told == [1.0] * 25
 
 
+@slow
 def test_a_model_that_fails_on_the_held_out_record_is_not_adequate(tmp_path: Path) -> None:
     """Slow loops do not show a current limit; the steps that are held out do."""
     path = tmp_path / "slow.csv"

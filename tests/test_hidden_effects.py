@@ -2,7 +2,8 @@
 
 The plants (`tests/plants/`) share no code and no equation form with the effects. Every case runs
 `psa_casadi.diagnose` on the file that was written, and judges what a user would see. Here every
-effect has one record, and fresh seeds a few more; `psa bench diagnose` is the full study.
+effect has one record, and fresh seeds a few more; `psa bench diagnose` is the full study. The quick
+tier has the cause that the demonstration hides (`tests/test_cli.py`), and a clean record here.
 """
 
 import secrets
@@ -15,6 +16,7 @@ import psa_casadi as psa
 from psa_casadi.bench.hidden_cases import Case, run_case
 from tests.plants.make import Truth, make_record
 from tests.plants.table import FOREIGN, KNOWN
+from tests.tiers import slow, slow_but
 
 NAMING = ("cause_named", "partly_explained", "ambiguous")
 #: The seed of every effect's record.
@@ -38,6 +40,7 @@ def within(found: psa.Diagnosis) -> set[str]:
     return {n for c in found.causes for n in (c.effect, *c.cannot_be_told_from)}
 
 
+@slow
 @pytest.mark.parametrize("effect", sorted(set(KNOWN) - LAGS))
 def test_the_hidden_effect_is_named_and_the_gain_is_real(effect: str, tmp_path: Path) -> None:
     found, truth = diagnose(effect, SEED, tmp_path)
@@ -51,6 +54,7 @@ def test_the_hidden_effect_is_named_and_the_gain_is_real(effect: str, tmp_path: 
     assert errors[1] < 0.8 * errors[0]
 
 
+@slow
 @pytest.mark.parametrize("effect", sorted(LAGS))
 def test_a_lag_is_named_as_a_lag(effect: str, tmp_path: Path) -> None:
     found, truth = diagnose(effect, SEED, tmp_path)
@@ -64,7 +68,7 @@ def test_a_lag_is_named_as_a_lag(effect: str, tmp_path: Path) -> None:
     assert found.extended_errors.holdout_rms_m < found.base_errors.holdout_rms_m
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", slow_but([0], range(4)))
 def test_clean_data_leave_the_diagnosis_silent(seed: int, tmp_path: Path) -> None:
     found, truth = diagnose(None, seed, tmp_path)
     assert found.verdict == "adequate"
@@ -73,6 +77,7 @@ def test_clean_data_leave_the_diagnosis_silent(seed: int, tmp_path: Path) -> Non
     assert found.base_errors.holdout_rms_m == pytest.approx(truth.sigma, rel=0.1)
 
 
+@slow
 @pytest.mark.parametrize("effect", sorted(FOREIGN))
 def test_a_cause_that_is_not_in_the_table_is_not_named_alone(effect: str, tmp_path: Path) -> None:
     found, _ = diagnose(effect, SEED, tmp_path)
@@ -84,6 +89,7 @@ def test_a_cause_that_is_not_in_the_table_is_not_named_alone(effect: str, tmp_pa
     assert not found.remaining.white or found.verdict == "ambiguous"
 
 
+@slow
 def test_fresh_records_every_time() -> None:
     """Seeds are drawn anew and printed: at most one of them may mislead."""
     seeds = [secrets.randbelow(10**6) for _ in range(FRESH)]

@@ -23,6 +23,7 @@ from tests.identified_plants import (
     standard_errors,
     values_of,
 )
+from tests.tiers import slow, slow_but
 
 SEEDS = (2, 3, 4, 5)
 DEMO = Path(__file__).parent.parent / "psa_casadi" / "data" / "demo.csv"
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.xdist_group("identification")
 IDENTIFIED = ("k_L", "A", "beta", "gamma", "n", "tau", "delta", "R_s", "c_P", "c_B")
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", slow_but(SEEDS[:1], SEEDS))
 def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
     truth, found = plant(seed)[0], identified(seed)
     assert found.fit.converged
@@ -50,6 +51,7 @@ def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
         assert value == pytest.approx(true[name], rel=TOLERANCE[name]), name
 
 
+@slow
 def test_intervals_cover_the_truth() -> None:
     """Of 20 intervals of 95 % at most three may miss (p = 0.016), and none by far."""
     deviations = []
@@ -67,7 +69,7 @@ def test_intervals_cover_the_truth() -> None:
     assert np.median(z) > 0.2  # intervals that are far too wide would cover too
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", slow_but(SEEDS[:1], SEEDS))
 def test_what_is_not_determined_is_listed(seed: int) -> None:
     """Lags are short and alike: not all of them can be told."""
     found = identified(seed).determinacy
@@ -81,6 +83,7 @@ def test_what_is_not_determined_is_listed(seed: int) -> None:
         assert interval.low < identified(seed).model.values[name] < interval.high
 
 
+@slow
 def test_a_given_stiffness_scales_the_forces() -> None:
     record = plant(2)[1].slice(0, 2500)
     assumed, given = identify([record]), identify([record], stiffness=1e7)
@@ -103,6 +106,7 @@ def shifted(record: Record, start: int, stop: int, offset: float) -> Record:
     return Record(part.name, part.time, part.voltage, part.displacement + offset)
 
 
+@slow
 def test_two_records_have_their_own_offsets_and_memories() -> None:
     truth, record = plant(4)
     parts = [shifted(record, 0, 3000, 1e-6), shifted(record, 3000, record.n, -4e-6)]
@@ -152,6 +156,7 @@ def test_intervals_cover_the_reference_where_the_mechanics_are_known() -> None:
     assert found.model.values["tau"] == pytest.approx(p["tau"], rel=0.02)
 
 
+@slow
 def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
     """The model's exponent is at least 1; the reference bends with 0.6."""
     p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
@@ -170,7 +175,9 @@ def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPat
     assert found.warnings[0].startswith("The fit was cut off before it converged")
 
 
-@pytest.mark.parametrize(("record", "limit"), [("sine_1hz", 0.49), ("minor_loops", 0.64)])
+@pytest.mark.parametrize(
+    ("record", "limit"), [pytest.param("sine_1hz", 0.49, marks=slow), ("minor_loops", 0.64)]
+)
 def test_the_micromanipulator_is_met_within_its_floors(
     measured_data: Path, record: str, limit: float
 ) -> None:
@@ -182,6 +189,7 @@ def test_the_micromanipulator_is_met_within_its_floors(
         same_as_the_named_stack(found.fit.rms, r, "micromanipulator")
 
 
+@slow
 def test_the_stack_of_the_demonstration_is_what_its_record_gives() -> None:
     record = read_record(DEMO)
     same_as_the_named_stack(identify([record]).fit.rms, record, "demo")

@@ -17,6 +17,7 @@ from psa_casadi.identification.starting import starting_model
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.simulation.simulate import simulate
+from tests.tiers import slow, slow_but
 
 Values = Mapping[str, float]
 PAPER = ("PTBS200", "WYDS0808020", "P-885.51")
@@ -77,10 +78,16 @@ def start(*records: Record) -> LinearStart | None:
     return linear_start(records, starting_model(records).values)
 
 
-@pytest.mark.parametrize(("name", "share", "first"), [
+#: The share of noise and the largest error of each stack's step.
+STEP_ERRORS = [
     ("PTBS200", 1e-3, 0.03), ("WYDS0808020", 1e-3, 0.08), ("P-885.51", 1e-3, 0.08),
     ("PTBS200", 1e-2, 0.15), ("WYDS0808020", 1e-2, 0.12), ("P-885.51", 1e-2, 0.15),
-])  # fmt: skip
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "share", "first"), slow_but([STEP_ERRORS[0], STEP_ERRORS[-1]], STEP_ERRORS)
+)
 def test_a_step_tells_the_transfer_function(name: str, share: float, first: float) -> None:
     record = step(name, share)
     found = start(record)
@@ -106,7 +113,7 @@ def test_a_ringing_step_tells_the_bonding_layers() -> None:
     assert damping == pytest.approx([1.0] * len(right), rel=0.05)
 
 
-@pytest.mark.parametrize("name", PAPER)
+@pytest.mark.parametrize("name", slow_but(["PTBS200"], PAPER))
 def test_a_multisine_tells_it_in_spite_of_the_loop(name: str) -> None:
     values = values_of(name)
     time, voltage = multisine_voltage(values, seed=3)
@@ -114,7 +121,7 @@ def test_a_multisine_tells_it_in_spite_of_the_loop(name: str) -> None:
     assert errors(start(record), values, record)[0] < 0.2
 
 
-@pytest.mark.parametrize("share", [1e-3, 1e-2])
+@pytest.mark.parametrize("share", slow_but([1e-3], [1e-3, 1e-2]))
 def test_slow_loops_show_no_dynamics(share: float) -> None:
     """Also where the shape of the loop is not that of play operators."""
     values = values_of("PTBS200")
@@ -136,7 +143,7 @@ def test_without_displacement_or_motion_there_is_no_start() -> None:
     assert linear_start([record.slice(0, 10)], base) is None
 
 
-@pytest.mark.parametrize("scale", [5.0, 40.0])
+@pytest.mark.parametrize("scale", slow_but([40.0], [5.0, 40.0]))
 def test_no_size_is_built_in(scale: float) -> None:
     """Times, volts and metres in other units give the same candidates in those units."""
     record = step("WYDS0808020", 1e-3)
@@ -162,6 +169,7 @@ def test_gaps_offset_clock_and_polarity_do_not_matter() -> None:
     assert errors(start(other), values_of("PTBS200"), other)[0] < 0.05
 
 
+@slow
 def test_irregular_samples_are_put_on_a_grid() -> None:
     values, rng = values_of("WYDS0808020"), np.random.default_rng(2)
     time = np.sort(step_of("WYDS0808020").duration * rng.random(4000))
@@ -182,6 +190,7 @@ def test_coarse_samples_tell_the_slower_part(between: bool) -> None:
     assert errors(start(record), values, record)[0] < 0.1
 
 
+@slow
 def test_a_long_record_is_cut_to_what_is_fast_and_a_coarse_whole() -> None:
     values = values_of("WYDS0808020")
     time = np.linspace(0.0, 5e-3, 100_000)
@@ -193,13 +202,13 @@ def test_a_long_record_is_cut_to_what_is_fast_and_a_coarse_whole() -> None:
     assert set(found.records) == {"long, fastest part", "long, coarse"}
 
 
-@pytest.mark.parametrize("effect", ["slow_creep", "structural_mode"])
+@pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "structural_mode"]))
 def test_what_the_model_lacks_does_not_mislead(effect: str) -> None:
     record = step("PTBS200", 1e-3, effect)
     assert min(errors(start(record), values_of("PTBS200"), record)) < 0.15
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", slow_but([1], range(6)))
 def test_stacks_of_any_speed(seed: int) -> None:
     """Resonances from 100 Hz to 300 kHz, light to heavy damping, k_P/k_B from 1.5 to 12."""
     values = random_stack(np.random.default_rng(seed))
@@ -208,7 +217,7 @@ def test_stacks_of_any_speed(seed: int) -> None:
     assert min(errors(start(record), values, record)) < 0.1
 
 
-@pytest.mark.parametrize("ratio", [1.0, 0.6])
+@pytest.mark.parametrize("ratio", slow_but([0.6], [1.0, 0.6]))
 def test_a_zero_in_the_band_tells_the_stiffness_ratio(ratio: float) -> None:
     """Ringing wafers, overdamped bonding layers: b of eq. (11) is far from both a_P and a_B."""
     values = {**values_of("PTBS200"), "tau": 2e-5, "R_s": 5.0}

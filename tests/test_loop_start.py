@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from psa_casadi.bench.coverage import quantities
-from psa_casadi.bench.records import clean_set, step_voltage, with_noise
+from psa_casadi.bench.records import clean_loops, step_voltage, with_noise
 from psa_casadi.experiment import Record
 from psa_casadi.identification.loop_start import loop_start
 from psa_casadi.identification.starting import starting_model
 from psa_casadi.identification.unknowns import static_compliance
 from psa_casadi.model.stacks import STACKS
+from tests.tiers import slow, slow_but
 
 BENDS = ("beta", "gamma", "delta")
 
@@ -23,7 +24,7 @@ def truth(name: str) -> dict[str, float]:
 
 @cache
 def loops(name: str) -> list[Record]:
-    return [r for r in clean_set(truth(name)) if r.name.startswith("loop")]
+    return clean_loops(truth(name))
 
 
 def errors(name: str, records: list[Record]) -> dict[str, float]:
@@ -39,7 +40,7 @@ def errors(name: str, records: list[Record]) -> dict[str, float]:
     return {**shares, "n": value["n"] - true["n"]}
 
 
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize("name", slow_but(["P-885.51"], STACKS))
 def test_loops_with_noise_tell_the_hysteresis(name: str) -> None:
     found = errors(name, with_noise(loops(name), 1e-3, seed=2))
     assert all(abs(e) < 0.03 for e in found.values()), found
@@ -57,6 +58,7 @@ def test_noise_of_one_per_cent_and_missing_samples_still_leave_a_good_start() ->
     assert abs(found["k_L"] + found["A"]) < 0.03
 
 
+@slow
 def test_loops_that_begin_amid_a_period_tell_it_too() -> None:
     cut = [replace_from(r, 300) for r in with_noise(loops("PTBS200"), 1e-3, seed=1)]
     found = errors("PTBS200", cut)

@@ -22,8 +22,10 @@ from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.starting import starting_model
 from tests.plants.again import play_again
 from tests.plants.make import make_record
+from tests.tiers import slow
 
 
+@slow
 def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
     """Of 7 ms, seventy times the ordinary lag, in a triangle and steps together."""
     path = tmp_path / "triangle.csv"
@@ -41,6 +43,7 @@ def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
     assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
 
 
+@slow
 @pytest.mark.parametrize("ends", [(900, 1200), (1000, 1000)], ids=["lengths", "alike"])
 def test_the_order_of_the_records_tells_nothing(ends: tuple[int, int], tmp_path: Path) -> None:
     truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
@@ -94,6 +97,7 @@ def test_a_needless_first_cause_leaves_the_second_as_good(tmp_path: Path) -> Non
     assert left[0].probability["charge_leakage"] > 0.9
 
 
+@slow
 def test_a_wrong_first_cause_gives_way_beside_the_second(tmp_path: Path) -> None:
     """A spring that hardens, taken for a lost preload while a mode still rang."""
     make_record(
@@ -120,6 +124,7 @@ def _also(step: Round, task: Task, name: str) -> None:
     step.evidence = {**step.evidence, name: step.extensions[-1].evidence}
 
 
+@slow
 def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
     """Four effects lead the screening, none explains the data: an amplifier of 0.9 ms does."""
     path = tmp_path / "record.csv"
@@ -164,6 +169,7 @@ def test_each_form_of_an_effect_gets_a_start_and_near_ones_stay_rivals(tmp_path:
     assert chosen(0.5) == [name]
 
 
+@slow
 def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
     tmp_path: Path,
 ) -> None:

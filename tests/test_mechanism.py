@@ -27,6 +27,7 @@ from psa_casadi.input_design.mechanism import (
     step_response,
 )
 from psa_casadi.model.stacks import stack_model
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 STACK = "PTBS200"
@@ -207,6 +208,7 @@ def coupled(first: Path, second: Path, voltage: float, step: float, end: float) 
     return x
 
 
+@slow
 def test_coupled_fmus_do_what_the_closed_form_says(tmp_path: Path) -> None:
     """Stack FMU and mechanism FMU approach the designed step response, to first order."""
     linear = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}

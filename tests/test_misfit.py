@@ -26,6 +26,7 @@ from tests.misfit_cases import (
     seen,
     shares,
 )
+from tests.tiers import slow
 
 
 def test_a_function_of_the_voltage() -> None:
@@ -197,6 +198,7 @@ def test_rate_and_turns_of_a_noisy_voltage() -> None:
     assert np.std((drive.rate - np.gradient(SINE, TIME))[inner]) < 0.6 * raw
 
 
+@slow
 def test_a_million_samples() -> None:
     n = 1_000_000
     v = 50.0 * (1.0 - np.cos(2 * np.pi * np.arange(n) / 800.0))

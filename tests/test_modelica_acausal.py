@@ -12,6 +12,7 @@ from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.simulation.stepper import run
 from tests.modelica_runs import load, model_named, simulated, text_of
 from tests.modelica_stub import STUB
+from tests.tiers import slow_but
 
 FloatArray = NDArray[np.float64]
 
@@ -65,7 +66,7 @@ def _by_hand(p: dict[str, float], text: str, t: FloatArray) -> FloatArray:
     return np.array([found.y[5], found.y[7], drawn])
 
 
-@pytest.mark.parametrize("name", ["P-885.51", "WYDS0808020"])
+@pytest.mark.parametrize("name", slow_but(["P-885.51"], ["P-885.51", "WYDS0808020"]))
 def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
     model = stack_model(name)
     text = modelica_text(model)
@@ -79,7 +80,10 @@ def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
         assert np.abs(got[name_of_it] - values).max() < 1e-6 * np.ptp(values), name_of_it
 
 
-@pytest.mark.parametrize("name", [*STACKS, *EFFECTS, "every_effect"])
+@pytest.mark.parametrize(
+    "name",
+    slow_but(["P-885.51", "slow_creep", "every_effect"], [*STACKS, *EFFECTS, "every_effect"]),
+)
 def test_every_wired_example_is_a_balanced_system(name: str) -> None:
     model = load(STUB + text_of(name), _WIRED)
     structure = model.structure()

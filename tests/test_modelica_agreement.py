@@ -12,16 +12,17 @@ from tests.modelica_runs import (
     text_of,
     triangle_error,
 )
+from tests.tiers import slow_but
 
 NAMES = [*STACKS, *EFFECTS, "every_effect"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_but([*list(STACKS)[:1], *EFFECTS], NAMES))
 def test_right_hand_sides_read_back_are_the_models(name: str) -> None:
     assert right_side_error(model_named(name), text_of(name)) < 1e-12
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_but(["P-885.51", "slow_creep"], NAMES))
 def test_trajectories_are_those_of_simulate(name: str) -> None:
     errors = triangle_error(model_named(name), text_of(name), SPANS.get(name, 0.02))
     assert max(errors.values()) < 1e-6, errors

@@ -17,6 +17,7 @@ from psa_casadi.export.modelica_printer import Printer
 from psa_casadi.model.compose import compose
 from psa_casadi.variables import State
 from tests.modelica_runs import pure_ode, read_back
+from tests.tiers import slow
 
 Build = Callable[[Symbols], Any]
 
@@ -95,7 +96,8 @@ def _as_numbers(source: str) -> str:
     return re.sub(r"(der\(\w+\)) = ([^;]*);", r"\1 = noEvent(\2);", source)
 
 
-@settings(max_examples=500, deadline=None, derandomize=True)
+@slow
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(first=_EXPRESSIONS, second=_EXPRESSIONS, seed=st.integers(0, 1000))
 def test_expressions_survive_being_written_and_read(first: Build, second: Build, seed: int) -> None:
     model = _model(first, second)

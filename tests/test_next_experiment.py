@@ -26,6 +26,9 @@ from tests.plants.hide import effect_called
 from tests.plants.make import make_record
 from tests.plants.same_device import in_terms_of
 
+#: The loop from record to name is run once: with pytest-xdist by one process.
+pytestmark = pytest.mark.xdist_group("next-experiment")
+
 #: A gain that bends with the field, hidden in a triangle, where a bent sensor looks the same.
 HIDDEN, RIVAL, SEED = "field_dependent_gain", "sensor_nonlinearity", 7003
 SAMPLES = 2000

@@ -159,6 +159,7 @@ def test_a_cause_is_named_beside_coloured_noise(tmp_path: Path) -> None:
     assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
 
 
+@pytest.mark.slow
 def test_a_cause_is_named_beside_a_sensor_that_sticks(tmp_path: Path) -> None:
     """Repeated readings far from the model are masked and said; without that nothing is named."""
     path = tmp_path / "record.csv"

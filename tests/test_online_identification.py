@@ -16,6 +16,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.stepper import run
 from tests.modelica_runs import simulated
 from tests.online_numpy import TRACKED, NumpyIdentification
+from tests.tiers import slow_but
 
 STACK, PERIOD, NOISE = "P-885.51", 5e-4, 2e-8
 
@@ -76,7 +77,7 @@ def test_uncertainty_stays_below_its_start_however_poor_the_voltage() -> None:
     assert all(np.isfinite(v) for v in found.parameters.values())
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
     model = identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
     d, online = record(), OnlineIdentification(model.values)

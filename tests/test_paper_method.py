@@ -46,6 +46,7 @@ from tests.paper_cases import (
     values,
 )
 from tests.stack_models import PAPER_STACKS
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 
@@ -109,7 +110,7 @@ def test_a_zero_that_the_poles_do_not_allow_is_told() -> None:
     assert found["tau"] == pytest.approx(p["tau"], rel=1e-4)
 
 
-@pytest.mark.parametrize("leading", [False, True])
+@pytest.mark.parametrize("leading", slow_but([False], [False, True]))
 def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
     p = values(STACK)
     if leading:
@@ -130,6 +131,7 @@ def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
     )
 
 
+@slow
 def test_the_whole_method_where_its_assumptions_hold() -> None:
     """A step without hysteresis and noise, long and dense; loops of the same stack."""
     p = values(STACK)
@@ -222,7 +224,9 @@ FAILURES: dict[str, tuple[Callable[[], list[Record]], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", FAILURES)
+@pytest.mark.parametrize(
+    "case", slow_but(["no step", "no loop", "ringing", "logarithms"], FAILURES)
+)
 def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
     make, expected = FAILURES[case]
     found = paper_method(make())

@@ -19,6 +19,7 @@ from psa_casadi.model.parts import PARTS, compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
@@ -93,7 +94,11 @@ def test_the_compensator_makes_the_reference_linear() -> None:
 
 @pytest.mark.parametrize(
     ("effect", "gain"),
-    [("hysteresis_memory", 0.05), ("field_dependent_gain", 0.1), ("saturation_of_strain", 0.3)],
+    [
+        pytest.param("hysteresis_memory", 0.05, marks=slow),
+        ("field_dependent_gain", 0.1),
+        pytest.param("saturation_of_strain", 0.3, marks=slow),
+    ],
 )
 def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gain: float) -> None:
     """The force behind the lag follows the command; without the effect it does not."""

@@ -11,10 +11,11 @@ from psa_casadi.experiment.split import whole
 from psa_casadi.identification.fit import fit
 from psa_casadi.model.compose import compose
 from psa_casadi.simulation.simulate import simulate
+from tests.tiers import slow_but
 
 
 @pytest.mark.parametrize("share", [0.97, 0.9, 0.8, 0.65, 0.5, 0.3, 0.1])
-@pytest.mark.parametrize("size", [0.4, 0.55, 0.75, 1.0])
+@pytest.mark.parametrize("size", slow_but([0.75], [0.4, 0.55, 0.75, 1.0]))
 def test_a_current_limit_of_any_height_is_near_one_that_is_tried(share: float, size: float) -> None:
     """Steps of many sizes, all slewed in 1 ms; the limit is a share of the tallest one's current.
 

@@ -24,6 +24,7 @@ from tests.modelica_stub import STUB
 from tests.oms_stand_in import OMSimulator
 from tests.recipe_commands import run_command
 from tests.script_calls import calls_of
+from tests.tiers import slow
 from tests.tool_interfaces import BLOCK_PARAMETERS, DYMOLA, OPENMODELICA, bound
 
 RECIPES = [e.name for e in examples().values() if e.kind == "recipe"]
@@ -151,6 +152,7 @@ def test_the_matlab_script() -> None:
         assert f"% {kind}s: {listed}\n" in script.text
 
 
+@slow
 @pytest.mark.parametrize("made", ["omsimulator"], indirect=True)
 def test_the_script_for_omsimulator_pushes_the_stage(
     made: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -209,6 +211,7 @@ def test_the_shell_commands_of_fmpy(made: Path, monkeypatch: pytest.MonkeyPatch)
     assert three["displacement"][-1] == pytest.approx(two["displacement"][-1], rel=1e-3)
 
 
+@slow
 def test_the_workflow_is_yaml_and_its_commands_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from psa_casadi.errors import InputError
 from psa_casadi.experiment import Record, read_record, write_record
 from tests.record_files import HEADER, ROWS, write
+from tests.tiers import slow
 
 
 def test_a_record_is_read_in_si_units_whatever_the_order_and_the_unit(tmp_path: Path) -> None:
@@ -120,6 +121,7 @@ def test_the_measured_records_are_read(measured_data: Path, file: str) -> None:
     assert 35e-6 < record.range_m < 50e-6
 
 
+@slow
 def test_a_million_rows_are_read_quickly(tmp_path: Path) -> None:
     rows = [f"{k / 10000:.4f},{k % 1000 / 10},{k % 1000 / 100}" for k in range(10**6)]
     path = write(tmp_path / "long.csv", HEADER, *rows)

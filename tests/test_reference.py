@@ -11,6 +11,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.reference import Mechanics, Trajectory, from_samples, simulate
 from tests.stack_models import PAPER_STACKS
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
@@ -146,6 +147,7 @@ def test_hold_leaves_the_hysteresis_force_at_rest() -> None:
     np.testing.assert_allclose(f_H[3:], f_H[2], rtol=0, atol=1e-8 * p["h_ref"])
 
 
+@slow
 def test_loop_lags_and_only_delta_makes_it_rate_dependent() -> None:
     widths: dict[tuple[float, float], float] = {}
     for delta in (0.0, values()["delta"]):

@@ -20,6 +20,7 @@ from psa_casadi.report.tables import blind_table, check_table, error_table, para
 from psa_casadi.report.text import check_sentence, effect_page, story
 from tests.html_page import Page, figures
 from tests.report_cases import ADDED, NOISE, diagnosis
+from tests.tiers import slow
 
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 SENTENCES = {
@@ -79,6 +80,7 @@ def test_a_report_that_cannot_be_written_is_the_users_problem(tmp_path: Path) ->
             write(diagnosis("adequate"), tmp_path / "absent" / "x")
 
 
+@slow
 def test_long_records_stay_small(tmp_path: Path) -> None:
     write_report(diagnosis("cause_named", tuple("abcdefgh"), 60_000), tmp_path / "r.html")
     assert (tmp_path / "r.html").stat().st_size < 8e6

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 import psa_casadi.identification.fit as fitting
 from psa_casadi.bench.coverage import Run, one_run
-from psa_casadi.bench.records import clean_set, with_noise
+from psa_casadi.bench.records import clean_loops, with_noise
 from psa_casadi.experiment import Record
 from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.model.stacks import STACKS
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
@@ -32,6 +33,7 @@ def run_of(name: str, seed: int) -> Run:
     return one_run(name, seed)
 
 
+@slow
 @pytest.mark.parametrize("name", ["P-885.51", "PTBS200"])
 def test_a_stack_is_found_from_its_records_alone(name: str) -> None:
     """Step, loops and multisine of the reference with 0.1 % noise; no start is given."""
@@ -47,6 +49,7 @@ def test_a_stack_is_found_from_its_records_alone(name: str) -> None:
     assert all(abs(f.value - f.truth) < 4.5 * f.error for f in told.values())
 
 
+@slow
 def test_a_ringing_stack_tells_its_resonances() -> None:
     """Which of the two belongs to the wafers may stay open; both are there."""
     found = {f.name: f for f in run_of("PTBS200", 3).found}
@@ -73,8 +76,7 @@ def test_exchanging_twice_changes_nothing() -> None:
 
 @cache
 def loops() -> list[Record]:
-    records = [r for r in clean_set(truth("P-885.51")) if r.name.startswith("loop")]
-    return with_noise(records[2:4], 1e-3, seed=4)
+    return with_noise(clean_loops(truth("P-885.51"))[2:4], 1e-3, seed=4)
 
 
 @pytest.fixture(scope="module")

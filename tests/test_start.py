@@ -9,9 +9,12 @@ from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.start import initial_slope, start_state
 from psa_casadi.simulation.stepper import run
 from tests.stack_models import FloatArray, jacobian, sine, stack
+from tests.tiers import slow
 
 
-@pytest.mark.parametrize("effects", [(), tuple(EFFECTS)], ids=["base", "all"])
+@pytest.mark.parametrize(
+    "effects", [(), pytest.param(tuple(EFFECTS), marks=slow)], ids=["base", "all"]
+)
 @pytest.mark.parametrize("name", sorted(STACKS))
 def test_rest_is_rest(name: str, effects: tuple[str, ...]) -> None:
     model = stack(name)

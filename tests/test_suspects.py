@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from psa_casadi.experiment import Record, multisine, read_record, sine, steps, time_grid, triangle
 from psa_casadi.experiment.quantum import quantum_of
 from psa_casadi.experiment.suspects import cleaned, suspects
+from tests.tiers import slow, slow_but
 
 FloatArray = NDArray[np.float64]
 RANGE = 20e-6
@@ -64,7 +65,7 @@ def record(voltage: str, noise: str, seed: int = 0, f: float = 200.0) -> Record:
 
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("voltage", VOLTAGES)
-@pytest.mark.parametrize("f", [20.0, 200.0, 1500.0])
+@pytest.mark.parametrize("f", slow_but([200.0], [20.0, 200.0, 1500.0]))
 def test_what_a_stack_does_is_not_suspect(voltage: str, noise: str, f: float) -> None:
     flagged = [int(suspects(record(voltage, noise, seed, f)).mask.sum()) for seed in range(2)]
     assert sum(flagged) <= 1
@@ -198,6 +199,7 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
     assert found.sentences("c") == ("c: the displacement is quantised in steps of 1 counts.",)
 
 
+@slow
 def test_a_million_samples_are_looked_at_quickly() -> None:
     t = time_grid(100.0, 1e-4)
     u = sine(t, 0.0, 100.0, 0.1)

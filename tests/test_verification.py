@@ -29,6 +29,7 @@ from psa_casadi.bench.verification_cases import (
 from psa_casadi.bench.verification_figure import picture
 from psa_casadi.experiment import steps, time_grid
 from psa_casadi.model.stacks import STACKS
+from tests.tiers import slow
 
 RATED = STACKS["P-885.51"].values["u_rated"].value
 
@@ -129,6 +130,7 @@ def test_the_picture_has_a_pair_of_panels_for_everything_shown(shown: list[Compa
     assert np.isfinite(figure.axes[5].get_lines()[-2].get_ydata()).sum() == 8
 
 
+@slow
 def test_only_a_wrong_number_of_masses_shows_in_a_step(ringing: list[Match]) -> None:
     """Reciprocal data: a single mass misses, the one-way cascade fits almost as well."""
     largest = {m.model: np.abs(m.step).max() for m in ringing}
@@ -166,6 +168,7 @@ def test_the_three_plants_are_three() -> None:
         assert y == pytest.approx(100.0 / hard[plant], rel=1e-4), plant
 
 
+@slow
 def test_run_puts_the_parts_together(
     shown: list[Comparison], ringing: list[Match], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,6 +190,7 @@ def test_run_puts_the_parts_together(
     assert asked[1:] == ["PTBS200", "WYDS0808020", "P-885.51"]
 
 
+@slow
 def test_the_micromanipulator_is_judged_on_what_was_kept(
     measured_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

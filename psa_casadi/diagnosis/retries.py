@@ -34,6 +34,8 @@ _CLEAR = 15.0
 #: Multiple of the sampling rate about which the images of a mode's tone are tried at most.
 _IMAGES = 3
 _QUICK, _FIRST, _BEST = 8, 4, 2
+#: How far above what is of use the cost after the first evaluations may be.
+_HOPEFUL = 2.0
 #: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
 _AGAIN = 1.5
 #: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band; the
@@ -118,7 +120,7 @@ def from_mode(
     rate = 1.0 / min(e.record.sample_time for e in experiments)
     near = images(tone, rate, _IMAGES)
     starts = [m for f in near for m in _masses(values, [f], damping * tone / f)]
-    final = _with_masses(before, starts, experiments)
+    final = _with_masses(before, starts, experiments, _as_good(mode.fit, _AS_GOOD))
     if final is None or _short(final, mode.fit) >= _AS_GOOD:
         return None
     return _in_base(base, before, final, experiments)
@@ -135,7 +137,7 @@ def instead_of(
     what looks like a further mode.
     """
     if not rings(extension):
-        found = _with_ringing(base, experiments, progress)
+        found = _with_ringing(base, experiments, progress, least=_as_good(extension.fit, _LIKE))
         if found is not None and _short(found, extension.fit) < _LIKE:
             return _tuned(found, experiments, progress)
     if not shows_ringing(experiments):
@@ -164,6 +166,11 @@ def _short(found: Fit, other: Fit) -> float:
     return len(other.residuals) * float(np.log(found.rms / other.rms))
 
 
+def _as_good(other: Fit, short: float) -> float:
+    """Return the rms [m] that falls short of another fit's by n ln(ratio of rms) = `short`."""
+    return other.rms * float(np.exp(short / len(other.residuals)))
+
+
 def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experiment]) -> Fit | None:
     """Return the base fitted from where a fit with more masses, and perhaps causes, has led."""
     if before is base:
@@ -188,12 +195,17 @@ def _moved(
 
 
 def _with_ringing(
-    fit: Fit, experiments: Sequence[Experiment], progress: Progress, seen: float = 0.0
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+    seen: float = 0.0,
+    least: float = np.inf,
 ) -> Fit | None:
     """Fit with a mass free, from the resonances that the residual's ringing may be of.
 
     None where it shows less than `seen`, a decrease of the whitened sum of squares, or where none
-    explains clearly more. A mass that is free already is tried elsewhere, too.
+    explains clearly more, down to the rms `least` [m]. A mass that is free already is tried
+    elsewhere, too.
     """
     rate = 1.0 / min(e.record.sample_time for e in experiments)
     if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
@@ -203,7 +215,7 @@ def _with_ringing(
         return None
     progress(f"base fit, with a resonance that may be seen at {tone.tone:.3g} Hz")
     starts = [m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z)]
-    return _with_masses(fit, starts, experiments)
+    return _with_masses(fit, starts, experiments, least)
 
 
 def _masses(
@@ -218,18 +230,22 @@ def _masses(
 
 
 def _with_masses(
-    before: Fit, starts: Sequence[Mapping[str, float]], experiments: Sequence[Experiment]
+    before: Fit,
+    starts: Sequence[Mapping[str, float]],
+    experiments: Sequence[Experiment],
+    least: float = np.inf,
 ) -> Fit | None:
     """Fit with one mass free from several starts; None where none explains clearly more.
 
-    A start is left where it does not come below the fit without the mass at once.
+    None as well where no rms comes near the `least` that is of use [m].
     """
+    least = min(least, before.rms * float(np.exp(-_CLEAR / len(before.residuals))))
 
     def begun(start: Mapping[str, float]) -> Fit | None:
         free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
         return quick_from(
             before, before.model, experiments, free,
-            start_states=before.starts(), evaluations=_FIRST, start=start, goal=before.cost,
+            start_states=before.starts(), evaluations=_FIRST, start=start,
         )  # fmt: skip
 
     def further(quick: Fit) -> Fit | None:
@@ -238,13 +254,13 @@ def _with_masses(
             quick, quick.model, experiments, names, start_states=states, evaluations=_QUICK
         )
 
-    found = [f for f in side_by_side(begun, starts) if f is not None and f.cost < before.cost]
+    limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
+    found = [f for f in side_by_side(begun, starts) if f is not None and f.cost < limit]
     ended = side_by_side(further, sorted(found, key=lambda f: f.cost)[:_BEST])
     best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
     if best is None:
         return None
     try:
-        least = before.rms * float(np.exp(-_CLEAR / len(before.residuals)))
         final = refit(best, experiments, best.unknowns.names, least=least)
     except PsaError:
         return None

@@ -1,14 +1,23 @@
 """The platforms an FMU can carry a binary for, and how each is compiled."""
 
+import hashlib
 import platform
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.sources import compiled_files
-from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler, zig_command
+from psa_casadi.files import atomic_path
+from psa_casadi.simulation.compiler import (
+    OPTIMISE,
+    cache_directory,
+    compiler_command,
+    run_compiler,
+    zig_command,
+)
 
 
 @dataclass(frozen=True)
@@ -78,19 +87,38 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
 def compile_library(texts: Mapping[str, str], identifier: str, target: Platform) -> bytes:
     """Compile sources to a shared library that exports only FMI functions; return its bytes.
 
+    What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
+    version, so that the same model is compiled once. A machine's own compiler may change unseen.
+
     Raises PsaError with the compiler's messages if it fails.
     """
-    compiler = compiler_command() if target.target is None else zig_command()
-    where = () if target.target is None else ("-target", target.target)
     output = identifier + target.suffix
     own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
     libraries = ("-lm",) if target.suffix == ".so" else ()
+    arguments = [
+        *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
+        "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
+    ]  # fmt: skip
+    if target.target is None:
+        return _compiled(texts, [*compiler_command(), *arguments], output)
+    arguments = ["-target", target.target, *arguments]
+    content = (version("ziglang"), arguments, sorted(texts.items()))
+    digest = hashlib.sha256(repr(content).encode("utf-8")).hexdigest()[:32]
+    kept = cache_directory() / "binaries" / (digest + target.suffix)
+    try:
+        return kept.read_bytes()
+    except FileNotFoundError:
+        made = _compiled(texts, [*zig_command(), *arguments], output)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(kept) as temporary:
+        temporary.write_bytes(made)
+    return made
+
+
+def _compiled(texts: Mapping[str, str], command: Sequence[str], output: str) -> bytes:
+    """Run a compiler in a folder of the sources; return the bytes of the file it wrote."""
     with tempfile.TemporaryDirectory() as directory:
         for name, text in texts.items():
             (Path(directory) / name).write_text(text, encoding="utf-8", newline="\n")
-        command = [
-            *compiler, *where, *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
-            "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
-        ]  # fmt: skip
         run_compiler(command, Path(directory))
         return (Path(directory) / output).read_bytes()

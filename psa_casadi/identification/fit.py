@@ -163,8 +163,9 @@ def _minimum(
 ) -> tuple[Minimum, Way, list[Simulated]]:
     """Return the minimum, found by a simulation that is accurate there, and how that was done."""
     allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
-    first = max(rtol, _loosest(experiments, allowed))
-    ways = [Way(first * 0.1**k) for k in range(_TENTHS)] + [Way(rtol, stepped=True)]
+    first = max(rtol, _loosest(experiments, allowed)) if rtol >= FIT_RTOL else rtol
+    ways = [Way(first * 0.1**k, rtol * 0.1**k) for k in range(_TENTHS)]
+    ways.append(Way(rtol, 0.1 * rtol, stepped=True))
     spent = 0
     for way in ways:
         evaluate = objective(model, experiments, unknowns, weights, way)

@@ -106,7 +106,6 @@ def quick_from(
     start_states: Sequence[Mapping[str, float]],
     evaluations: int,
     start: Mapping[str, float] | None = None,
-    goal: float = np.inf,
 ) -> Fit | None:
     """Fit a little from other values, weighted as before; None if these cannot be simulated."""
     try:
@@ -119,7 +118,6 @@ def quick_from(
             start_states=start_states,
             evaluations=evaluations,
             rtol=quick_rtol(previous.sigma, experiments),
-            goal=goal,
         )
     except PsaError:
         return None

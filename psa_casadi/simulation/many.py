@@ -59,7 +59,9 @@ def simulate_many(
 
     def alone(one: Model) -> FloatArray:
         try:
-            return trace(one, t, u, start(one), way=Way(rtol, stepped=True), output=output).output
+            return trace(
+                one, t, u, start(one), way=Way(rtol, rtol, stepped=True), output=output
+            ).output
         except SimulationError:
             return np.full(record.n, np.nan)
 

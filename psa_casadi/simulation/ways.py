@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.exact.run import NotExact, run_exact, time_steps, why_not
+from psa_casadi.simulation.exact.run import NotExact, run_exact
 from psa_casadi.simulation.stepper import Steps, run
 
 FloatArray = npt.NDArray[np.float64]
@@ -19,7 +19,10 @@ EXACT, STEPPER = "exact steps", "stepper"
 STEP_SHARE, SMALLEST_STEP_RTOL = 0.003, 1e-12
 #: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
 #: Each is judged by the one before.
-_LADDER = ((0.1, 0), (0.01, 0), (1e-3, 1), (1e-4, 1))
+_LADDER = ((0.1, 0), (0.03, 1), (0.01, 2), (1e-3, 3))
+#: Share of the tolerance to which two runs agree: the finer one may err by a part of it that both
+#: have in common.
+_AGREE = 0.5
 #: Below this tolerance two runs may share an error that is of its size: the stepper is taken.
 _TIGHTEST = 1e-6
 #: Loosest tolerance of exact steps: beyond it nothing is won.
@@ -30,15 +33,19 @@ _STILL = 1e-3
 
 @dataclass(frozen=True)
 class Way:
-    """How a record is run: `rtol` is the tolerance of a step; `stepped` rules exact steps out."""
+    """How a record is run: tolerance of an exact step, and of a step of the stepper.
+
+    `stepped` rules exact steps out.
+    """
 
     rtol: float
+    step_rtol: float
     stepped: bool = False
 
     @property
     def finer(self) -> "Way":
         """A way whose error is far smaller: what this one's is judged by."""
-        return Way(0.1 * self.rtol, self.stepped)
+        return Way(0.1 * self.rtol, 0.1 * self.step_rtol, self.stepped)
 
 
 @dataclass(frozen=True)
@@ -48,17 +55,6 @@ class Traced:
     output: FloatArray
     sensitivity: FloatArray
     way: str
-
-
-def exact(model: Model, t: FloatArray, way: Way, output: str) -> bool:
-    """Whether a model's output over times `t` (n,) is run by exact steps."""
-    if way.stepped or why_not(model.structure, output):
-        return False
-    try:
-        time_steps(t)
-    except NotExact:
-        return False
-    return True
 
 
 def output_of(model: Model) -> str | None:
@@ -97,7 +93,7 @@ def trace(
         except NotExact:
             pass
     steps = run(
-        model, t, u, x0, rtol=way.rtol, steps_limit=steps_limit, unknowns=unknowns, s0=s0,
+        model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, unknowns=unknowns, s0=s0,
         output=output,
     )  # fmt: skip
     slopes = none if steps.sensitivity is None else steps.sensitivity
@@ -125,7 +121,11 @@ def accurate(
             break
         size = max(float(np.ptp(found.shown)), _STILL * nominal)
         fine = before is not None and not found.forced
-        if before is not None and fine and np.max(np.abs(found.shown - before)) <= rtol * size:
+        if (
+            before is not None
+            and fine
+            and np.max(np.abs(found.shown - before)) <= _AGREE * rtol * size
+        ):
             x, y = found.x, found.y
             if x is not None and y is not None:
                 empty = np.empty((len(t), 0))

@@ -12,6 +12,7 @@ from tests.plants.noise import coloured
 from tests.plants.rerun import fine_command, moved_by
 from tests.plants.stack import FloatArray
 from tests.plants.visibility import base_directions, refitted_ratio, visible_ratio
+from tests.tiers import slow, slow_but
 
 
 def column(path: Path, number: int) -> FloatArray:
@@ -62,7 +63,7 @@ def test_record_with_drop_outs(stuck: bool, tmp_path: Path) -> None:
     assert np.std(kept) == pytest.approx(truth.sigma, rel=0.05)
 
 
-@pytest.mark.parametrize("kind", EXCITATIONS)
+@pytest.mark.parametrize("kind", slow_but(["rich", "bipolar", "small"], EXCITATIONS))
 def test_every_voltage_starts_at_rest_and_stays_in_its_span(
     kind: ExcitationKind, tmp_path: Path
 ) -> None:
@@ -92,7 +93,7 @@ def test_poor_voltages_are_poor(tmp_path: Path) -> None:
     assert np.count_nonzero(np.diff(levels)) <= 21
 
 
-@pytest.mark.parametrize("effect", ["slow_creep", "backlash"])
+@pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "backlash"]))
 def test_visible_ratio_is_what_was_asked_for(effect: str, tmp_path: Path) -> None:
     truth = make_record(effect, 4, tmp_path / "a.csv", visible=0.4)
     assert truth.visible == pytest.approx(0.4, rel=0.05)
@@ -130,6 +131,7 @@ def test_thermometer_is_in_the_record(tmp_path: Path) -> None:
     assert make_record("slow_creep", 6, path).temperature is None
 
 
+@slow
 def test_a_pole_before_the_drive_vanishes_in_a_fit(tmp_path: Path) -> None:
     """Why a lag is scaled by a base that is fitted again: its linearisation cannot see this."""
     truth = make_record(None, 1, tmp_path / "a.csv")

@@ -1,0 +1,215 @@
+"""Exact steps against the stepper and against the paper's equations in plain NumPy.
+
+The stepper at 1e-10 errs by up to 9e-8 of the range over a record (PTBS200), at 1e-12 by 5e-9.
+"""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi import reference
+from psa_casadi.component import Component
+from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.effects import EFFECTS
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.reference import Mechanics
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.ways import EXACT, STEPPER, accurate
+from tests.exact_cases import (
+    BEAT,
+    CUBIC,
+    JUMP,
+    LAG,
+    OUTPUT,
+    VOLTAGES,
+    composite,
+    error,
+    inputs,
+    start,
+    stepped,
+    times,
+    voltage,
+    with_effect,
+)
+from tests.stack_models import stack
+from tests.test_agreement import stack_values
+
+FloatArray = NDArray[np.float64]
+
+RTOL = 1e-6
+SAMPLES = 1500
+#: A few of the stack's lags in a sample, and many of them.
+SAMPLE_TIMES = (2e-5, 1e-3)
+NAMES = ("base", *EFFECTS)
+slow = pytest.mark.slow
+
+
+def compare(
+    model: Model, t: FloatArray, relative: FloatArray, rtol: float = RTOL, hold: str = "linear"
+) -> tuple[float, str]:
+    """Return the error of a run over the range, by a stepper that is far finer, and the way."""
+    u = inputs(model, t, relative)
+    x0 = start(model, t, u)
+    steps, way = accurate(model, t, u, x0, rtol=rtol, hold=hold)
+    shown = steps.y[:, model.output_names.index(OUTPUT)]
+    fine = max(1e-4 * rtol, 1e-12)
+    return error(shown, stepped(model, t, u, x0, rtol=fine, hold=hold)), way
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_composite_record_agrees_with_the_stepper(name: str) -> None:
+    """A sine, a ramp, a hold and a step; the stepper takes its 1500 steps and more."""
+    found, way = compare(with_effect(name), times(SAMPLES, 1e-4), composite(SAMPLES))
+    assert found <= RTOL
+    # thresholds that follow the rate fall within a microsecond at a reversal: no step is so short
+    assert way == EXACT or name == "rate_dependent_hysteresis"
+
+
+@slow
+@pytest.mark.parametrize("stack_name", sorted(STACKS))
+@pytest.mark.parametrize("name", NAMES)
+def test_every_stack_and_voltage_agrees_with_the_stepper(name: str, stack_name: str) -> None:
+    """Two of ten runs may be stepped: play behind a light resonance turns at every swing."""
+    model, ways, share = with_effect(name, stack_name), [], np.linspace(0.0, 1.0, SAMPLES)
+    for kind in VOLTAGES:
+        for step in SAMPLE_TIMES:
+            found, way = compare(model, times(SAMPLES, step), voltage(kind, share))
+            # where the stepper was taken it may err by what its own 0.003 rtol a step adds up to
+            assert found <= (RTOL if way == EXACT else 3 * RTOL), (kind, step)
+            ways.append(way)
+    assert ways.count(EXACT) >= len(ways) - 2
+
+
+@pytest.mark.parametrize("rtol", [1e-5, *(pytest.param(r, marks=slow) for r in (1e-7, 1e-8))])
+@pytest.mark.parametrize("name", ["base", "hysteresis_memory", "load_stiffness", "drive_lag"])
+def test_the_error_keeps_to_other_tolerances(name: str, rtol: float) -> None:
+    """Exact steps do not know their error to less than 1e-6: then the stepper is taken."""
+    relative = np.concatenate([composite(300), voltage("triangle", np.linspace(0.0, 1.0, 300))])
+    found, way = compare(with_effect(name), times(600, 1e-4), relative, rtol)
+    assert found <= rtol
+    assert way == (EXACT if rtol >= 1e-6 else STEPPER)
+
+
+@pytest.mark.parametrize("name", ["base", "backlash", "voltage_saturation"])
+def test_held_inputs_agree(name: str) -> None:
+    """Every sample begins with a jump; the stepper takes over where its turns are not settled."""
+    relative = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
+    found, way = compare(with_effect(name), times(600, 1e-4), relative, hold="zero")
+    assert found <= RTOL
+    assert way == (STEPPER if name == "voltage_saturation" else EXACT)
+
+
+@pytest.mark.parametrize("name", ["base", "backlash"])
+def test_a_few_time_steps_in_one_record(name: str) -> None:
+    t = np.cumsum(np.repeat([1e-4, 1e-3, 2.5e-5], 200))
+    relative = voltage("sine", t / t[-1])
+    found, way = compare(with_effect(name), t, relative)
+    assert found <= RTOL
+    assert way == EXACT
+
+
+def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
+    model, rng = stack("P-885.51"), np.random.default_rng(3)
+    t = 1e-3 * (np.arange(300) + 0.01 * rng.standard_normal(300))
+    v = 60.0 * (1.0 - np.cos(20.0 * t))
+    found = simulate(model, t, v)
+    assert found.way == STEPPER
+    regular = simulate(model, times(300, 1e-3), v)
+    assert regular.way == EXACT
+    # clocks tell times to a few digits only: that is no other step
+    rounded = np.round(times(300, 1e-3), 9) + 1.0e-3 * 2e-7 * rng.standard_normal(300)
+    assert simulate(model, rounded, v).way == EXACT
+
+
+def test_steps_that_differ_slightly_are_told_apart() -> None:
+    """Two clocks 0.1 % apart: each step is taken at its own length."""
+    t = np.cumsum(np.where(np.arange(600) % 7 < 3, 1e-4, 1.001e-4))
+    found, way = compare(stack("P-885.51"), t, voltage("sine", t / t[-1]))
+    assert found <= RTOL
+    assert way == EXACT
+
+
+@pytest.mark.parametrize("name", ["base", "slow_creep", "sensor_delay"])
+@pytest.mark.parametrize("shift", [np.pi / 2, np.pi], ids=["in motion", "at the top"])
+def test_a_record_may_start_anywhere(name: str, shift: float) -> None:
+    t = times(600, 1e-4)
+    found, way = compare(with_effect(name), t, 0.4 * (1.0 - np.cos(300.0 * t + shift)))
+    assert found <= RTOL
+    assert way == EXACT
+
+
+@pytest.mark.parametrize(
+    ("component", "expected"),
+    [(LAG, EXACT), (CUBIC, EXACT), (JUMP, STEPPER)],
+    ids=["lag", "spring", "jump"],
+)
+def test_a_component_of_one_s_own_agrees_or_is_stepped(component: Component, expected: str) -> None:
+    model = compose((*BASE, component), stack("P-885.51").values)
+    t = times(200, 1e-3)
+    found, way = compare(model, t, voltage("sine", t / t[-1]))
+    assert found <= 2 * RTOL  # the stepper does not look for the jump
+    assert way == expected
+
+
+TONES = [2.5e-4, *(pytest.param(q, marks=slow) for q in (3.1e-4, 1.25e-4, 6.25e-5))]
+
+
+@pytest.mark.parametrize("period", TONES)
+def test_a_tone_whose_period_divides_a_sample_is_seen(period: float) -> None:
+    """It looks constant at start, quarter, half and end of a sample."""
+    values = {**stack("P-885.51").values, "beat_period": period}
+    t = times(200, 1e-3)
+    found, _ = compare(compose((*BASE, BEAT), values), t, voltage("sine", t / t[-1]))
+    assert found <= RTOL
+
+
+@pytest.mark.parametrize("mechanics", ["cascade", "single_mass"])
+@pytest.mark.parametrize(
+    "stack_name",
+    [n if n == "P-885.51" else pytest.param(n, marks=slow) for n in sorted(STACKS)],
+)
+def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Mechanics) -> None:
+    """Corners at samples, given to the reference as breakpoints."""
+    p = stack_values(stack_name, mechanics)
+    corners = np.array([0.0, 0.05, 0.1, 0.101, 0.15, 0.35, 0.4])
+    levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
+    t = times(401, 1e-3)
+    model = compose(BASE if mechanics == "cascade" else SIMPLIFIED, p)
+    found = simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True)
+    assert found.way == EXACT
+    path = reference.from_samples(corners, levels)
+    every = slice(None, None, 10)
+    true = reference.simulate(
+        p, path, t[every], mechanics=mechanics, breakpoints=list(corners), rtol=1e-9
+    )
+    assert error(found.outputs["displacement"][every], true.displacement) <= RTOL
+
+
+@pytest.mark.parametrize("hold", ["linear", "zero"])
+def test_the_base_agrees_with_the_reference_between_and_at_kinks(hold: str) -> None:
+    """120 coarse samples with a corner at each of them."""
+    p = stack_values("P-885.51", "cascade")
+    t = times(121, 1e-4)
+    v = p["u_rated"] * voltage("sine", t / t[-1])
+    held = reference.from_samples(t, v)
+
+    def path(time: float) -> float:
+        return (
+            float(v[np.searchsorted(t, time, side="right") - 1]) if hold == "zero" else held(time)
+        )
+
+    found = simulate(compose(BASE, p), t, v, from_rest_at_zero=True, hold=hold)
+    assert found.way == EXACT
+    true = reference.simulate(p, path, t, breakpoints=list(t[1:-1]), rtol=1e-9)
+    assert error(found.outputs["displacement"], true.displacement) <= RTOL
+
+
+def test_two_runs_have_the_same_bits() -> None:
+
+    model, t = stack("demo"), times(500, 1e-4)
+    u = inputs(model, t, composite(500))
+    x0 = start(model, t, u)
+    runs = [accurate(model, t, u, x0, rtol=RTOL, hold="linear") for _ in range(2)]
+    np.testing.assert_array_equal(runs[0][0].y, runs[1][0].y)
+    assert np.isfinite(runs[0][0].x).all()
