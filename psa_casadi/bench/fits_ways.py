@@ -16,6 +16,7 @@ import numpy.typing as npt
 from psa_casadi.bench.outcome import Progress, TitledTable, share
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.fit import FIT_RTOL
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.phrases import number, plain
@@ -39,8 +40,6 @@ KINKED: dict[str, tuple[tuple[float, float], ...]] = {
 }  # fmt: skip
 MIXED = "sine, ramp, hold, step"
 _SAMPLES, _OUTPUT = 1500, "measured_displacement"
-#: Tolerance of a step of a fit.
-_FIT_RTOL = 1e-6
 _RTOLS = (1e-4, 1e-5, 1e-6)
 _TRUTH, _CHECK = 1e-11, 1e-10
 _LISTED = 20
@@ -147,7 +146,7 @@ def tried(rtols: Sequence[float], repeats: int, trial: Trial) -> list[Reached]:
         doubt = _error(stepped(_CHECK), truth)
     except PsaError:
         return []
-    fit = trace(model, t, u, x0, way=Way(_FIT_RTOL), output=_OUTPUT)
+    fit = trace(model, t, u, x0, way=Way(FIT_RTOL, FIT_RTOL), output=_OUTPUT)
     fitted = fit.way, _error(fit.output, truth)
     found = []
     for rtol in rtols:
@@ -191,7 +190,7 @@ def effects_table(found: Sequence[Reached]) -> TitledTable:
         f"Ways of the effects, one at a time: {MIXED} ({_SAMPLES} samples)",
         Table(head, tuple(rows)),
         f"Of {len(names)} effects {fits} take the exact way in a fit (tolerance of a step"
-        f" {_FIT_RTOL:.0e}); in `simulate` {', '.join(counts)}. The others fall back on the"
+        f" {FIT_RTOL:.0e}); in `simulate` {', '.join(counts)}. The others fall back on the"
         f" stepper at {STEP_SHARE:g} of the tolerance, which is also the peer of the last column."
         f" The last three columns are of `simulate` at {rtols[-1]:.0e}; its time includes the runs"
         f" that judge the error. Errors are against the stepper at {_TRUTH:.0e}.",
