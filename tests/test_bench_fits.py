@@ -87,8 +87,8 @@ def test_errors_above_the_tolerance_are_counted_and_listed() -> None:
     assert stepper[1:] == (
         "stepper", "0 % (0 of 4)", "25 % (1 of 4)", "2.0", "demo, slow creep, steps, 1 ms"
     )  # fmt: skip
-    assert "over its tolerance is 3.0" in errors_table(FOUND).note
-    assert [row[3:5] for row in exceeding_table(FOUND).table.rows] == [("3.0", "2.0")]
+    assert "over its tolerance is 3.00" in errors_table(FOUND).note
+    assert [row[3:5] for row in exceeding_table(FOUND).table.rows] == [("3.00", "2.0")]
 
 
 @pytest.mark.parametrize("record", [MIXED, *KINKED])

@@ -214,7 +214,7 @@ def errors_table(found: Sequence[Reached]) -> TitledTable:
     note = (
         f"{len(trials)} trials: {counts[0]} stacks, {counts[1]} models (the base, and each effect"
         f" alone beside it), {counts[2]} kinds of record. The worst error of `simulate` over its"
-        f" tolerance is {number(worst.over, 2)}; {share(len(above), len(found))} exceed 1. The"
+        f" tolerance is {number(worst.over, 3)}; {share(len(above), len(found))} exceed 1. The"
         f" stepper alone takes the tolerance that `simulate` gives it, {STEP_SHARE:g} of the one"
         " asked for."
     )
@@ -241,7 +241,7 @@ def exceeding_table(found: Sequence[Reached]) -> TitledTable:
     above = sorted((r for r in found if r.over > 1.0), key=lambda r: -r.over)
     rows = tuple(
         (
-            f"{r.rtol:.0e}", _where(r), r.way, number(r.over, 2),
+            f"{r.rtol:.0e}", _where(r), r.way, number(r.over, 3),
             number(r.stepper_error / r.rtol, 2), number(r.doubt / r.rtol, 2),
         )
         for r in above[:_LISTED]
