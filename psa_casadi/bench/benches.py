@@ -22,6 +22,11 @@ BENCHES: dict[str, Bench] = {
             "identification against scipy's least_squares with solve_ivp, and how it grows",
         ),
         _later(
+            "fits",
+            "fits",
+            "exact steps against the stepper: error against time, lanes, effects, whole diagnoses",
+        ),
+        _later(
             "coverage",
             "coverage",
             "identified parameters and their intervals against the truth, over seeds and stacks",
