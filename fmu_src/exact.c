@@ -537,6 +537,24 @@ static void find_drift(psa_state *state, psa_trial *trial, int g, int slopes) {
         stages->drift[i] = choose(uneven, leg->out[0][i] - stages->fast[i] / FAST, REAL(0.0));
 }
 
+/* On a leg to or from a turn the rate goes from 0 to that at its far end: what the states do in time must be the
+   same at the mean and at the far end, or the leg must be so short that it does not count */
+static void check_turn(psa_state *state, psa_trial *trial, int g, int k) {
+    const psa_stages *const stages = trial->stages + g;
+    const psa_leg *const leg = stages->leg + k;
+    const real far = k == 0 ? stages->w[NODES] : stages->w[WHOLE];
+    const bits turned = MASK(stages->turn < 1.0) & MASK(leg->rate != 0.0);
+    const real mean = choose(turned, leg->rate, REAL(1.0)), t = state->t + leg->begin * trial->dt;
+    real fast[EX_GROUP_OUT] = {REAL(0.0)}, out[EX_GROUP_OUT] = {REAL(0.0)};
+    ex_group(g, t, leg->at[0], trial->v[HALF], FAST * mean, state->k, fast);
+    ex_group(g, t, leg->at[0], trial->v[HALF], far, state->k, out);
+    for (int i = 0; i < ex_group_size[g]; ++i) {
+        const real apart = (out[i] - leg->out[0][i]) - fast[i] / FAST * (far - mean) / mean;
+        const real e = leg->dt * v_fabs(apart) / state->nominal[ex_group_states[ex_group_first[g] + i]];
+        set_error(trial, choose(turned, e / state->tolerance, REAL(0.0)));
+    }
+}
+
 static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
     psa_stages *const stages = trial->stages + g;
     const int first = ex_group_first[g], size = ex_group_size[g];
@@ -549,6 +567,7 @@ static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
                 leg->from[q] = stages->leg[k - 1].to[q];
             }
         do_leg(state, trial, g, leg, slopes);
+        if (stages->legs > 1) check_turn(state, trial, g, k);
     }
     const psa_leg *const last = stages->leg + stages->legs - 1;
     for (int i = 0; i < size; ++i) {
