@@ -198,15 +198,16 @@ def test_the_stack_of_the_demonstration_is_what_its_record_gives() -> None:
 def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
     """The named stack meets its record as well as any values of what was identified for it.
 
-    So does the fit, hardly better where it frees masses besides, which the named stack leaves at
-    ordinary values. Offset and memory are fitted.
+    A search from nothing is at least as good. It may be better: it frees masses besides, and in the
+    demonstration's record, half as far off, it takes the hidden creep for a lag of the wafers, with
+    c_P on its bound, which it says. Offset and memory are fitted.
     """
     model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
     y: FloatArray = np.asarray(record.displacement)
     found = fit(model, [whole(record)], [], sigma=[rms])
     again = fit(model, [whole(record)], IDENTIFIED, sigma=[rms])
     assert found.rms == pytest.approx(again.rms, rel=1e-3)
-    assert 0.995 * found.rms < rms < 1.001 * found.rms
+    assert rms < 1.001 * found.rms
     x, _, _ = predict_record(model, record, found.start(0), [],
                              stop=record.n, rtol=1e-8)  # fmt: skip
     assert np.std(x - y) == pytest.approx(found.rms, rel=2e-3)

@@ -40,7 +40,7 @@ class Fit:
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
-    each record was run and how accurately.
+    each record was run and how accurately; it is empty after an interrupt.
     """
 
     model: Model
@@ -183,8 +183,10 @@ def _minimum(
             )
         minimum, theta = found, found.theta
         spent += found.evaluations
+        if minimum.interrupted:  # whoever interrupts does not wait for the error
+            return replace(minimum, evaluations=spent), way, []
         told = simulated(model, experiments, unknowns, theta, way=way)
-        if minimum.interrupted or not any(t.error > a for t, a in zip(told, allowed, strict=True)):
+        if not any(t.error > a for t, a in zip(told, allowed, strict=True)):
             break
     return replace(minimum, evaluations=spent), way, told
 
