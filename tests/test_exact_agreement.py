@@ -93,11 +93,11 @@ def test_the_error_keeps_to_other_tolerances(name: str, rtol: float) -> None:
 
 @pytest.mark.parametrize("name", ["base", "backlash", "voltage_saturation"])
 def test_held_inputs_agree(name: str) -> None:
-    """Every sample begins with a jump; the stepper takes over where its turns are not settled."""
+    """Every sample begins with a jump."""
     relative = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
     found, way = compare(with_effect(name), times(600, 1e-4), relative, hold="zero")
     assert found <= RTOL
-    assert way == (STEPPER if name == "voltage_saturation" else EXACT)
+    assert way == EXACT
 
 
 @pytest.mark.parametrize("name", ["base", "backlash"])
