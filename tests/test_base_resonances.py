@@ -74,22 +74,23 @@ def test_wrong_mechanics_is_found_behind_a_right_force(tmp_path: Path) -> None:
 
 @slow
 def test_mechanics_is_sought_again_where_another_model_is_nearer(tmp_path: Path) -> None:
-    """Two resonances at 5.5 and 5.8 kHz, one of them missed: 3 % above the noise, unnoticed.
+    """Two resonances at 5.5 and 5.8 kHz: a search from the loops misses one, by 17 % of the noise.
 
-    What remains rings at the fast end of the spectrum, from which the noise is estimated.
+    What remains rings at the fast end of the spectrum, from which the noise is estimated. A search
+    from the resonances finds both, so that no mode stands for one of them.
     """
     truth = make_record(None, 95361, tmp_path / "a.csv", excitation="fast")
     record = read_record(tmp_path / "a.csv")
     held = np.arange(record.n) * 16 // record.n % 4 == 3
     experiments = (Experiment(record, record.mask & ~held, record.mask & held),)
     base = fit_base(starting_model([record], None), experiments)
-    lost = from_resonances(base, experiments, _quietly) or base
-    assert retuned(lost, experiments, _quietly) is lost
-    mode = _extended(lost, experiments, "structural_mode")
-    assert mode.evidence > 30.0
-    found = instead_of(lost, mode, experiments, _quietly)
+    assert base.rms > 1.1 * truth.sigma
+    found = from_resonances(base, experiments, _quietly)
     assert found is not None
-    assert found.rms < 1.017 * truth.sigma < lost.rms
+    assert found.rms < 1.017 * truth.sigma
+    assert retuned(found, experiments, _quietly) is found
+    mode = _extended(found, experiments, "structural_mode")
+    assert mode.evidence < 0.0
     # nothing is better than what is found, so that nothing stands for the mode beside it
     assert instead_of(found, mode, experiments, _quietly) is None
 

@@ -70,15 +70,19 @@ def test_a_composite_record_agrees_with_the_stepper(name: str) -> None:
 @pytest.mark.parametrize("stack_name", sorted(STACKS))
 @pytest.mark.parametrize("name", NAMES)
 def test_every_stack_and_voltage_agrees_with_the_stepper(name: str, stack_name: str) -> None:
-    """Two of ten runs may be stepped: play behind a light resonance turns at every swing."""
+    """Two of ten runs may be stepped: play behind a light resonance turns at every swing.
+
+    Three where the loop follows the rate, whose notch at a turn is seen only by the finest steps.
+    """
     model, ways, share = with_effect(name, stack_name), [], np.linspace(0.0, 1.0, SAMPLES)
     for kind in VOLTAGES:
         for step in SAMPLE_TIMES:
             found, way = compare(model, times(SAMPLES, step), voltage(kind, share))
-            # where the stepper was taken it may err by what its own 0.003 rtol a step adds up to
+            # where the stepper was taken it may err by what its own 0.0005 rtol a step adds up to
             assert found <= (RTOL if way == EXACT else 3 * RTOL), (kind, step)
             ways.append(way)
-    assert ways.count(EXACT) >= len(ways) - 2
+    stepped_ones = 3 if name == "rate_dependent_hysteresis" else 2
+    assert ways.count(EXACT) >= len(ways) - stepped_ones
 
 
 @pytest.mark.parametrize("rtol", [1e-5, *(pytest.param(r, marks=slow) for r in (1e-7, 1e-8))])
