@@ -14,7 +14,7 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Names of the two ways in results.
 EXACT, STEPPER = "exact steps", "stepper"
-#: The stepper's tolerance of a step over the tolerance asked of the whole run: with the 0.003 of the
+#: The stepper's tolerance of a step over the one asked of the whole run: with the 0.003 of the
 #: FMU (`fmu_src/instance.c`) clipped voltages and light resonances erred by 3 times what was asked.
 STEP_SHARE, SMALLEST_STEP_RTOL = 0.0005, 1e-12
 #: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
