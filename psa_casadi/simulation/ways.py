@@ -19,7 +19,7 @@ EXACT, STEPPER = "exact steps", "stepper"
 STEP_SHARE, SMALLEST_STEP_RTOL = 0.0005, 1e-12
 #: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
 #: Each is judged by the one before; a turn that one halving misses as well is seen after two.
-_LADDER = ((0.03, 0), (0.01, 2), (3e-3, 4))
+_LADDER = ((0.03, 0), (0.01, 2), (3e-3, 4), (3e-3, 6))
 #: Share of the tolerance to which two runs agree: the finer one may err by a part of it that both
 #: have in common.
 _AGREE = 0.5
