@@ -68,8 +68,8 @@ def write_exact(model: Model, directory: Path) -> Path:
     directory.mkdir(parents=True, exist_ok=True)
     text = generate(split, "measured_displacement")
     (directory / "exact_model.h").write_text(text, encoding="utf-8")
-    for source in ("exact.c", "exact.h", "exact_levels.h", "exact_math.h"):
-        shutil.copy(ROOT / "fmu_src" / source, directory)
+    for source in (ROOT / "fmu_src").glob("exact*"):
+        shutil.copy(source, directory)
     return directory / "exact.c"
 
 

@@ -10,7 +10,6 @@ from psa_casadi.component import Component, Equations
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.start import initial_slope, start_state
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Parameter, State
 from tests.stack_models import stack
@@ -124,12 +123,6 @@ def inputs(model: Model, t: FloatArray, relative: FloatArray) -> FloatArray:
         reference = model.values["temperature_reference"]
         given["temperature"] = reference + 2.0 * np.sin(3.0 * t / t[-1])
     return input_samples(model, len(t), given)
-
-
-def start(model: Model, t: FloatArray, u: FloatArray) -> FloatArray:
-    """Return the state (nx,) that the first inputs and their rates put a record at."""
-    rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
-    return start_state(model, list(u[0]), rates, None, float(t[0])).x
 
 
 def stepped(

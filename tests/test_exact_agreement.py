@@ -15,6 +15,7 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.reference import Mechanics
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.ways import EXACT, STEPPER, accurate
 from tests.exact_cases import (
     BEAT,
@@ -26,7 +27,6 @@ from tests.exact_cases import (
     composite,
     error,
     inputs,
-    start,
     stepped,
     times,
     voltage,
@@ -50,7 +50,7 @@ def compare(
 ) -> tuple[float, str]:
     """Return the error of a run over the range, by a stepper that is far finer, and the way."""
     u = inputs(model, t, relative)
-    x0 = start(model, t, u)
+    x0 = start_on(model, t, u).x
     steps, way = accurate(model, t, u, x0, rtol=rtol, hold=hold)
     shown = steps.y[:, model.output_names.index(OUTPUT)]
     fine = max(1e-4 * rtol, 1e-12)
@@ -214,7 +214,7 @@ def test_two_runs_have_the_same_bits() -> None:
 
     model, t = stack("demo"), times(500, 1e-4)
     u = inputs(model, t, composite(500))
-    x0 = start(model, t, u)
+    x0 = start_on(model, t, u).x
     runs = [accurate(model, t, u, x0, rtol=RTOL, hold="linear") for _ in range(2)]
     np.testing.assert_array_equal(runs[0][0].y, runs[1][0].y)
     assert np.isfinite(runs[0][0].x).all()

@@ -1,16 +1,15 @@
 """Exact steps give the same bits with and without wide vectors, and their C compiles cleanly."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from build_scripts.compile_c import write_exact
-from psa_casadi.simulation.compiler import run_compiler, vector_flags, zig_command
+from psa_casadi.simulation.compiler import vector_flags
 from psa_casadi.simulation.exact import run as exact
-from tests.exact_cases import composite, inputs, start, times, with_effect
+from psa_casadi.simulation.start import start_on
+from tests.exact_cases import composite, inputs, times, with_effect
 
 FloatArray = NDArray[np.float64]
 
@@ -38,7 +37,7 @@ def results(name: str) -> list[FloatArray]:
     u = inputs(model, t, composite(400))
     unknowns: list[str | int] = ["k_L", "A", "R_s", "tau", "k_P"]
     found = exact.run_exact(
-        model, t, u, start(model, t, u), tolerance=1e-7, unknowns=unknowns, everything=True
+        model, t, u, start_on(model, t, u).x, tolerance=1e-7, unknowns=unknowns, everything=True
     )
     arrays = (found.shown, found.sensitivity, found.x, found.y)
     return [np.asarray(a) for a in arrays if a is not None]
@@ -60,13 +59,3 @@ def test_two_runs_have_the_same_bits() -> None:
     for ours, theirs in zip(first, second, strict=True):
         np.testing.assert_array_equal(ours, theirs)
         assert np.isfinite(ours).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lanes", LANES)
-@pytest.mark.parametrize("name", ["base", "load_stiffness"])
-def test_the_c_code_compiles_without_a_warning(name: str, lanes: int, tmp_path: Path) -> None:
-    write_exact(with_effect(name), tmp_path)
-    flags = ["-std=gnu99", "-O2", "-Wall", "-Wextra", "-Werror", f"-DPSA_LANES={lanes}"]
-    run_compiler([*zig_command(), *flags, "-I.", "-c", "exact.c", "-o", "exact.o"], tmp_path)
-    assert (tmp_path / "exact.o").is_file()

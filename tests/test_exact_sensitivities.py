@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.run import run_exact
+from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
-from tests.exact_cases import OUTPUT, composite, inputs, start, times, with_effect
+from tests.exact_cases import OUTPUT, composite, inputs, times, with_effect
 
 FloatArray = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def unknowns_of(name: str, model: Model) -> list[str | int]:
 def record(model: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
     t = times(SAMPLES, STEP)
     u = inputs(model, t, composite(SAMPLES))
-    return t, u, start(model, t, u)
+    return t, u, start_on(model, t, u).x
 
 
 def initial(model: Model, unknowns: list[str | int]) -> FloatArray:

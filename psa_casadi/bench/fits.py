@@ -28,7 +28,7 @@ from psa_casadi.report.tables import Table
 from psa_casadi.simulation.exact.run import LANES, run_exact, run_sets
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run as run_stepper
 from psa_casadi.simulation.ways import EXACT, STEPPER
 
@@ -80,9 +80,7 @@ class Task:
 
     def start(self, model: Model) -> tuple[FloatArray, FloatArray]:
         """Return the initial state (nx,) and its derivatives by the unknowns (nx, k)."""
-        t, u = self.time, self.inputs
-        rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
-        found = start_state(model, list(u[0]), rates)
+        found = start_on(model, self.time, self.inputs)
         return found.x, found.by_parameter[:, [model.parameter_names.index(n) for n in FREE]]
 
 

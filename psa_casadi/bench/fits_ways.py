@@ -23,7 +23,7 @@ from psa_casadi.report.phrases import number, plain
 from psa_casadi.report.tables import Table
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import input_samples, simulate
-from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
 from psa_casadi.simulation.ways import EXACT, STEP_SHARE, STEPPER, Way, trace
 
@@ -135,7 +135,7 @@ def tried(rtols: Sequence[float], repeats: int, trial: Trial) -> list[Reached]:
     if "temperature" in model.input_names:
         given["temperature"] = 293.15 + 2.0 * np.sin(3.0 * t / t[-1])
     u = input_samples(model, len(t), given)
-    x0 = start_state(model, list(u[0]), [initial_slope(t, c) for c in u.T]).x
+    x0 = start_on(model, t, u).x
     shown = model.output_names.index(_OUTPUT)
 
     def stepped(rtol: float) -> FloatArray:

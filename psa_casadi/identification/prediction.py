@@ -17,6 +17,7 @@ from psa_casadi.simulation.start import (
     initial_slope,
     memory_names,
     settling_time,
+    start_on,
     start_state,
 )
 from psa_casadi.simulation.ways import Traced, Way, trace
@@ -79,11 +80,8 @@ def trace_record(
     """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
     names = model.state_names
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
-    rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
     memories = memory_names(model.structure)
-    found = start_state(
-        model, list(u[0]), rates, {n: start.get(n, 0.0) for n in memories}, float(t[0])
-    )
+    found = start_on(model, t, u, {n: start.get(n, 0.0) for n in memories})
     x0, searched = found.x.copy(), [names.index(n) for n in start]
     by_start = np.zeros((len(names), len(start)))
     for column, name in enumerate(start):

@@ -11,7 +11,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_sets
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way, output_of, trace
 
@@ -39,17 +39,13 @@ def simulate_many(
         raise InputError(["The model has no displacement; use `run` for models of other kinds."])
     models = [model.with_values(values) for values in sets]
     t, u = record.time - record.time[0], record_inputs(model, record, record.n)
-    rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
-
-    def start(one: Model) -> FloatArray:
-        return start_state(one, list(u[0]), rates, None, float(t[0])).x
 
     def lanes(group: Sequence[Model]) -> FloatArray:
         p, x0, nominal = (
             np.array(rows).T
             for rows in (
                 [m.parameter_vector() for m in group],
-                [start(m) for m in group],
+                [start_on(m, t, u).x for m in group],
                 [m.state_nominals() for m in group],
             )
         )
@@ -59,9 +55,8 @@ def simulate_many(
 
     def alone(one: Model) -> FloatArray:
         try:
-            return trace(
-                one, t, u, start(one), way=Way(rtol, rtol, stepped=True), output=output
-            ).output
+            x0, way = start_on(one, t, u).x, Way(rtol, rtol, stepped=True)
+            return trace(one, t, u, x0, way=way, output=output).output
         except SimulationError:
             return np.full(record.n, np.nan)
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from psa_casadi.errors import Problems
 from psa_casadi.experiment.record import Record
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import Steps
 from psa_casadi.simulation.ways import accurate
 
@@ -69,8 +69,7 @@ def simulate(
     u = input_samples(model, len(t), given)
     x0 = np.zeros(len(model.state_names))
     if not from_rest_at_zero:
-        rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
-        x0 = start_state(model, list(u[0]), rates, memory, float(t[0])).x
+        x0 = start_on(model, t, u, memory).x
     return _trajectory(model, t, v, *accurate(model, t, u, x0, rtol=rtol, hold=hold))
 
 

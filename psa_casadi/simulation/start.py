@@ -47,6 +47,17 @@ def initial_slope(t: FloatArray, v: FloatArray) -> float:
     return 0.0
 
 
+def start_on(
+    model: Model, t: FloatArray, u: FloatArray, memory: Mapping[str, float] | None = None
+) -> Start:
+    """Return the initial state for samples u (n, nu) at times t (n,) [s].
+
+    The first inputs and the rates at which they begin put the model there (`start_state`).
+    """
+    rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
+    return start_state(model, list(u[0]), rates, memory, float(t[0]))
+
+
 def start_state(
     model: Model,
     inputs: Sequence[float],

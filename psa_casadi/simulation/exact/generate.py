@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Expression
+from psa_casadi.simulation.exact.dependence import closure
 from psa_casadi.simulation.exact.emit import Printer
-from psa_casadi.simulation.exact.split import Split, closure
+from psa_casadi.simulation.exact.split import Split
 
 _KINDS = {"group": "EX_GROUP", "port": "EX_PORT", "loop": "EX_LOOP"}
 

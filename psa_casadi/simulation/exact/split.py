@@ -12,20 +12,24 @@ along one driver are evaluated in the order in which they feed each other; a por
 what it depends on (a load's stiffness) is solved for.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
-from scipy.sparse.csgraph import connected_components
 
 from psa_casadi.component import Expression
 from psa_casadi.model.structure import Structure
-
-BoolArray = npt.NDArray[np.bool_]
-
+from psa_casadi.simulation.exact.dependence import (
+    BoolArray,
+    closure,
+    dependence,
+    others,
+    variables,
+)
+from psa_casadi.simulation.exact.order import Item, NoSplit, Port, order_of
+from psa_casadi.simulation.exact.paths import Group, along, groups_along
 
 #: Operations whose value jumps.
 _JUMPS = frozenset(
@@ -34,50 +38,19 @@ _JUMPS = frozenset(
 )
 
 
-class NoSplit(Exception):  # noqa: N818 - it says that a form does not fit, which is no mistake
-    """The model does not have the form of exact steps; the message says why."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """States along the path of one driver, by their indices in the model's state vector.
-
-    `rate` is the symbol that stands for the driver's rate in `slopes`, the states' derivatives.
-    """
-
-    driver: int
-    states: tuple[int, ...]
-    rate: Expression
-    slopes: Expression
-
-
-@dataclass(frozen=True)
-class Port:
-    """What the linear part leaves of one state's derivative.
-
-    `chord` is the driver along whose path the port varies, -1 if there is none.
-    """
-
-    state: int
-    value: Expression
-    feedback: bool
-    chord: int
-
-
 @dataclass(frozen=True, eq=False)
 class Split:
     """The parts of a model by their indices in its state vector.
 
-    `linear` are the states of L. `order` lists what is evaluated one after the other: a group (its
-    index), a port or ports that are solved for together (their indices). M (nL, nL), B (nL, nu) and
-    c (nL,) depend on the parameters alone.
+    `linear` are the states of L. `order` lists what is evaluated one after the other. M (nL, nL),
+    B (nL, nu) and c (nL,) depend on the parameters alone.
     """
 
     structure: Structure
     linear: tuple[int, ...]
     groups: tuple[Group, ...]
     ports: tuple[Port, ...]
-    order: tuple[tuple[str, tuple[int, ...]], ...]
+    order: tuple[Item, ...]
     matrices: tuple[Expression, Expression, Expression]
 
     @property
@@ -101,12 +74,12 @@ def _split(s: Structure) -> Split:
     if not s.states:
         raise NoSplit("it has no states")
     _check_smooth(s)
-    depends = _depends(s.xdot, s.x)  # [k, j]: x_k' depends on x_j
+    depends = dependence(s.xdot, s.x)  # [k, j]: x_k' depends on x_j
     reach = closure(depends)
     moving = [i for i in range(len(s.states)) if not _constant_slopes(s, i)]
-    alone = [i for i in moving if not any(reach[i, j] and reach[j, i] for j in _others(s, i))]
-    found = {i: g for i in alone if (g := _along(s, i, reach)) is not None}
-    groups = _groups(found)
+    alone = [i for i in moving if not any(reach[i, j] and reach[j, i] for j in others(s, i))]
+    found = {i: g for i in alone if (g := along(s, i, reach)) is not None}
+    groups = groups_along(found)
     # what feeds comes before what it feeds: M is block triangular
     linear = tuple(
         sorted(
@@ -117,8 +90,7 @@ def _split(s: Structure) -> Split:
     matrices, remainders = _linear_part(s, linear)
     ports = _ports(s, linear, remainders, groups, reach)
     _check_switches(s, groups)
-    split = Split(s, linear, groups, ports, (), matrices)
-    return Split(s, linear, groups, ports, _order(s, split, reach), matrices)
+    return Split(s, linear, groups, ports, order_of(s, groups, ports, reach), matrices)
 
 
 def _check_smooth(s: Structure) -> None:
@@ -129,92 +101,11 @@ def _check_smooth(s: Structure) -> None:
             raise NoSplit("its equations jump")
 
 
-def _others(s: Structure, i: int) -> Iterable[int]:
-    return (j for j in range(len(s.states)) if j != i)
-
-
-def _depends(of: Expression, on: Expression) -> BoolArray:
-    """Return which rows of an expression depend on which symbols, shape (rows, symbols)."""
-    return np.array(ca.DM(ca.jacobian_sparsity(of, on), 1).full(), dtype=bool)
-
-
-def closure(depends: BoolArray) -> BoolArray:
-    """Return [k, j]: a change of j reaches k sooner or later; each reaches itself."""
-    reach = depends | np.eye(len(depends), dtype=bool)
-    for _ in range(len(depends).bit_length()):
-        reach = (reach.astype(int) @ reach.astype(int)) > 0
-    return reach
-
-
-def _variables(s: Structure) -> Expression:
-    return ca.vertcat(s.x, s.u, s.time)
-
-
 def _constant_slopes(s: Structure, i: int) -> bool:
     """Whether x_i' is affine in states, inputs and time with constant coefficients."""
-    everything = _variables(s)
+    everything = variables(s)
     slopes = ca.jacobian(s.xdot[i], everything)
     return not ca.depends_on(slopes, everything)
-
-
-def _along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Expression] | None:
-    """Return driver, rate symbol and slope of a state that rests where its driver rests.
-
-    With the driver's rate at zero its derivative may depend on nothing but the state itself, and on
-    that linearly (a heat that decays).
-    """
-    rates = {j: name for j in _others(s, i) if (name := _rate_name(s, j)) is not None}
-    for driver, name in rates.items():
-        if not reach[i, driver] or reach[driver, i]:
-            continue
-        rate = ca.SX.sym("rate")
-        keep = {name} if name in s.balances else set()
-        slope = _resolved(s, s.der[s.states[i].name], keep)
-        slope = ca.substitute(slope, s.symbols[name], rate)
-        if ca.depends_on(slope, s.time):
-            continue
-        if not ca.depends_on(slope, rate):
-            continue
-        resting = ca.substitute(slope, rate, ca.SX(0))
-        everything = ca.vertcat(s.x[list(_others(s, i))], s.u, s.time)
-        own = ca.jacobian(resting, s.x[i])
-        if not ca.depends_on(resting, everything) and not ca.depends_on(own, s.x[i]):
-            return driver, rate, slope
-    return None
-
-
-def _rate_name(s: Structure, i: int) -> str | None:
-    """Return the name of the balance or state that is a state's derivative, if there is one."""
-    derivative: Expression = ca.SX(s.der[s.states[i].name])
-    return str(derivative.name()) if derivative.is_symbolic() else None
-
-
-def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expression:
-    """Return an expression with all balances but those kept substituted."""
-    names = [n for n in s.balances if n not in keep]
-    symbols, sums = [s.symbols[n] for n in names], [s.balances[n] for n in names]
-    unused = [q for n, q in s.symbols.items() if n not in s.balances and _is_balance(s, n)]
-    result = ca.substitute([ca.SX(expression)], unused, [ca.SX(0)] * len(unused))[0]
-    while any(ca.depends_on(result, q) for q in symbols):
-        result = ca.substitute([result], symbols, sums)[0]
-        result = ca.substitute([result], unused, [ca.SX(0)] * len(unused))[0]
-    return result
-
-
-def _is_balance(s: Structure, name: str) -> bool:
-    tables = (s.states, s.inputs, s.parameters, s.sampled)
-    return name != "time" and all(name not in [q.name for q in table] for table in tables)
-
-
-def _groups(found: dict[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
-    drivers = sorted({driver for driver, *_ in found.values()})
-    groups = []
-    for driver in drivers:
-        states = tuple(i for i, (d, *_) in found.items() if d == driver)
-        rate = found[states[0]][1]
-        slopes = [ca.substitute(found[i][2], found[i][1], rate) for i in states]
-        groups.append(Group(driver, states, rate, ca.vertcat(*slopes)))
-    return tuple(groups)
 
 
 def _linear_part(
@@ -223,7 +114,7 @@ def _linear_part(
     """Return M, B, c at the origin, and what they leave of each row."""
     rows = list(linear)
     xdot, x = s.xdot[rows], s.x[rows]
-    everything = _variables(s)
+    everything = variables(s)
     origin = ca.SX.zeros(everything.numel())
     blocks = [ca.jacobian(xdot, x), ca.jacobian(xdot, s.u), xdot]
     m, b, c = (ca.densify(q) for q in ca.substitute(blocks, [everything], [origin]))
@@ -264,9 +155,9 @@ def _ports(
 ) -> tuple[Port, ...]:
     ports = []
     for state, value in zip(linear, remainders, strict=True):
-        if not ca.depends_on(value, _variables(s)):
+        if not ca.depends_on(value, variables(s)):
             continue
-        read = [int(j) for j in np.flatnonzero(_depends(value, s.x)[0])]
+        read = [int(j) for j in np.flatnonzero(dependence(value, s.x)[0])]
         feedback = any(reach[j, state] for j in read)
         if feedback and any(j in g.states for g in groups for j in read):
             raise NoSplit("a hysteresis lies in a loop")
@@ -285,47 +176,3 @@ def _check_switches(s: Structure, groups: Sequence[Group]) -> None:
     for name, expression in s.switches.items():
         if not any(ca.is_equal(expression, rate, 20) for rate in rates):
             raise NoSplit(f"its equations have a kink of their own ({name})")
-
-
-def _order(s: Structure, split: Split, reach: BoolArray) -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """Return the order in which groups and ports are evaluated, each after what feeds it."""
-    items: list[tuple[str, tuple[int, ...]]] = [("group", (k,)) for k in range(len(split.groups))]
-    _, label = connected_components(reach & reach.T, directed=False)
-    loops: dict[int, list[int]] = {}
-    for k, port in enumerate(split.ports):
-        if port.feedback:
-            loops.setdefault(int(label[port.state]), []).append(k)
-        else:
-            items.append(("port", (k,)))
-    items += [("loop", tuple(ks)) for ks in loops.values()]
-    feeds = [_feeds(split, item) for item in items]
-    reads = [_reads(s, split, item) for item in items]
-    waiting, done = list(range(len(items))), []
-    while waiting:
-        ready = [
-            k
-            for k in waiting
-            if not any(reach[r, f] for o in waiting if o != k for f in feeds[o] for r in reads[k])
-        ]
-        if not ready:
-            raise NoSplit("its nonlinear parts feed each other in a loop")
-        done += ready
-        waiting = [k for k in waiting if k not in ready]
-    return tuple(items[k] for k in done)
-
-
-def _feeds(split: Split, item: tuple[str, tuple[int, ...]]) -> list[int]:
-    kind, members = item
-    if kind == "group":
-        return list(split.groups[members[0]].states)
-    return [split.ports[k].state for k in members]
-
-
-def _reads(s: Structure, split: Split, item: tuple[str, tuple[int, ...]]) -> list[int]:
-    kind, members = item
-    if kind == "group":
-        group = split.groups[members[0]]
-        inside = np.any(_depends(group.slopes, s.x), axis=0)
-        return [int(j) for j in np.flatnonzero(inside) if j not in group.states] + [group.driver]
-    inside = np.any([_depends(split.ports[k].value, s.x)[0] for k in members], axis=0)
-    return [int(j) for j in np.flatnonzero(inside)]

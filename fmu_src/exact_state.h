@@ -1,0 +1,120 @@
+/* Exact steps: what a step under trial and a run are made of (exact.c). */
+#ifndef PSA_EXACT_STATE_H
+#define PSA_EXACT_STATE_H
+
+#include "exact.h"
+#include "exact_model.h"
+#include "exact_levels.h"
+
+#define SLOWS 0.8        /* a driver whose rate falls to less than this share of it may come to rest */
+#define FAST 1e3         /* over the driver's rate: there what a state does in time is nothing */
+#define GROWS 0.03       /* of the tolerance: the next step may be twice as long */
+#define TURNS 8          /* iterations for the instant at which a driver turns */
+#define LOST 1e6         /* times the tolerance: an error of the finest step from which nothing can be told */
+#define BENDS 0.05       /* of its way: a driver's course that bends by more is not a smooth one */
+#define UNEVEN 2e-3      /* share of its way by which a driver is off the middle at the half of a step */
+#define NEWTON_LIMIT 12
+#define STILL 1e-9       /* of its nominal size: a driver's way along which nothing can be told */
+
+/* Columns of sensitivities, four at a time; with lanes there are none */
+#if PSA_LANES == 1
+typedef double column __attribute__((vector_size(32), aligned(8)));
+#define COLUMNS 4
+#else
+typedef real column;
+#define COLUMNS 1
+#endif
+
+enum { WHOLE, HALF, QUARTER, NODES };
+
+/* One leg of a group's way, on which its driver does not turn, with what the derivatives need */
+typedef struct {
+    real begin, dt;                       /* share of the step at which it begins; its duration */
+    real from[EX_NX], to[EX_NX];          /* path variables at both ends, states at both ends */
+    real at[4][EX_NX];                    /* path variables and states of the four evaluations */
+    real out[4][EX_GROUP_OUT];            /* slopes and their partial derivatives */
+    real last[EX_NX];                     /* slopes at the end */
+    real rate, way;                       /* mean rate of the driver, its way */
+    int stages;                           /* 4, or 2 where the way is short */
+} psa_leg;
+
+/* A group's way: one leg, or two where the driver turns at the share `turn` of the step */
+typedef struct {
+    psa_leg leg[2];
+    int legs;
+    real w[NODES + 1], turn;              /* the driver's rate at whole, half, quarter, start */
+    real share[NODES];                    /* of the leg's way at the nodes */
+    int on[NODES];                        /* the leg of each node; with lanes only the first counts */
+    real basis[6];                        /* Hermite's, at the turn */
+    real missed;                          /* error of the driver's value there */
+    int drifts;                           /* what the states do in time is told apart at the nodes */
+    real drift[EX_NX], fast[EX_GROUP_OUT]; /* their slopes in time, and all slopes at a great rate */
+    real rate_slopes[NODES + 1][EX_RATE_OUT];
+} psa_stages;
+
+/* Change over a step and bend inside it of a driver and of a port, and what sigma is a ratio over */
+typedef struct {
+    real way, bend, change, bent, over;
+} psa_chord;
+
+/* Everything of one step under trial */
+typedef struct {
+    const psa_level *level;
+    real dt, t[NODES];
+    real v0[EX_NU + 1], v[NODES][EX_NU + 1], dv[EX_NU + 1];
+    real l[ROWS], x[NODES][EX_NX];
+    real port[NODES][EX_NPORT + 1];       /* values */
+    real slopes[NODES][EX_NPORT + 1][EX_PORT_OUT]; /* values and partial derivatives */
+    psa_chord chords[EX_NCH + 1];
+    real chord[EX_NCH + 1], beyond[EX_NCH + 1][NL]; /* sigma, and the response to u(t) beyond the parabola */
+    psa_stages stages[EX_NG + 1];
+    real error;                           /* over the tolerance */
+} psa_trial;
+
+/* A partial derivative that counts: by a state (kind 0), the rate (1), or straight into a column (2); the
+   list ends with kind -1 */
+typedef struct {
+    short kind, index, entry;
+} psa_active;
+
+/* Where the lanes stand within a sample, the levels of their next steps, and which have come to an end */
+typedef struct {
+    long at[PSA_LANES];
+    int level[PSA_LANES], dead[PSA_LANES];
+} psa_pace;
+
+typedef struct {
+    psa_exact *run;
+    real t, x[EX_NX], port[EX_NPORT + 1], start_slopes[EX_NPORT + 1][EX_PORT_OUT];
+    real p[EX_NP + 1], k[EX_NK + 1];
+    real nominal[EX_NX], inverse_nominal[NL], tolerance, brief;
+    psa_ladder *ladders;                  /* [lengths][lanes] */
+    psa_level *levels;                    /* [lengths][finest + 1][1 + thetas] */
+    psa_level *mixed;                     /* of lanes whose levels differ */
+    char *ready;                          /* [lengths][finest + 1] */
+    double scale[PSA_LANES][NL];
+    int thetas;                           /* unknown parameters of the linear part */
+    int theta_column[EX_NTHETA + 1];
+    int column_of[EX_NP + 1];             /* -1: not asked for */
+    int blocks;                           /* of columns */
+    column *s, *sport;                    /* [EX_NX][blocks], [EX_NPORT][blocks] */
+    column *node, *snode_port, *scratch;  /* work of one step */
+    column *direct;                       /* [NL + EX_NEED][blocks]: of the matrices' own derivatives */
+    psa_active group_list[EX_NX + 1][EX_GROUP_OUT + 1], port_list[EX_NPORT + 1][EX_PORT_OUT + 1],
+        rate_list[EX_NG + 1][EX_RATE_OUT + 1], shown_list[EX_SHOWN_OUT + 1];
+    psa_trial trial;
+} psa_state;
+
+static int any(bits mask) {
+    int found = 0;
+    for (int lane = 0; lane < PSA_LANES; ++lane) found |= LANE(mask, lane) != 0;
+    return found;
+}
+
+static void set_error(psa_trial *trial, real error) {
+    /* a number that is not finite counts as an infinite error */
+    const bits fine = MASK(error <= 1e300);
+    trial->error = v_fmax(trial->error, choose(fine, error, REAL(1e300)));
+}
+
+#endif
