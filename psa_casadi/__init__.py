@@ -24,39 +24,39 @@ from psa_casadi.version import __version__
 if TYPE_CHECKING:
     from psa_casadi import datasets
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-    from psa_casadi.diagnosis.diagnose import diagnose
-    from psa_casadi.diagnosis.result import Diagnosis
-    from psa_casadi.effects import EFFECTS
-    from psa_casadi.errors import InputError, PsaError
-    from psa_casadi.experiment import Record, read_record, read_records, write_record
-    from psa_casadi.export.check import CheckReport, check_fmu
-    from psa_casadi.export.fmu import export_fmu
-    from psa_casadi.export.modelica import export_modelica
-    from psa_casadi.export.ssp import export_ssp
-    from psa_casadi.identification.identify import Identification, identify
-    from psa_casadi.input_design.mechanism import (
+    from psa_casadi.design.mechanism.mechanism import (
         design_mechanism,
         mechanism_model,
         port_model,
     )
-    from psa_casadi.input_design.observer import FeedForward, HysteresisObserver, stack_values
-    from psa_casadi.input_design.recursive_least_squares import (
+    from psa_casadi.design.online.observer import FeedForward, HysteresisObserver, stack_values
+    from psa_casadi.design.online.recursive_least_squares import (
         AdaptiveFeedForward,
         OnlineIdentification,
         identifier_for,
     )
+    from psa_casadi.diagnosis.diagnose import diagnose
+    from psa_casadi.diagnosis.result import Diagnosis
+    from psa_casadi.effects import EFFECTS
+    from psa_casadi.errors import InputError, PsaError
+    from psa_casadi.export.check.check import CheckReport, check_fmu
+    from psa_casadi.export.fmu.archive import export_fmu
+    from psa_casadi.export.modelica.package import export_modelica
+    from psa_casadi.export.ssp.archive import export_ssp
+    from psa_casadi.identification.identify import Identification, identify
     from psa_casadi.model.compose import Model, compose
-    from psa_casadi.model.from_casadi import ode_model
+    from psa_casadi.model.from_casadi.ode_model import ode_model
     from psa_casadi.model.model_file import load_model, save_model
-    from psa_casadi.model.nanopositioner import nanopositioner
     from psa_casadi.model.parts import PARTS, compensator_for, part_model
     from psa_casadi.model.stacks import STACKS, stack_model
-    from psa_casadi.model.system import System, connect
-    from psa_casadi.model.tuning import controller_for, margins_of
-    from psa_casadi.report.figure import save_figure
-    from psa_casadi.report.fit_page import write_fit_report
-    from psa_casadi.report.page import write_report
-    from psa_casadi.report.text import story
+    from psa_casadi.model.system.nanopositioner import nanopositioner
+    from psa_casadi.model.system.system import System, connect
+    from psa_casadi.model.system.tuning import controller_for, margins_of
+    from psa_casadi.records import Record, read_record, read_records, write_record
+    from psa_casadi.report.page.diagnosis import write_report
+    from psa_casadi.report.page.fit_page import write_fit_report
+    from psa_casadi.report.plots.figure import save_figure
+    from psa_casadi.report.words.text import story
     from psa_casadi.simulation.many import simulate_many
     from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
     from psa_casadi.simulation.stepper import run
@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
 #: Where each public name lives.
 _HOMES = {
-    "psa_casadi.experiment": (
+    "psa_casadi.records": (
         "Record",
         "read_record",
         "read_records",
@@ -85,17 +85,17 @@ _HOMES = {
         "Model",
         "compose",
     ),
-    "psa_casadi.input_design.mechanism": (
+    "psa_casadi.design.mechanism.mechanism": (
         "design_mechanism",
         "mechanism_model",
         "port_model",
     ),
-    "psa_casadi.input_design.observer": (
+    "psa_casadi.design.online.observer": (
         "FeedForward",
         "HysteresisObserver",
         "stack_values",
     ),
-    "psa_casadi.input_design.recursive_least_squares": (
+    "psa_casadi.design.online.recursive_least_squares": (
         "AdaptiveFeedForward",
         "OnlineIdentification",
         "identifier_for",
@@ -105,16 +105,16 @@ _HOMES = {
         "part_model",
         "compensator_for",
     ),
-    "psa_casadi.model.tuning": (
+    "psa_casadi.model.system.tuning": (
         "controller_for",
         "margins_of",
     ),
-    "psa_casadi.model.system": (
+    "psa_casadi.model.system.system": (
         "System",
         "connect",
     ),
-    "psa_casadi.model.nanopositioner": ("nanopositioner",),
-    "psa_casadi.model.from_casadi": ("ode_model",),
+    "psa_casadi.model.system.nanopositioner": ("nanopositioner",),
+    "psa_casadi.model.from_casadi.ode_model": ("ode_model",),
     "psa_casadi.variables": (
         "Input",
         "Output",
@@ -142,14 +142,14 @@ _HOMES = {
     ),
     "psa_casadi.diagnosis.diagnose": ("diagnose",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),
-    "psa_casadi.report.text": ("story",),
-    "psa_casadi.report.figure": ("save_figure",),
-    "psa_casadi.report.page": ("write_report",),
-    "psa_casadi.report.fit_page": ("write_fit_report",),
-    "psa_casadi.export.fmu": ("export_fmu",),
-    "psa_casadi.export.modelica": ("export_modelica",),
-    "psa_casadi.export.ssp": ("export_ssp",),
-    "psa_casadi.export.check": (
+    "psa_casadi.report.words.text": ("story",),
+    "psa_casadi.report.plots.figure": ("save_figure",),
+    "psa_casadi.report.page.diagnosis": ("write_report",),
+    "psa_casadi.report.page.fit_page": ("write_fit_report",),
+    "psa_casadi.export.fmu.archive": ("export_fmu",),
+    "psa_casadi.export.modelica.package": ("export_modelica",),
+    "psa_casadi.export.ssp.archive": ("export_ssp",),
+    "psa_casadi.export.check.check": (
         "CheckReport",
         "check_fmu",
     ),

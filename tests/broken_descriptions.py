@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from psa_casadi.export.variable_table import variable_table
+from psa_casadi.export.common.variable_table import variable_table
 from tests.fmu_models import model_named
 
 STACK = "P-885.51"

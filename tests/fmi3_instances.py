@@ -6,8 +6,9 @@ from ctypes import c_bool, c_double, c_size_t
 from functools import cache
 from typing import Any, Self
 
-from psa_casadi.export import fmu_instance3
-from psa_casadi.export.fmu_instance import CO_SIMULATION, MODEL_EXCHANGE, OK, Fmu
+from psa_casadi.export.importer import instance3
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, OK, Fmu
+from psa_casadi.export.importer.library import Library
 from tests.fmu_models import exported
 
 
@@ -17,10 +18,10 @@ def loaded(name: str) -> Fmu:
     return Fmu(exported(name, 3))
 
 
-class Instance3(fmu_instance3.Instance3):
+class Instance3(instance3.Instance3):
     """One instance; what it does not succeed in raises FmuError, what is tried returns a status."""
 
-    def __init__(self, fmu: Fmu, interface: int = CO_SIMULATION, **changes: Any) -> None:
+    def __init__(self, fmu: Library, interface: int = CO_SIMULATION, **changes: Any) -> None:
         super().__init__(fmu, interface, **changes)
 
     def call(self, function: str, *arguments: Any) -> int:

@@ -11,7 +11,7 @@ from lxml import etree  # type: ignore[import-untyped]
 
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.fmu import export_fmu, write_archive
+from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.experiment import Record, read_record
-from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.certainty.determinacy import covariance_of
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.records import Record, read_record
+from psa_casadi.records.split import Experiment
 from tests.plants.make import Truth, make_record
 from tests.plants.stack import Stack, loop_width
 

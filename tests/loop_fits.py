@@ -5,13 +5,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.bench.records import LOOP_FREQUENCIES, loop_voltage
-from psa_casadi.experiment import Record
-from psa_casadi.experiment.split import Experiment, whole
-from psa_casadi.identification.determinacy import Determinacy, determinacy
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
+from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import Model
+from psa_casadi.records import Record
+from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.simulate import simulate
+from tests.benchmarks.records import LOOP_FREQUENCIES, loop_voltage
 from tests.stack_models import stack
 
 FloatArray = NDArray[np.float64]

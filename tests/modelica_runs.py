@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.modelica import modelica_text
+from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.simulation.stepper import run

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi import reference
-from psa_casadi.experiment import Record, sine, time_grid
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import Record, sine, time_grid
 
 FloatArray = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
-from psa_casadi.export.platforms import chosen_platforms
+from psa_casadi.export.fmu.platforms import chosen_platforms
 
 _FOLDER = tempfile.TemporaryDirectory()
 

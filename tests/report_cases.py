@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.misfit import Misfit, misfit
-from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor
+from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor
+from psa_casadi.diagnosis.residual.misfit import Misfit, misfit
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
@@ -21,14 +21,14 @@ from psa_casadi.diagnosis.result import (
     Verdict,
 )
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment import Record, multisine, sine, time_grid
-from psa_casadi.experiment.split import Experiment, split, whole
-from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import Simulated, measured
+from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.identification.identify import Identification, identify
-from psa_casadi.identification.prediction import Simulated, measured
-from psa_casadi.identification.unknowns import unknowns_of
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.report.series import Curve, Series
+from psa_casadi.records import Record, multisine, sine, time_grid
+from psa_casadi.records.split import Experiment, split, whole
+from psa_casadi.report.words.series import Curve, Series
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import EXACT, Way
 from psa_casadi.units import FloatArray

@@ -4,7 +4,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from psa_casadi.export.fmu import export_fmu
+from psa_casadi.export.fmu.archive import export_fmu
 from tests.sampled_models import controller, loop
 
 _FOLDER = tempfile.TemporaryDirectory()

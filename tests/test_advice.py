@@ -2,14 +2,14 @@
 
 import pytest
 
-from psa_casadi.bench.records import loop_voltage
-from psa_casadi.experiment import Record
-from psa_casadi.experiment.split import whole
-from psa_casadi.identification.advice import FORCE_ADVICE, Advice, advice
-from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.fit import fit
-from psa_casadi.identification.plans import plans, quantity
-from psa_casadi.identification.scenarios import scenarios
+from psa_casadi.identification.advice.advice import FORCE_ADVICE, Advice, advice
+from psa_casadi.identification.advice.plans import plans, quantity
+from psa_casadi.identification.advice.scenarios import scenarios
+from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.records import Record
+from psa_casadi.records.split import whole
+from tests.benchmarks.records import loop_voltage
 from tests.loop_fits import FREE, NOISE, loops, measured
 from tests.stack_models import stack
 from tests.tiers import slow_but

@@ -7,18 +7,18 @@ import pytest
 
 from psa_casadi.cli import diagnose as command
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.contenders import one_of_each
+from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.evidence import levelled
+from psa_casadi.diagnosis.screening.evidence import levelled
+from psa_casadi.diagnosis.search.contenders import one_of_each
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.experiment.reading import read_record
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import split
-from psa_casadi.identification.fit import fit
-from psa_casadi.input_design.experiment import resolving_experiment
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import compose
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import split
 from psa_casadi.simulation.simulate import simulate
 from tests.plants.make import make_record
 from tests.tiers import slow

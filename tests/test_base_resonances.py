@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psa_casadi.diagnosis.base_fit.retries import from_band, from_resonances, instead_of
+from psa_casadi.diagnosis.base_fit.ringing import ringing
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.extension import Extension, extend, polish
-from psa_casadi.diagnosis.retries import from_band, from_resonances, instead_of
-from psa_casadi.diagnosis.ringing import ringing
-from psa_casadi.diagnosis.rounds import examine
-from psa_casadi.diagnosis.selection import starts_of
+from psa_casadi.diagnosis.search.extension import Extension, extend, polish
+from psa_casadi.diagnosis.search.rounds import examine
+from psa_casadi.diagnosis.search.selection import starts_of
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment.reading import read_record
-from psa_casadi.experiment.split import Experiment, split
-from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.force_start import retuned
-from psa_casadi.identification.refitting import quick_rtol
-from psa_casadi.identification.search import fit_base
-from psa_casadi.identification.starting import starting_model
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.search.force_start import retuned
+from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search.refitting import quick_rtol
+from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.split import Experiment, split
 from psa_casadi.simulation.simulate import simulate_record
 from tests.plants.excitations import ExcitationKind
 from tests.plants.make import Truth, make_record

@@ -1,11 +1,11 @@
-"""What `psa bench diagnose` counts: on cases made up here, so that every figure can be told."""
+"""What the benchmark `diagnose` counts: on cases made up here, so that every figure can be told."""
 
 import pytest
 
-from psa_casadi.bench.hidden import result_tables
-from psa_casadi.bench.hidden_cases import Case, Found, Kind
-from psa_casadi.bench.hidden_figure import RELIABILITY, in_class, picture
-from psa_casadi.bench.hidden_gain import Covered, intervals_table
+from tests.benchmarks.hidden import result_tables
+from tests.benchmarks.hidden_cases import Case, Found, Kind
+from tests.benchmarks.hidden_figure import RELIABILITY, in_class, picture
+from tests.benchmarks.hidden_gain import Covered, intervals_table
 
 KNOWN, FOREIGN = ("slow_creep", "offset_drift"), ("dry_friction",)
 

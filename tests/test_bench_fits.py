@@ -1,14 +1,19 @@
-"""What `psa bench fits` counts and prints: on figures made up here, so that all can be told."""
+"""What the benchmark `fits` counts and prints: on figures made up here, so that all can be told."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from psa_casadi.bench.fits import Point, cheapest, lanes_table, least_times, run_table, time_at
-from psa_casadi.bench.fits_diagnosis import Spent, spent_table, stepper_alone
-from psa_casadi.bench.fits_figure import picture
-from psa_casadi.bench.fits_ways import (
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import PsaError
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.ways import EXACT, STEPPER
+from tests.benchmarks.fits import Point, cheapest, lanes_table, least_times, run_table, time_at
+from tests.benchmarks.fits_diagnosis import Spent, spent_table, stepper_alone
+from tests.benchmarks.fits_figure import picture
+from tests.benchmarks.fits_ways import (
     KINKED,
     MIXED,
     Reached,
@@ -19,11 +24,6 @@ from psa_casadi.bench.fits_ways import (
     voltage,
     with_one_effect,
 )
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import PsaError
-from psa_casadi.model.stacks import STACKS
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.ways import EXACT, STEPPER
 
 POINTS = [
     Point(EXACT, 1e-5, 2e-5, 5e-6, 1.5, 0.7, 1.4),

@@ -13,10 +13,10 @@ from psa_casadi.cli.app import app
 from psa_casadi.cli.demo import FILES
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment import multisine, read_record, time_grid, write_record
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import load_model, save_model
-from psa_casadi.report.text import identification_text
+from psa_casadi.records import multisine, read_record, time_grid, write_record
+from psa_casadi.report.words.text import identification_text
 from psa_casadi.simulation.simulate import simulate_record
 from tests.html_page import Page, figures
 from tests.test_report import png_size

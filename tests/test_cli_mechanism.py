@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
-from psa_casadi.input_design.mechanism import design_mechanism
+from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.stacks import stack_model
 

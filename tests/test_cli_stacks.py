@@ -11,8 +11,8 @@ from typer.testing import CliRunner, Result
 import psa_casadi
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import read_record, sine, time_grid, write_record
 from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.records import read_record, sine, time_grid, write_record
 from psa_casadi.simulation.simulate import simulate_record
 from tests.tiers import slow
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, hold, read_record, sine, steps, time_grid, triangle
-from psa_casadi.experiment.decimate import decimated
-from psa_casadi.experiment.fast_noise import fast_noise
+from psa_casadi.records import Record, hold, read_record, sine, steps, time_grid, triangle
+from psa_casadi.records.decimate import decimated
+from psa_casadi.records.quality.fast_noise import fast_noise
 
 FloatArray = NDArray[np.float64]
 SLOPE, NOISE = 1e-7, 1e-8

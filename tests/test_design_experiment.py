@@ -7,26 +7,26 @@ import pytest
 from scipy.optimize import least_squares
 
 from psa_casadi import reference
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record
-from psa_casadi.input_design.candidates import KINDS, Kind, draw, rest_of
-from psa_casadi.input_design.chances import naming_probability, plays_of
-from psa_casadi.input_design.criterion import Criterion, Point
-from psa_casadi.input_design.experiment import (
+from psa_casadi.design.experiment.candidates import KINDS, Kind, draw, rest_of
+from psa_casadi.design.experiment.chances import naming_probability, plays_of
+from psa_casadi.design.experiment.criterion import Criterion, Point
+from psa_casadi.design.experiment.experiment import (
     informative_experiment,
     rival_of_effect,
     separating_experiment,
     usual_records,
 )
-from psa_casadi.input_design.information import Information, Optimality
-from psa_casadi.input_design.limits import Limits, excess
-from psa_casadi.input_design.rivals import Rival, SensorNoise, rival_of_model
-from psa_casadi.input_design.search import Effort, search
-from psa_casadi.input_design.separation import Separation
+from psa_casadi.design.experiment.information import Information, Optimality
+from psa_casadi.design.experiment.limits import Limits, excess
+from psa_casadi.design.experiment.rivals import Rival, SensorNoise, rival_of_model
+from psa_casadi.design.experiment.search import Effort, search
+from psa_casadi.design.experiment.separation import Separation
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.report.experiment_part import sentences
+from psa_casadi.records import Record
+from psa_casadi.report.page.experiment_part import sentences
 from psa_casadi.units import FloatArray
 
 STACK = "P-885.51"

@@ -7,11 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
+from psa_casadi.design.experiment.experiment import usual_records
+from psa_casadi.design.experiment.limits import Limits, excess
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment import read_record, write_record
-from psa_casadi.input_design.experiment import usual_records
-from psa_casadi.input_design.limits import Limits, excess
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import read_record, write_record
 from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow
 

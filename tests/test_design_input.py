@@ -11,21 +11,21 @@ import pytest
 from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.bench.creeping_reference import creeping_displacement
-from psa_casadi.bench.design_tracking import LIMITS, own_bang_bang, scan, scanner, wrong_values
-from psa_casadi.bench.linear_bound import bang_bang_bound
 from psa_casadi.cli.app import app
+from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
+from psa_casadi.design.tracking.collocation import interval_of
+from psa_casadi.design.tracking.dynamics import dynamics_of
+from psa_casadi.design.tracking.inversion import correct, invert
+from psa_casadi.design.tracking.minimum_time import quickest_move
+from psa_casadi.design.tracking.program import NoSolutionError, Program
+from psa_casadi.design.tracking.saturation import binding
+from psa_casadi.design.tracking.targets import Target, raster_scan, read_target
+from psa_casadi.design.tracking.tracking import TrackedInput, track
+from psa_casadi.design.tracking.verification import error_of, uncompensated
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
-from psa_casadi.input_design.amplifier_limits import AmplifierLimits
-from psa_casadi.input_design.collocation import interval_of
-from psa_casadi.input_design.dynamics import dynamics_of
-from psa_casadi.input_design.inversion import correct, invert
-from psa_casadi.input_design.minimum_time import quickest_move
-from psa_casadi.input_design.program import NoSolutionError, Program
-from psa_casadi.input_design.saturation import binding
-from psa_casadi.input_design.targets import Target, raster_scan, read_target
-from psa_casadi.input_design.tracking import TrackedInput, track
-from psa_casadi.input_design.verification import error_of, uncompensated
+from tests.benchmarks.creeping_reference import creeping_displacement
+from tests.benchmarks.design_tracking import LIMITS, own_bang_bang, scan, scanner, wrong_values
+from tests.benchmarks.linear_bound import bang_bang_bound
 from tests.fmu_models import exported
 from tests.tiers import slow
 

@@ -7,10 +7,10 @@ import plotly.graph_objects as go
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.report.design_input_part import Titled
-from psa_casadi.report.design_page import write_design_page
-from psa_casadi.report.document import Picture
-from psa_casadi.report.tables import Table
+from psa_casadi.report.page.design_input_part import Titled
+from psa_casadi.report.page.design_page import write_design_page
+from psa_casadi.report.page.document import Picture
+from psa_casadi.report.words.tables import Table
 
 
 def test_a_page_holds_summary_tables_and_figures(tmp_path: Path) -> None:

@@ -8,12 +8,12 @@ import pytest
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.colour import colour_of
-from psa_casadi.diagnosis.errors_of import gain_of
-from psa_casadi.diagnosis.omnibus import omnibus
-from psa_casadi.experiment.drive import among_harmonics, drive_frequency
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import Experiment
+from psa_casadi.diagnosis.held_out.errors import gain_of
+from psa_casadi.diagnosis.noise.colour import colour_of
+from psa_casadi.diagnosis.noise.residual_tests import omnibus
+from psa_casadi.records.drive import among_harmonics, drive_frequency
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
 from tests.plants.make import make_record
 

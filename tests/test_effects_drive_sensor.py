@@ -16,7 +16,7 @@ from psa_casadi.effects.sensor_lag import SENSOR_LAG
 from psa_casadi.effects.sensor_nonlinearity import SENSOR_NONLINEARITY
 from psa_casadi.effects.temperature import TEMPERATURE
 from psa_casadi.effects.voltage_saturation import VOLTAGE_SATURATION
-from psa_casadi.identification.unknowns import static_compliance
+from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import run

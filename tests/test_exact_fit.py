@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.experiment import Record, multisine, time_grid
-from psa_casadi.experiment.split import Experiment, whole
-from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fit import FIT_RTOL, Fit, fit
-from psa_casadi.identification.prediction import measured, simulated
-from psa_casadi.identification.search import free_parameters
+from psa_casadi.identification.certainty.determinacy import covariance_of
+from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
+from psa_casadi.identification.fitting.prediction import measured, simulated
+from psa_casadi.identification.search.multistart import free_parameters
 from psa_casadi.model.compose import Model
+from psa_casadi.records import Record, multisine, time_grid
+from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import EXACT, STEPPER, Way
 from tests.test_fit import model_with

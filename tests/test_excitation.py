@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import (
+from psa_casadi.records import (
     concatenate,
     decaying_triangle,
     hold,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from psa_casadi.experiment.filtering import convolved, filtered, peaks, without_line
+from psa_casadi.records.quality.filtering import convolved, filtered, peaks, without_line
 
 RANDOM = np.random.default_rng(7)
 
@@ -44,7 +44,7 @@ def test_peaks() -> None:
 
 def test_a_diagnosis_without_pages_loads_no_drawing_and_no_statistics() -> None:
     code = (
-        "import sys, psa_casadi.diagnosis.diagnose, psa_casadi.report.text;"
+        "import sys, psa_casadi.diagnosis.diagnose, psa_casadi.report.words.text;"
         "print(*{'matplotlib', 'plotly', 'fmpy', 'scipy.signal', 'scipy.stats'} & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

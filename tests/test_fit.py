@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, multisine, time_grid
-from psa_casadi.experiment.split import Experiment, whole
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.prediction import predict
+from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
-from psa_casadi.identification.prediction import predict
-from psa_casadi.identification.search import free_parameters
-from psa_casadi.identification.unknowns import Unknowns, unknowns_of
+from psa_casadi.identification.search.multistart import free_parameters
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import Record, multisine, time_grid
+from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import Way
 

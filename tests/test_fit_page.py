@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.identification.advice import Advice
-from psa_casadi.identification.combinations import Combination
-from psa_casadi.report.fit_page import fit_page, write_fit_report
-from psa_casadi.report.fit_words import determined_sentence, error_bar_note, pairs_sentence
-from psa_casadi.report.grades import Grade, grades, strong_pairs
-from psa_casadi.report.page import write_report
-from psa_casadi.report.plots import time_plot
-from psa_casadi.report.record_part import MOST_RECORDS, points_each
-from psa_casadi.report.series import compact, extremes, kept, series_of_fit
-from psa_casadi.report.tables import parameter_table
-from psa_casadi.report.theme import DARK
+from psa_casadi.identification.advice.advice import Advice
+from psa_casadi.identification.certainty.combinations import Combination
+from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.page.fit_page import fit_page, write_fit_report
+from psa_casadi.report.page.record_part import MOST_RECORDS, points_each
+from psa_casadi.report.plots.residual_plots import time_plot
+from psa_casadi.report.plots.theme import DARK
+from psa_casadi.report.words.fit_words import determined_sentence, error_bar_note, pairs_sentence
+from psa_casadi.report.words.grades import Grade, grades, strong_pairs
+from psa_casadi.report.words.series import compact, extremes, kept, series_of_fit
+from psa_casadi.report.words.tables import parameter_table
 from tests.html_page import Page, figures, numbers
 from tests.report_cases import diagnosis, identification, long_fit
 from tests.tiers import slow_but

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.export.fmu import export_fmu, write_archive
-from psa_casadi.export.model_description3 import model_description3
-from psa_casadi.export.variable_table import variable_table
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu.archive import export_fmu, write_archive
+from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.model.stacks import STACKS
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but
@@ -28,7 +28,7 @@ def test_archives_are_valid(
     name: str, fmi: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The binary is left out: what is checked are the description and the list of sources."""
-    monkeypatch.setattr("psa_casadi.export.fmu.compile_library", lambda *_: b"no binary")
+    monkeypatch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
     path = export_fmu(model_named(name), tmp_path / "m.fmu", name="m", fmi=fmi, include_sensor=True)
     assert validate_fmu(str(path)) == []
     description = fmpy.read_model_description(str(path))
@@ -54,7 +54,7 @@ def test_the_validation_finds_faults(breakage: str, tmp_path: Path) -> None:
 
 def test_archive_of_fmi_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Folders are named by FMI 3's platform tuples; the same model gives the same bytes."""
-    monkeypatch.setattr("psa_casadi.export.fmu.compile_library", lambda *_: b"no binary")
+    monkeypatch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
     paths = [tmp_path / "a.fmu", tmp_path / "b.fmu"]
     for path in paths:
         export_fmu(model_named("demo"), path, name="demo", platforms=["all"], fmi=3)

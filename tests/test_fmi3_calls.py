@@ -11,7 +11,7 @@ import fmpy
 import numpy as np
 import pytest
 
-from psa_casadi.export.fmu_instance import (
+from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
     ERROR,
@@ -20,7 +20,7 @@ from psa_casadi.export.fmu_instance import (
     WARNING,
     Fmu,
 )
-from psa_casadi.export.fmu_instance3 import Update
+from psa_casadi.export.importer.instance3 import Update
 from tests.fmi3_instances import Instance3, loaded
 from tests.fmu_models import exported
 

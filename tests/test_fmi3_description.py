@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.export.dependencies import dependencies
-from psa_casadi.export.model_description import model_description
-from psa_casadi.export.model_description3 import model_description3
-from psa_casadi.export.variable_table import variable_table
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu.dependencies import dependencies
+from psa_casadi.export.fmu.model_description import model_description
+from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.variables import Input, Output, Parameter, State

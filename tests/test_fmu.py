@@ -7,10 +7,10 @@ import fmpy
 import numpy as np
 import pytest
 
-from psa_casadi.export.check import check_fmu
-from psa_casadi.export.check_agreement import has_reference
-from psa_casadi.export.fmu_instance import CO_SIMULATION, Fmu
-from psa_casadi.export.fmu_masters import FloatArray, Signals, co_simulate
+from psa_casadi.export.check.agreement import has_reference
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
+from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate
 from psa_casadi.reference import from_samples, simulate
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but

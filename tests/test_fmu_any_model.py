@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.export.check import check_fmu
-from psa_casadi.export.fmu import export_fmu
-from psa_casadi.export.fmu_instance import CO_SIMULATION, Fmu
-from psa_casadi.export.modelica import modelica_text
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
+from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.from_casadi import ode_model
-from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.from_casadi.ode_model import ode_model
+from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Parameter, State
 from tests.modelica_runs import simulated

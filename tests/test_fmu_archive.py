@@ -14,11 +14,11 @@ from psa_casadi.component import Component, Equations
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.export.fmu import MODEL_ENTRY, export_fmu
-from psa_casadi.export.model_description import model_description, time_scale
-from psa_casadi.export.platforms import PLATFORMS, chosen_platforms, compile_library
-from psa_casadi.export.sources import STRICT, write_sources
-from psa_casadi.export.variable_table import rate_unit, variable_table
+from psa_casadi.export.common.variable_table import rate_unit, variable_table
+from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu
+from psa_casadi.export.fmu.model_description import model_description, time_scale
+from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
+from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import loads
 from psa_casadi.simulation.compiler import run_compiler, zig_command
@@ -205,7 +205,7 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (directory / command[-1]).write_bytes(b"binary %d" % len(calls))
 
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
-    monkeypatch.setattr("psa_casadi.export.platforms.run_compiler", compiled)
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", compiled)
     texts, linux = {"model.c": "int a;"}, PLATFORMS["x86_64-linux"]
     first = compile_library(texts, "psa", linux)
     assert compile_library(dict(texts), "psa", linux) == first == b"binary 1"
@@ -214,7 +214,7 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         compile_library(texts, "other", linux),
         compile_library(texts, "psa", PLATFORMS["aarch64-linux"]),
     ]
-    monkeypatch.setattr("psa_casadi.export.platforms.version", lambda _: "99")
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.version", lambda _: "99")
     others.append(compile_library(texts, "psa", linux))
     assert len({first, *others}) == len(calls) == 5
     own = replace(linux, target=None)  # a machine's own compiler may change without a new name
@@ -223,7 +223,7 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def fails(command: list[str], directory: Path) -> None:
         raise PsaError("no compiler")
 
-    monkeypatch.setattr("psa_casadi.export.platforms.run_compiler", fails)
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", fails)
     for _ in range(2):
         with pytest.raises(PsaError, match="no compiler"):
             compile_library({"model.c": "int c;"}, "psa", linux)

@@ -6,8 +6,8 @@ import lief
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.binary_file import Binary, read_binary
-from psa_casadi.export.platforms import PLATFORMS
+from psa_casadi.export.fmu.platforms import PLATFORMS
+from psa_casadi.export.importer.binary_file import Binary, read_binary
 from tests.c_host.build import VERSIONS, binary
 from tests.tiers import slow
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.export import check_agreement
-from psa_casadi.export.check import CheckReport, check_fmu
-from psa_casadi.export.check_agreement import expected_outputs
-from psa_casadi.export.fmu import MODEL_ENTRY, write_archive
-from psa_casadi.export.fmu_masters import Signals
-from psa_casadi.export.platforms import compile_library, host_platform
+from psa_casadi.export.check import agreement
+from psa_casadi.export.check.agreement import expected_outputs
+from psa_casadi.export.check.check import CheckReport, check_fmu
+from psa_casadi.export.fmu.archive import MODEL_ENTRY, write_archive
+from psa_casadi.export.fmu.platforms import compile_library, host_platform
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.units import FloatArray
 from tests.broken_descriptions import DESCRIPTIONS, STACK
@@ -58,7 +58,7 @@ def _recompiled(target: Path, fmi: int, edits: Mapping[str, tuple[tuple[str, str
 @pytest.fixture(autouse=True)
 def _reference_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a sound FMU would give is the same for every fault: it is computed once."""
-    monkeypatch.setattr(check_agreement, "expected_outputs", _remembered_outputs)
+    monkeypatch.setattr(agreement, "expected_outputs", _remembered_outputs)
 
 
 _OUTPUTS: dict[tuple[object, ...], FloatArray] = {}

@@ -13,8 +13,8 @@ import lief
 import numpy as np
 import pytest
 
-from psa_casadi.export.platforms import PLATFORMS
-from psa_casadi.export.sources import STRICT
+from psa_casadi.export.fmu.platforms import PLATFORMS
+from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.simulation.compiler import cache_directory, run_compiler, zig_command
 from tests.c_host.build import (
     HEADERS,
@@ -41,7 +41,7 @@ C_LIBRARY = {
 
 EXPORT = """
 import sys
-from psa_casadi.export.fmu import export_fmu
+from psa_casadi.export.fmu.archive import export_fmu
 from tests.c_host.build import STACK
 from tests.fmu_models import model_named
 export_fmu(model_named(STACK), sys.argv[1], fmi=int(sys.argv[2]), platforms=sys.argv[3:])

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from psa_casadi.export.fmu_instance import (
+from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
     ERROR,
@@ -149,7 +149,8 @@ def test_instances_run_in_threads() -> None:
 def test_snapshot_of_another_model_or_interface_is_refused(slave: Instance) -> None:
     snapshot = slave.save()
     data = slave.serialize(snapshot)
-    with slave.fmu.start(MODEL_EXCHANGE) as other, pytest.raises(FmuError, match="other interface"):
+    fmu = Fmu(slave.fmu.path)
+    with fmu, fmu.start(MODEL_EXCHANGE) as other, pytest.raises(FmuError, match="other interface"):
         other.restore(snapshot)
     with (
         Fmu(exported("PTBS200")) as fmu,

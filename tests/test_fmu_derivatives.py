@@ -9,9 +9,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from psa_casadi.export.fmu_instance import CO_SIMULATION, DISCARD, ERROR, MODEL_EXCHANGE, OK, Fmu
-from psa_casadi.export.fmu_instance3 import Update
-from psa_casadi.export.variable_table import variable_table
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.importer.fmu import (
+    CO_SIMULATION,
+    DISCARD,
+    ERROR,
+    MODEL_EXCHANGE,
+    OK,
+    Fmu,
+)
+from psa_casadi.export.importer.instance3 import Update
 from tests.fmi3_instances import Instance3, loaded
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but

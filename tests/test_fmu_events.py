@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 from scipy.integrate import solve_ivp
 
-from psa_casadi.export.fmu_instance import CO_SIMULATION, ERROR, MODEL_EXCHANGE, OK, Fmu
-from psa_casadi.export.variable_table import variable_table
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, OK, Fmu
 from tests import fmi3_instances as fmi3
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but

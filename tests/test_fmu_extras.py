@@ -13,14 +13,14 @@ from lxml import etree  # type: ignore[import-untyped]
 
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.documentation import documentation
-from psa_casadi.export.icon import ICONS, SIDE, png, svg
-from psa_casadi.export.reference_results import (
+from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.fmu.reference_results import (
     FOLDER,
     NOTES,
 )
-from psa_casadi.export.terminals import terminal_entries, terminals_and_icons, terminals_of
-from psa_casadi.export.variable_table import variable_table
+from psa_casadi.export.fmu.terminals import terminal_entries, terminals_and_icons, terminals_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.variables import Interval

@@ -17,7 +17,7 @@ import fmpy
 import numpy as np
 import pytest
 
-from psa_casadi.export.fmu_masters import FloatArray
+from psa_casadi.export.importer.masters import FloatArray
 from psa_casadi.reference import simulate
 from tests.fmu_models import exported, model_named
 from tests.test_fmu_system import END, RATE, coupled, monolithic

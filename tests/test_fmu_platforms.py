@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.export.platforms import PLATFORMS, host_platform
+from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
 from psa_casadi.simulation.compiler import OPTIMISE, zig_command
 from tests.c_host.build import (
     STEPS,

@@ -17,12 +17,10 @@ import pytest
 
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.check_agreement import expected_outputs
-from psa_casadi.export.fmu import export_fmu
-from psa_casadi.export.fmu_instance import Fmu
-from psa_casadi.export.fmu_masters import Signals, co_simulate, integrate
-from psa_casadi.export.parameter_sets import parameter_set
-from psa_casadi.export.reference_results import (
+from psa_casadi.export.check.agreement import expected_outputs
+from psa_casadi.export.common.parameter_sets import parameter_set
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.fmu.reference_results import (
     EXPERIMENTS,
     FOLDER,
     INPUTS,
@@ -31,6 +29,8 @@ from psa_casadi.export.reference_results import (
     PARAMETERS,
     reference_entries,
 )
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.stepper import SimulationError
@@ -197,8 +197,8 @@ def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
     def fails(*_: object, **__: object) -> None:
         raise SimulationError("no")
 
-    monkeypatch.setattr("psa_casadi.export.reference_results.run", fails)
-    monkeypatch.setattr("psa_casadi.export.fmu.compile_library", lambda *_: b"no binary")
+    monkeypatch.setattr("psa_casadi.export.fmu.reference_results.run", fails)
+    monkeypatch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
     with zipfile.ZipFile(export_fmu(flexure, tmp_path / "m.fmu", fmi=3)) as archive:
         names = set(archive.namelist())
         page = archive.read("documentation/index.html").decode()

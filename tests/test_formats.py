@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, read_record, read_records, write_record
-from psa_casadi.experiment.column_map import parse_columns
-from psa_casadi.experiment.columns import Source
+from psa_casadi.records import Record, read_record, read_records, write_record
+from psa_casadi.records.read.column_map import parse_columns
+from psa_casadi.records.read.columns import Source
 from tests.record_files import HEADER, ROWS, write
 from tests.tiers import slow
 

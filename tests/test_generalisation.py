@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.colour import colour_of
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.generalisation import held_out_excess
-from psa_casadi.diagnosis.noise_floor import noise_floor
+from psa_casadi.diagnosis.held_out.generalisation import held_out_excess
+from psa_casadi.diagnosis.noise.colour import colour_of
+from psa_casadi.diagnosis.noise.floor import noise_floor
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment.reading import read_record
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import divided, split
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import divided, split
 from psa_casadi.simulation.simulate import simulate
 from tests.plants.again import play_again
 from tests.plants.make import make_record

@@ -2,8 +2,9 @@
 
 The plants (`tests/plants/`) share no code and no equation form with the effects. Every case runs
 `psa_casadi.diagnose` on the file that was written, and judges what a user would see. Here every
-effect has one record, and fresh seeds a few more; `psa bench diagnose` is the full study. The quick
-tier has the cause that the demonstration hides (`tests/test_cli.py`), and a clean record here.
+effect has one record, and fresh seeds a few more; the benchmark `diagnose` is the full study. The
+quick tier has the cause that the demonstration hides (`tests/test_cli.py`), and a clean record
+here.
 """
 
 import secrets
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.bench.hidden_cases import Case, run_case
+from tests.benchmarks.hidden_cases import Case, run_case
 from tests.plants.make import Truth, make_record
 from tests.plants.table import FOREIGN, KNOWN
 from tests.tiers import slow, slow_but

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from psa_casadi.identification.levenberg_marquardt import Minimum, minimise
+from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
 
 FloatArray = NDArray[np.float64]
 Pair = tuple[FloatArray, FloatArray]

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from psa_casadi.identification.linear_response import (
+from psa_casadi.identification.start.linear import arrangements
+from psa_casadi.identification.start.linear_response import (
     mechanics_poles,
     numerator_time,
     plays,
     respond,
     transfer,
 )
-from psa_casadi.identification.linear_start import arrangements
-from psa_casadi.identification.vector_fitting import Response, vector_fit
+from psa_casadi.identification.start.vector_fitting import Response, vector_fit
 
 
 def test_the_response_is_exact_between_samples() -> None:

@@ -6,13 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from psa_casadi.bench.coverage import quantities
-from psa_casadi.bench.records import clean_loops, step_voltage, with_noise
-from psa_casadi.experiment import Record
-from psa_casadi.identification.loop_start import loop_start
-from psa_casadi.identification.starting import starting_model
-from psa_casadi.identification.unknowns import static_compliance
+from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.start.loop import loop_start
+from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import Record
+from tests.benchmarks.coverage import quantities
+from tests.benchmarks.records import clean_loops, step_voltage, with_noise
 from tests.tiers import slow, slow_but
 
 BENDS = ("beta", "gamma", "delta")

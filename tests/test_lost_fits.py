@@ -6,20 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.backward import reconsidered
-from psa_casadi.diagnosis.colour import excess_power
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.extension import extend, extend_any, polish
-from psa_casadi.diagnosis.rounds import Round, examine, settle_on
-from psa_casadi.diagnosis.selection import WORTHWHILE, choose, starts_of
+from psa_casadi.diagnosis.noise.colour import excess_power
+from psa_casadi.diagnosis.search.backward import reconsidered
+from psa_casadi.diagnosis.search.extension import extend, extend_any, polish
+from psa_casadi.diagnosis.search.rounds import Round, examine, settle_on
+from psa_casadi.diagnosis.search.selection import WORTHWHILE, choose, starts_of
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment.reading import read_record
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import split
-from psa_casadi.identification.prediction import measured
-from psa_casadi.identification.search import fit_base
-from psa_casadi.identification.starting import starting_model
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import split
 from tests.plants.again import play_again
 from tests.plants.make import make_record
 from tests.tiers import slow

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from psa_casadi.component import Component
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.experiment.record import Record
 from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.simulate import simulate_record
 from tests.stack_models import stack

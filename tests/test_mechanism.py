@@ -9,11 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.export.fmu import export_fmu
-from psa_casadi.export.fmu_instance import CO_SIMULATION, Fmu
-from psa_casadi.input_design.mechanism import (
+from psa_casadi.design.mechanism.mechanism import (
     Limits,
     MechanismDesign,
     Mounting,
@@ -26,6 +22,10 @@ from psa_casadi.input_design.mechanism import (
     root_locus,
     step_response,
 )
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.model.stacks import stack_model
 from tests.tiers import slow
 

@@ -6,22 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psa_casadi.bench.hidden_cases import Case, Found
-from psa_casadi.bench.hidden_controls import CONTROLS, control_table
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.errors_of import held_out_rms
-from psa_casadi.diagnosis.evidence import bic_probabilities
-from psa_casadi.diagnosis.extension import extend, stripped
-from psa_casadi.diagnosis.imitators import imitations
-from psa_casadi.diagnosis.rounds import examine
-from psa_casadi.diagnosis.selection import choose, starts_of
+from psa_casadi.diagnosis.held_out.errors import held_out_rms
+from psa_casadi.diagnosis.screening.evidence import bic_probabilities
+from psa_casadi.diagnosis.search.extension import extend, stripped
+from psa_casadi.diagnosis.search.imitators import imitations
+from psa_casadi.diagnosis.search.rounds import examine
+from psa_casadi.diagnosis.search.selection import choose, starts_of
 from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment import Record
-from psa_casadi.experiment.split import Experiment, split
-from psa_casadi.identification.fit import Fit, fit
+from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
+from psa_casadi.records import Record
+from psa_casadi.records.split import Experiment, split
 from psa_casadi.simulation.simulate import simulate
+from tests.benchmarks.hidden_cases import Case, Found
+from tests.benchmarks.hidden_controls import CONTROLS, control_table
 
 NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from psa_casadi.cli import diagnose as command
+from psa_casadi.design.experiment import experiment
+from psa_casadi.design.experiment.designs import Separated
+from psa_casadi.design.experiment.experiment import resolving_experiment
+from psa_casadi.design.experiment.limits import excess
+from psa_casadi.design.experiment.rivals import noise_of_fit, rival_of_fit
+from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, read_record
-from psa_casadi.input_design import experiment
-from psa_casadi.input_design.designs import Separated
-from psa_casadi.input_design.experiment import resolving_experiment
-from psa_casadi.input_design.limits import excess
-from psa_casadi.input_design.rivals import noise_of_fit, rival_of_fit
-from psa_casadi.input_design.search import Effort
-from psa_casadi.report.text import story
+from psa_casadi.records import Record, read_record
+from psa_casadi.report.words.text import story
 from tests.plants.again import play_again
 from tests.plants.base import simulate_base
 from tests.plants.hide import effect_called

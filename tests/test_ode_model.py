@@ -15,8 +15,8 @@ from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi.examples.van_der_pol import model as van_der_pol
-from psa_casadi.export.modelica import modelica_text
-from psa_casadi.export.variable_table import variable_table
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.modelica.package import modelica_text
 from tests.modelica_runs import load, simulated
 
 SPAN, MU = 10.0, 3.0

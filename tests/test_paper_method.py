@@ -9,15 +9,6 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import (
-    Record,
-    decaying_triangle,
-    multisine,
-    steps,
-    time_grid,
-    triangle,
-    write_record,
-)
 from psa_casadi.identification.paper.factors import mechanics_of
 from psa_casadi.identification.paper.hysteresis import hysteresis_part
 from psa_casadi.identification.paper.method import identify_by_paper, paper_method
@@ -30,6 +21,15 @@ from psa_casadi.identification.paper.moments import (
 )
 from psa_casadi.identification.paper.shapes import find_loops, find_steps
 from psa_casadi.model.model_file import load_model
+from psa_casadi.records import (
+    Record,
+    decaying_triangle,
+    multisine,
+    steps,
+    time_grid,
+    triangle,
+    write_record,
+)
 from tests.paper_cases import (
     LEADING,
     LINEAR,

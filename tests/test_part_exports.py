@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
-from psa_casadi.export.check import check_fmu
-from psa_casadi.export.fmu import export_fmu
-from psa_casadi.export.modelica import modelica_text
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.probes import directions
+from psa_casadi.diagnosis.screening.probes import directions
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import whole
-from psa_casadi.identification.fit import fit
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import compose
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import whole
 from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow_but
 

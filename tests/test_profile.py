@@ -10,19 +10,19 @@ from scipy.signal import lfilter
 
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, multisine, time_grid
-from psa_casadi.experiment.split import Experiment, whole
-from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.fit import Fit, fit
-from psa_casadi.identification.profile import (
+from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.certainty.profile import (
     PROFILE_LIMIT,
     Profile,
     profile,
     profile_sentences,
 )
+from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.report.profile_plot import profile_plot
+from psa_casadi.records import Record, multisine, time_grid
+from psa_casadi.records.split import Experiment, whole
+from psa_casadi.report.plots.profile_plot import profile_plot
 from psa_casadi.simulation.simulate import simulate
 
 FloatArray = NDArray[np.float64]

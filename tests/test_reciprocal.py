@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.bench.three_mechanics import two_masses as two_linear_masses
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, time_grid
-from psa_casadi.experiment.split import whole
-from psa_casadi.identification.fit import fit
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import Record, time_grid
+from psa_casadi.records.split import whole
 from psa_casadi.simulation.simulate import simulate
+from tests.benchmarks.three_mechanics import two_masses as two_linear_masses
 from tests.plants.base import Run, simulate_base
 from tests.plants.reciprocal_coupling import matrices, two_masses
 from tests.plants.stack import Stack

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import read_record, read_records
+from psa_casadi.records import read_record, read_records
 from tests.record_files import HEADER, ROWS, write
 
 

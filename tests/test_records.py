@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, read_record, write_record
+from psa_casadi.records import Record, read_record, write_record
 from tests.record_files import HEADER, ROWS, write
 from tests.tiers import slow
 

@@ -10,14 +10,14 @@ import pytest
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.check import CheckReport, CheckRow
-from psa_casadi.report.figure import save_figure
-from psa_casadi.report.page import write_report
-from psa_casadi.report.phrases import length_scale, listing, number
-from psa_casadi.report.residuals import noise_density, spectrum
-from psa_casadi.report.series import series_of, telling_window
-from psa_casadi.report.tables import blind_table, check_table, error_table, parameter_table
-from psa_casadi.report.text import check_sentence, effect_page, story
+from psa_casadi.export.check.check import CheckReport, CheckRow
+from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.plots.figure import save_figure
+from psa_casadi.report.words.phrases import length_scale, listing, number
+from psa_casadi.report.words.residuals import noise_density, spectrum
+from psa_casadi.report.words.series import series_of, telling_window
+from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
+from psa_casadi.report.words.text import check_sentence, effect_page, story
 from tests.html_page import Page, figures
 from tests.report_cases import ADDED, NOISE, diagnosis
 from tests.tiers import slow

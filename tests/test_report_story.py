@@ -9,11 +9,11 @@ import pytest
 
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, Verdict
 from psa_casadi.effects import EFFECTS
-from psa_casadi.report.misfit_part import drawn, split_table
-from psa_casadi.report.page import write_report
-from psa_casadi.report.phrases import probability_text, strongest_sentence
-from psa_casadi.report.tables import blindest, candidate_table
-from psa_casadi.report.text import story
+from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.page.misfit_part import drawn, split_table
+from psa_casadi.report.words.phrases import probability_text, strongest_sentence
+from psa_casadi.report.words.tables import blindest, candidate_table
+from psa_casadi.report.words.text import story
 from tests.html_page import Page, figures, numbers
 from tests.report_cases import diagnosis, misfits, periodic, with_periodic
 

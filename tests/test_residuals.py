@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from psa_casadi.report.fit_words import residual_sentence
-from psa_casadi.report.phrases import Scale
-from psa_casadi.report.residuals import (
+from psa_casadi.report.words.fit_words import residual_sentence
+from psa_casadi.report.words.phrases import Scale
+from psa_casadi.report.words.residuals import (
     ResidualFigures,
     autocorrelation,
     distribution,
@@ -12,7 +12,7 @@ from psa_casadi.report.residuals import (
     spectrum,
     white_band,
 )
-from psa_casadi.report.series import Curve, FloatArray, Series
+from psa_casadi.report.words.series import Curve, FloatArray, Series
 
 SECONDS = Scale("s", 1.0)
 

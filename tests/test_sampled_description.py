@@ -6,9 +6,9 @@ import fmpy
 import numpy as np
 import pytest
 
-from psa_casadi.export.check import check_fmu
-from psa_casadi.export.fmu_instance import CO_SIMULATION, DISCARD, ERROR, Fmu, FmuError
-from psa_casadi.export.sources import STRICT, write_sources
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.fmu.sources import STRICT, write_sources
+from psa_casadi.export.importer.fmu import CO_SIMULATION, DISCARD, ERROR, Fmu, FmuError
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.sampled_fmus import exported
 from tests.sampled_models import PERIOD, controller, loop

@@ -4,13 +4,13 @@ import fmpy
 import numpy as np
 import pytest
 
-from psa_casadi.export.fmu_instance import (
+from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     MODEL_EXCHANGE,
     Fmu,
     Instance,
 )
-from psa_casadi.export.fmu_masters import Signals, co_simulate, integrate
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from tests.sampled_fmus import exported
 from tests.sampled_models import PERIOD, FloatArray, expected, grid
 

@@ -8,7 +8,7 @@ import pytest
 import rumoca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.export.modelica import modelica_text
+from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output, Parameter, State

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import psa_casadi.identification.fit as fitting
-from psa_casadi.bench.coverage import Run, one_run
-from psa_casadi.bench.records import clean_loops, with_noise
-from psa_casadi.experiment import Record
-from psa_casadi.identification.exchanges import exchanges
+import psa_casadi.identification.fitting.fit as fitting
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.search.exchanges import exchanges
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import Record
+from tests.benchmarks.coverage import Run, one_run
+from tests.benchmarks.records import clean_loops, with_noise
 from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]

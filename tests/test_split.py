@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.experiment import Record
-from psa_casadi.experiment.noise import correlation_inflation, high_frequency_noise
-from psa_casadi.experiment.split import reversals, split, whole
+from psa_casadi.records import Record
+from psa_casadi.records.quality.noise import correlation_inflation, high_frequency_noise
+from psa_casadi.records.split import reversals, split, whole
 
 FloatArray = NDArray[np.float64]
 

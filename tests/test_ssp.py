@@ -10,12 +10,12 @@ from fmpy.ssp.ssd import read_ssd
 from lxml import etree  # type: ignore[import-untyped]
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.ssp import export_ssp, layout_of, save_wiring, wiring_of
-from psa_casadi.export.ssp_archive import SspArchive
-from psa_casadi.export.ssp_layout import OUTSIDE, Port
-from psa_casadi.export.ssp_parameters import shared_parameters
-from psa_casadi.model.nanopositioner import nanopositioner
-from psa_casadi.model.system import System
+from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
+from psa_casadi.export.ssp.layout import OUTSIDE, Port
+from psa_casadi.export.ssp.parameters import shared_parameters
+from psa_casadi.export.ssp.read_archive import SspArchive
+from psa_casadi.model.system.nanopositioner import nanopositioner
+from psa_casadi.model.system.system import System
 from tests.fmu_models import assert_valid, model_named
 from tests.ssp_systems import archive_of, closed_loop, pushed_stage
 from tests.test_fmu_system import STACK

@@ -7,9 +7,9 @@ from fmpy.ssp.ssd import read_ssd
 from typer.testing import CliRunner, Result
 
 from psa_casadi.cli.app import app
-from psa_casadi.export.ssp import wiring_of
-from psa_casadi.export.ssp_steps import stable_step
-from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.export.ssp.archive import wiring_of
+from psa_casadi.export.ssp.steps import stable_step
+from psa_casadi.model.system.nanopositioner import nanopositioner
 
 
 def psa(*arguments: str) -> Result:

@@ -5,10 +5,10 @@ import pytest
 
 from psa_casadi.components import SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment import Record
-from psa_casadi.identification.starting import chosen_start, with_stiffness
+from psa_casadi.identification.start.ordinary import chosen_start, with_stiffness
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import Record
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.variables import Provenance
 

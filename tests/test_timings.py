@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.components import BASE
-from psa_casadi.experiment import write_record
-from psa_casadi.experiment.excitation import time_grid, triangle
 from psa_casadi.model.compose import compose
-from psa_casadi.report.timings import timings_table
+from psa_casadi.records import write_record
+from psa_casadi.records.excitation import time_grid, triangle
+from psa_casadi.report.words.timings import timings_table
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import run

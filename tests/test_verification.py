@@ -1,21 +1,23 @@
-"""`psa bench verification`: what it judges was not fitted, and its figures are what they say."""
+"""The benchmark `verification`: what it judges was not fitted, its figures are what they say."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from psa_casadi.bench import verification
-from psa_casadi.bench.outcome import Progress
-from psa_casadi.bench.three_mechanics import (
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import steps, time_grid
+from tests.benchmarks import verification
+from tests.benchmarks.outcome import Progress
+from tests.benchmarks.three_mechanics import (
     Match,
     matches,
     plant_response,
     tables,
     with_single_mass,
 )
-from psa_casadi.bench.verification import run, verification_tables
-from psa_casadi.bench.verification_cases import (
+from tests.benchmarks.verification import run, verification_tables
+from tests.benchmarks.verification_cases import (
     FITTED_LOOPS,
     KEPT_LOOPS,
     LOOPS,
@@ -26,9 +28,7 @@ from psa_casadi.bench.verification_cases import (
     instrument,
     synthetic,
 )
-from psa_casadi.bench.verification_figure import picture
-from psa_casadi.experiment import steps, time_grid
-from psa_casadi.model.stacks import STACKS
+from tests.benchmarks.verification_figure import picture
 from tests.tiers import slow
 
 RATED = STACKS["P-885.51"].values["u_rated"].value

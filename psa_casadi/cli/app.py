@@ -4,7 +4,6 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.bench import bench
 from psa_casadi.cli.check import check
 from psa_casadi.cli.datasets import datasets
 from psa_casadi.cli.demo import demo
@@ -90,7 +89,6 @@ design.command(
 app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))
 app.command(epilog="Example: psa examples van_der_pol -o van_der_pol")(guarded(examples))
 app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(datasets))
-app.command(epilog="Example: psa bench identify --quick")(guarded(bench))
 
 
 def main() -> None:

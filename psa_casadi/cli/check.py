@@ -18,10 +18,10 @@ def check(
 ) -> None:
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.check import check_fmu
+    from psa_casadi.export.check.check import check_fmu
     from psa_casadi.model.model_file import load_model
-    from psa_casadi.report.tables import check_table
-    from psa_casadi.report.text import check_sentence
+    from psa_casadi.report.words.tables import check_table
+    from psa_casadi.report.words.text import check_sentence
 
     given = Given()
     if not fmu.is_file():

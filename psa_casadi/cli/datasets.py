@@ -23,7 +23,7 @@ def datasets(
     """
     from psa_casadi.datasets import DATASETS, copy, find, origin_text
     from psa_casadi.errors import InputError
-    from psa_casadi.report.tables import Table
+    from psa_casadi.report.words.tables import Table
 
     if name is None:
         if output is not None:

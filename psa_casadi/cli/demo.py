@@ -29,16 +29,16 @@ def demo(
 ) -> None:
     """Identify, diagnose, extend, export and check a stack, on a synthetic record."""
     from psa_casadi.diagnosis.diagnose import diagnose
-    from psa_casadi.experiment import read_record
-    from psa_casadi.export.check import check_fmu
-    from psa_casadi.export.fmu import export_fmu
+    from psa_casadi.export.check.check import check_fmu
+    from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.files import atomic_write
     from psa_casadi.identification.identify import identify
     from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.figure import save_figure
-    from psa_casadi.report.page import write_report
-    from psa_casadi.report.tables import check_table
-    from psa_casadi.report.text import check_sentence, story
+    from psa_casadi.records import read_record
+    from psa_casadi.report.page.diagnosis import write_report
+    from psa_casadi.report.plots.figure import save_figure
+    from psa_casadi.report.words.tables import check_table
+    from psa_casadi.report.words.text import check_sentence, story
 
     paths = _prepared(directory)
     record = read_record(paths[RECORD], need_excitation=True)

@@ -19,8 +19,8 @@ from psa_casadi.cli.screen import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from psa_casadi.input_design.designs import Informative, Separated
-    from psa_casadi.input_design.rivals import Rival
+    from psa_casadi.design.experiment.designs import Informative, Separated
+    from psa_casadi.design.experiment.rivals import Rival
     from psa_casadi.model.compose import Model
 
 
@@ -103,7 +103,7 @@ def experiment(
     """
     from psa_casadi.cli import design_given
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.input_design.search import Effort
+    from psa_casadi.design.experiment.search import Effort
 
     given = Given()
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
@@ -141,7 +141,7 @@ def _write(
     output: Path | None,
     report: Path | None,
 ) -> None:
-    from psa_casadi.report.experiment_part import write_experiment_page, write_voltage
+    from psa_casadi.report.page.experiment_part import write_experiment_page, write_voltage
 
     if output is not None:
         write_voltage(output, design.record)
@@ -150,7 +150,7 @@ def _write(
 
 
 def _tell(design: "Informative | Separated", model: "Model", quiet: bool) -> None:
-    from psa_casadi.report.experiment_part import design_tables, sentences
+    from psa_casadi.report.page.experiment_part import design_tables, sentences
 
     for sentence in sentences(design, model.values.get("C_p")):
         show(sentence, quiet)

@@ -8,14 +8,14 @@ if TYPE_CHECKING:
 
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
-    from psa_casadi.experiment.record import Record
-    from psa_casadi.input_design.candidates import Kind
-    from psa_casadi.input_design.designs import Informative, Separated
-    from psa_casadi.input_design.information import Optimality
-    from psa_casadi.input_design.limits import Limits
-    from psa_casadi.input_design.rivals import Rival, SensorNoise
-    from psa_casadi.input_design.search import Effort
+    from psa_casadi.design.experiment.candidates import Kind
+    from psa_casadi.design.experiment.designs import Informative, Separated
+    from psa_casadi.design.experiment.information import Optimality
+    from psa_casadi.design.experiment.limits import Limits
+    from psa_casadi.design.experiment.rivals import Rival, SensorNoise
+    from psa_casadi.design.experiment.search import Effort
     from psa_casadi.model.compose import Model
+    from psa_casadi.records.record import Record
 
 #: Noise of the sensor over the stroke where none is given, and samples of a record.
 _NOISE_SHARE, _SAMPLES = 1e-3, 1000
@@ -33,7 +33,7 @@ class Plan:
     @property
     def kinds(self) -> "tuple[Kind, ...]":
         """The families to search."""
-        from psa_casadi.input_design.candidates import KINDS
+        from psa_casadi.design.experiment.candidates import KINDS
 
         return KINDS if self.family == "any" else tuple(k for k in KINDS if k == self.family)
 
@@ -68,8 +68,8 @@ def limits(
     records: "Sequence[Record]", model: "Model | None", wanted: "Mapping[str, float | None]"
 ) -> "Limits | None":
     """Return the limits: as given, else those of the records, else the stack's rated voltage."""
+    from psa_casadi.design.experiment.limits import Limits, limits_of
     from psa_casadi.errors import InputError
-    from psa_casadi.input_design.limits import Limits, limits_of
 
     if records:
         return limits_of(records, **wanted)
@@ -89,7 +89,7 @@ def noise(
     model: "Model", limits: "Limits", noise: float | None, correlation: float
 ) -> "SensorNoise":
     """Return the noise [nm] as given, else a share of the stroke within the limits."""
-    from psa_casadi.input_design.rivals import SensorNoise
+    from psa_casadi.design.experiment.rivals import SensorNoise
     from psa_casadi.simulation.simulate import simulate
 
     if noise is not None:
@@ -108,7 +108,7 @@ def separating(
     progress: "Callable[[str], None]",
 ) -> "tuple[Separated, list[Rival]]":
     """Return the record that tells effects apart, and the rivals it was designed for."""
-    from psa_casadi.input_design.experiment import separating_experiment
+    from psa_casadi.design.experiment.experiment import separating_experiment
 
     base, found, fitted = rivals(model, effects, records, progress)
     design = separating_experiment(
@@ -126,7 +126,7 @@ def informative(
     progress: "Callable[[str], None]",
 ) -> "tuple[Informative, list[Rival]]":
     """Return the record that sharpens parameters, and the model with what is free in it."""
-    from psa_casadi.input_design.experiment import informative_experiment
+    from psa_casadi.design.experiment.experiment import informative_experiment
 
     rival = whole(model, parameters)
     design = informative_experiment(
@@ -143,10 +143,10 @@ def rivals(
     progress: "Callable[[str], None]",
 ) -> "tuple[Rival | None, list[Rival], SensorNoise | None]":
     """Return the base, the rivals and the noise, fitted to records if there are any."""
-    from psa_casadi.diagnosis.contenders import fit_contenders
-    from psa_casadi.identification.search import CORE
-    from psa_casadi.input_design.experiment import rival_of_effect
-    from psa_casadi.input_design.rivals import noise_of_fit, rival_of_fit
+    from psa_casadi.design.experiment.experiment import rival_of_effect
+    from psa_casadi.design.experiment.rivals import noise_of_fit, rival_of_fit
+    from psa_casadi.diagnosis.search.contenders import fit_contenders
+    from psa_casadi.identification.search.multistart import CORE
 
     if not records:
         plain = model.without(e.name for e in effects)
@@ -160,8 +160,8 @@ def rivals(
 
 def whole(model: "Model", wanted: "Sequence[str]") -> "Rival":
     """Return the model with what records of loops determine as its unknowns, and what is wanted."""
-    from psa_casadi.identification.search import CORE, FIXED
-    from psa_casadi.input_design.rivals import rival_of_model
+    from psa_casadi.design.experiment.rivals import rival_of_model
+    from psa_casadi.identification.search.multistart import CORE, FIXED
 
     own = [p.name for e in model.effects for p in e.parameters if p.name not in FIXED]
     free = [n for n in CORE if n in model.parameter_names]

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psa_casadi.cli.screen import show, show_table, tell_written, working
-from psa_casadi.experiment import Record, write_record
-from psa_casadi.input_design.amplifier_limits import AmplifierLimits
-from psa_casadi.input_design.inversion import invert as inverted
-from psa_casadi.input_design.minimum_time import QuickMove, quickest_move
-from psa_casadi.input_design.saturation import binding
-from psa_casadi.input_design.targets import Target
-from psa_casadi.input_design.tracking import TrackedInput
-from psa_casadi.input_design.tracking import track as tracked
-from psa_casadi.input_design.trial import corrected
-from psa_casadi.input_design.verification import Response, TrackingError, error_of, uncompensated
+from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
+from psa_casadi.design.tracking.inversion import invert as inverted
+from psa_casadi.design.tracking.minimum_time import QuickMove, quickest_move
+from psa_casadi.design.tracking.saturation import binding
+from psa_casadi.design.tracking.targets import Target
+from psa_casadi.design.tracking.tracking import TrackedInput
+from psa_casadi.design.tracking.tracking import track as tracked
+from psa_casadi.design.tracking.trial import corrected
+from psa_casadi.design.tracking.verification import Response, TrackingError, error_of, uncompensated
 from psa_casadi.model.compose import Model
-from psa_casadi.report.design_input_part import (
+from psa_casadi.records import Record, write_record
+from psa_casadi.report.page.design_input_part import (
     Titled,
     error_table,
     inversion_pictures,
@@ -28,11 +28,11 @@ from psa_casadi.report.design_input_part import (
     tracking_pictures,
     trial_pictures,
 )
-from psa_casadi.report.design_page import write_design_page
-from psa_casadi.report.phrases import number
+from psa_casadi.report.page.design_page import write_design_page
+from psa_casadi.report.words.phrases import number
 
 if TYPE_CHECKING:
-    from psa_casadi.report.document import Picture
+    from psa_casadi.report.page.document import Picture
 
 _Rows = list[tuple[str, TrackingError]]
 

@@ -9,7 +9,7 @@ import typer
 from psa_casadi.cli.screen import Quiet, StackOption, show, show_table, tell_written, working
 
 if TYPE_CHECKING:
-    from psa_casadi.input_design.mechanism import MechanismDesign
+    from psa_casadi.design.mechanism.mechanism import MechanismDesign
 
 
 class ActsOn(StrEnum):
@@ -60,15 +60,15 @@ def mechanism(
     MECHANISM.json is a model: `psa export fmu --model MECHANISM.json` makes an FMU of it.
     """
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.input_design.mechanism import (
+    from psa_casadi.design.mechanism.goals import check_goals
+    from psa_casadi.design.mechanism.mechanism import (
         Limits,
         design_mechanism,
         mechanism_model,
         port_model,
     )
-    from psa_casadi.input_design.mechanism_goals import check_goals
     from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.mechanism_page import write_mechanism_page
+    from psa_casadi.report.page.mechanism_page import write_mechanism_page
 
     given = Given()
     given.outputs({"--output": output, "--port": port, "--report": report}, [model])
@@ -97,7 +97,11 @@ def mechanism(
 
 
 def _tell(design: "MechanismDesign", quiet: bool) -> None:
-    from psa_casadi.report.mechanism_page import mechanism_sentences, mechanism_table, pole_table
+    from psa_casadi.report.page.mechanism_page import (
+        mechanism_sentences,
+        mechanism_table,
+        pole_table,
+    )
 
     for sentence in mechanism_sentences(design):
         show(sentence, quiet)

@@ -78,8 +78,8 @@ def diagnose(
         with stage("loading"):
             from psa_casadi.cli.inputs import Given
             from psa_casadi.diagnosis.diagnose import diagnose as run
-            from psa_casadi.report.text import story
-            from psa_casadi.report.timings import timings_table
+            from psa_casadi.report.words.text import story
+            from psa_casadi.report.words.timings import timings_table
         with stage("reading"):
             given, held = Given(), holdout or []
             given.stiffness(stiffness)
@@ -124,11 +124,11 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
         return d
     from dataclasses import replace
 
-    from psa_casadi.diagnosis.contenders import one_of_each
+    from psa_casadi.design.experiment.experiment import resolving_experiment
     from psa_casadi.diagnosis.result import NextExperiment
+    from psa_casadi.diagnosis.search.contenders import one_of_each
     from psa_casadi.errors import PsaError
-    from psa_casadi.input_design.experiment import resolving_experiment
-    from psa_casadi.report.experiment_part import sentences, write_voltage
+    from psa_casadi.report.page.experiment_part import sentences, write_voltage
 
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:

@@ -22,8 +22,8 @@ def effects(
     Example: psa effects slow_creep --figure creep.png
     """
     from psa_casadi.effects import EFFECTS
-    from psa_casadi.report.tables import effects_table
-    from psa_casadi.report.text import effect_page
+    from psa_casadi.report.words.tables import effects_table
+    from psa_casadi.report.words.text import effect_page
 
     wanted = _known(name, list(EFFECTS), figure)
     if wanted is None:
@@ -62,8 +62,8 @@ def _known(name: str | None, names: list[str], figure: Path | None) -> str | Non
 
 
 def _draw(name: str, path: Path) -> None:
-    from psa_casadi.diagnosis.signature import signature
+    from psa_casadi.diagnosis.residual.signature import signature
     from psa_casadi.effects import EFFECTS
-    from psa_casadi.report.signature_figure import save_signature
+    from psa_casadi.report.plots.signature_figure import save_signature
 
     save_signature(EFFECTS[name], signature(EFFECTS[name]), path)

@@ -84,7 +84,7 @@ def _create(folder: Path) -> None:
 
 
 def _list(found: "Mapping[str, Example]") -> None:
-    from psa_casadi.report.tables import Table
+    from psa_casadi.report.words.tables import Table
 
     rows = tuple((e.name, e.kind, e.title) for e in found.values())
     show_table(Table(("name", "kind", "what it shows"), rows))

@@ -35,8 +35,8 @@ def fmu(
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.fmu import export_fmu
-    from psa_casadi.export.platforms import chosen_platforms
+    from psa_casadi.export.fmu.archive import export_fmu
+    from psa_casadi.export.fmu.platforms import chosen_platforms
 
     given = Given()
     given.outputs({"--output": output}, [model])

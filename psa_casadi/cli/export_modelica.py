@@ -21,7 +21,7 @@ def modelica(
 ) -> None:
     """Write a model as a Modelica package: signals, connectors, examples in one file."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.modelica import class_names, export_modelica
+    from psa_casadi.export.modelica.package import class_names, export_modelica
 
     given = Given()
     given.outputs({"--output": output}, [model])

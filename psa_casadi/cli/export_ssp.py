@@ -8,7 +8,7 @@ import typer
 from psa_casadi.cli.screen import Quiet, show, tell_written, working
 
 if TYPE_CHECKING:
-    from psa_casadi.export.ssp_structure import WiredParts
+    from psa_casadi.export.ssp.structure import WiredParts
 
 #: The stack of a system for which no model is given.
 DEFAULT_STACK = "P-885.51"
@@ -38,9 +38,9 @@ def ssp(
 ) -> None:
     """Write a nanopositioner as SSP: controller, compensator, amplifier, stack, flexure, wired."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.platforms import chosen_platforms
-    from psa_casadi.export.ssp import export_ssp, layout_of, save_wiring, wiring_of
-    from psa_casadi.model.nanopositioner import nanopositioner
+    from psa_casadi.export.fmu.platforms import chosen_platforms
+    from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
+    from psa_casadi.model.system.nanopositioner import nanopositioner
 
     given = Given()
     given.outputs({"--output": output, "--picture": picture}, [model])
@@ -68,7 +68,7 @@ def ssp(
 
 
 def _ports(wiring: "WiredParts", quiet: bool) -> None:
-    from psa_casadi.export.ssp_layout import OUTSIDE, Port
+    from psa_casadi.export.ssp.layout import OUTSIDE, Port
 
     for kind in ("input", "output"):
         named = [
@@ -80,7 +80,7 @@ def _ports(wiring: "WiredParts", quiet: bool) -> None:
 
 
 def _steps(wiring: "WiredParts", quiet: bool) -> None:
-    from psa_casadi.export.ssp_steps import stable_step
+    from psa_casadi.export.ssp.steps import stable_step
 
     if quiet:
         return

@@ -53,13 +53,13 @@ def identify(
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine."""
     from psa_casadi.cli.inputs import Given
+    from psa_casadi.identification.certainty.profile import profile as profile_of
+    from psa_casadi.identification.certainty.profile import profile_sentences
     from psa_casadi.identification.identify import identify as run
     from psa_casadi.identification.paper.method import identify_by_paper as by_paper
-    from psa_casadi.identification.profile import profile as profile_of
-    from psa_casadi.identification.profile import profile_sentences
     from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.fit_page import write_fit_report
-    from psa_casadi.report.text import identification_text
+    from psa_casadi.report.page.fit_page import write_fit_report
+    from psa_casadi.report.words.text import identification_text
 
     given = Given()
     if method is Method.PAPER and profile:

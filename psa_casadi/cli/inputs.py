@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TypeVar
 
 from psa_casadi.errors import InputError
-from psa_casadi.experiment import Record, read_record
-from psa_casadi.experiment.column_map import parse_columns
-from psa_casadi.experiment.columns import ColumnMap
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import Record, read_record
+from psa_casadi.records.read.column_map import parse_columns
+from psa_casadi.records.read.columns import ColumnMap
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from psa_casadi.report.tables import Table
+    from psa_casadi.report.words.tables import Table
 
 Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress and no summary; errors still show.")

@@ -25,7 +25,7 @@ def simulate(
 ) -> None:
     """Simulate a model on a measured or planned voltage; write every output with its unit."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.experiment import write_record
+    from psa_casadi.records import write_record
     from psa_casadi.simulation.simulate import simulate_record
 
     given = Given()

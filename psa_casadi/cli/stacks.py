@@ -13,7 +13,7 @@ def stacks(
 ) -> None:
     """List the stacks that can be used by name; show the figures of one with their sources."""
     from psa_casadi.model.stacks import STACKS, stack_model
-    from psa_casadi.report.tables import stack_table, stacks_table
+    from psa_casadi.report.words.tables import stack_table, stacks_table
 
     if name is None:
         if quiet:

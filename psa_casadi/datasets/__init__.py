@@ -12,7 +12,7 @@ the conversion stated with the record makes of it, byte for byte.
 
 from psa_casadi.datasets.fetching import copy, find, origin_text, paths
 from psa_casadi.datasets.published import DATASETS, Dataset, DatasetFile
-from psa_casadi.experiment import Record, read_records
+from psa_casadi.records import Record, read_records
 
 __all__ = [
     "DATASETS",

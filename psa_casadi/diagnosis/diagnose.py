@@ -4,11 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.backward import reconsidered
-from psa_casadi.diagnosis.errors_of import held_out_rms
-from psa_casadi.diagnosis.extension import extend_any
-from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.retries import (
+from psa_casadi.diagnosis.base_fit.retries import (
     BETTER_BASE,
     from_band,
     from_extension,
@@ -17,21 +13,25 @@ from psa_casadi.diagnosis.retries import (
     instead_of,
     rings,
 )
-from psa_casadi.diagnosis.rounds import AFRESH, Round, decide, examine, search_cause
+from psa_casadi.diagnosis.held_out.errors import held_out_rms
+from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.search.backward import reconsidered
+from psa_casadi.diagnosis.search.extension import extend_any
+from psa_casadi.diagnosis.search.rounds import AFRESH, Round, decide, examine, search_cause
 from psa_casadi.diagnosis.standing import is_open, left, missed, worth_searching
-from psa_casadi.diagnosis.stuck_readings import without_stuck_readings
 from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import Experiment, divided, in_one_order
-from psa_casadi.experiment.suspects import cleaned
-from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.refitting import Progress, refit
-from psa_casadi.identification.search import fit_base
-from psa_casadi.identification.starting import chosen_start
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search.refitting import Progress, refit
+from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
+from psa_casadi.records.quality.suspects import cleaned
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment, divided, in_one_order
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
 

@@ -8,11 +8,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.misfit import Misfit
-from psa_casadi.diagnosis.noise_floor import NoiseFloor
-from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import Fit
+from psa_casadi.diagnosis.noise.floor import NoiseFloor
+from psa_casadi.diagnosis.residual.misfit import Misfit
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
 Verdict = Literal["adequate", "cause_named", "partly_explained", "ambiguous", "unexplained"]

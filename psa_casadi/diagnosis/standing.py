@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from psa_casadi.diagnosis.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.rounds import Round
-from psa_casadi.diagnosis.selection import OF_FIRST
+from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
+from psa_casadi.diagnosis.search.rounds import Round
+from psa_casadi.diagnosis.search.selection import OF_FIRST
 from psa_casadi.diagnosis.verdict import PARTLY
 
 #: A further cause must promise this share of what it has to remove, linearly estimated, unless

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from psa_casadi.component import Component
-from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.records.split import Experiment
 
 #: Sampling interval [s] below which a stack may ring within the record's band.
 FAST = 7e-4

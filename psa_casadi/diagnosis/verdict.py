@@ -6,13 +6,15 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.contenders import contenders, same_curve_note
-from psa_casadi.diagnosis.errors_of import errors_of, explained_share, gain_of, whole_residuals
-from psa_casadi.diagnosis.evidence import CREDIBLE, credible_set
-from psa_casadi.diagnosis.extension import Extension
-from psa_casadi.diagnosis.generalisation import Excess, held_out_excess
-from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
-from psa_casadi.diagnosis.noise_floor import NoiseFloor, noise_floor, pooled_level
+from psa_casadi.diagnosis.held_out.errors import (
+    errors_of,
+    explained_share,
+    gain_of,
+    whole_residuals,
+)
+from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
+from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
+from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
@@ -23,12 +25,15 @@ from psa_casadi.diagnosis.result import (
     Remaining,
     Verdict,
 )
-from psa_casadi.diagnosis.rounds import Round
+from psa_casadi.diagnosis.screening.evidence import CREDIBLE, credible_set
+from psa_casadi.diagnosis.search.contenders import contenders, same_curve_note
+from psa_casadi.diagnosis.search.extension import Extension
+from psa_casadi.diagnosis.search.rounds import Round
 from psa_casadi.diagnosis.task import same_curves
-from psa_casadi.experiment.split import Experiment
-from psa_casadi.identification.determinacy import Determinacy, determinacy
-from psa_casadi.identification.fit import Fit
+from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
+from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
 
 FloatArray = npt.NDArray[np.float64]

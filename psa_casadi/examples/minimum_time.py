@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
+from psa_casadi.design.tracking.minimum_time import QuickMove, quickest_move
+from psa_casadi.design.tracking.verification import Response, respond
 from psa_casadi.examples.raster_scan import scanner
-from psa_casadi.input_design.amplifier_limits import AmplifierLimits
-from psa_casadi.input_design.minimum_time import QuickMove, quickest_move
-from psa_casadi.input_design.verification import Response, respond
 
 BEGIN, END = 2e-6, 10e-6
 LIMITS = AmplifierLimits(min_voltage=-20.0, max_voltage=120.0)

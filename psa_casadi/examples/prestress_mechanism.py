@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import psa_casadi as psa
-from psa_casadi.input_design.mechanism import (
+from psa_casadi.design.mechanism.mechanism import (
     Limits,
     MechanismDesign,
     Mounting,

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from psa_casadi.design.experiment.designs import Separated
+from psa_casadi.design.experiment.experiment import resolving_experiment, usual_records
+from psa_casadi.design.experiment.limits import Limits
+from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
-from psa_casadi.experiment.record import Record
-from psa_casadi.input_design.designs import Separated
-from psa_casadi.input_design.experiment import resolving_experiment, usual_records
-from psa_casadi.input_design.limits import Limits
-from psa_casadi.input_design.search import Effort
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.report.experiment_part import write_voltage
+from psa_casadi.records.record import Record
+from psa_casadi.report.page.experiment_part import write_voltage
 from psa_casadi.simulation.simulate import simulate
 
 EFFECT, RIVAL = "field_dependent_gain", "sensor_nonlinearity"

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.export.fmu import export_fmu
-from psa_casadi.export.fmu_instance import Fmu
-from psa_casadi.export.fmu_masters import FloatArray, Signals, co_simulate
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import start_state
 

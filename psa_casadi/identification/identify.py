@@ -5,19 +5,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.experiment.noise import high_frequency_noise
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import Experiment, whole
-from psa_casadi.identification.advice import Advice, advice
-from psa_casadi.identification.combinations import Combination, free_combinations
-from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
-from psa_casadi.identification.fit import Fit
-from psa_casadi.identification.linear_start import linear_start
+from psa_casadi.identification.advice.advice import Advice, advice
+from psa_casadi.identification.certainty.combinations import Combination, free_combinations
+from psa_casadi.identification.certainty.determinacy import Determinacy, assumed_ratio, determinacy
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
-from psa_casadi.identification.refitting import Progress, record_rms, refit
-from psa_casadi.identification.search import Search, StartOutcome, search
-from psa_casadi.identification.starting import chosen_start
+from psa_casadi.identification.search.multistart import Search, StartOutcome, search
+from psa_casadi.identification.search.refitting import Progress, record_rms, refit
+from psa_casadi.identification.start.linear import linear_start
+from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
+from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.variables import Provenance
 from psa_casadi.version import __version__

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from psa_casadi.experiment.decimate import decimated
-from psa_casadi.experiment.fast_noise import fast_noise
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.suspects import masked, suspects
-from psa_casadi.identification.prediction import measured
-from psa_casadi.identification.starting import static_slope
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.start.ordinary import static_slope
+from psa_casadi.records.decimate import decimated
+from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.quality.suspects import masked, suspects
+from psa_casadi.records.record import Record
 
 
 def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:

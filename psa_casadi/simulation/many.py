@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError
-from psa_casadi.experiment.record import Record
 from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_sets
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import record_inputs

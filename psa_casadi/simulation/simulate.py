@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import Problems
-from psa_casadi.experiment.record import Record
 from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import Steps
 from psa_casadi.simulation.ways import accurate

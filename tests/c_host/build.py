@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from psa_casadi.export.fmu import export_fmu
-from psa_casadi.export.platforms import PLATFORMS, Platform
-from psa_casadi.export.sources import STRICT
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.fmu.platforms import PLATFORMS, Platform
+from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.simulation.compiler import OPTIMISE, run_compiler, zig_command
 from tests.fmu_models import model_named
 

@@ -11,19 +11,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.experiment.record import Record
-from psa_casadi.experiment.split import whole
-from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.fit import fit
+from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.identify import Identification, with_provenance
 from psa_casadi.identification.paper.conditions import loop_conditions, missing
 from psa_casadi.identification.paper.forces import in_forces
 from psa_casadi.identification.paper.hysteresis import Bends, HysteresisPart, hysteresis_part
 from psa_casadi.identification.paper.moments import linear_part
 from psa_casadi.identification.paper.shapes import Loop, find_loops, find_steps
-from psa_casadi.identification.refitting import noise_levels
-from psa_casadi.identification.starting import ordinary_values, starting_model
+from psa_casadi.identification.search.refitting import noise_levels
+from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import whole
 
 #: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
 _TIP = (0.8, 0.97)

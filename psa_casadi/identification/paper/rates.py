@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from psa_casadi.experiment.noise import high_frequency_noise
 from psa_casadi.identification.paper.shapes import Loop
+from psa_casadi.records.quality.noise import high_frequency_noise
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

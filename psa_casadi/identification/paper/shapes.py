@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import find_peaks
 
-from psa_casadi.experiment.record import Record
-from psa_casadi.identification.prediction import measured
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.records.record import Record
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""What to measure next: voltages that separate causes and settle parameters."""

@@ -1,0 +1,211 @@
+"""The search for the best voltage: many drawn waveforms, the best of them improved by SLSQP."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import Bounds, NonlinearConstraint, minimize
+
+from psa_casadi.design.experiment.candidates import KINDS, Kind, Waveform, draw
+from psa_casadi.design.experiment.criterion import Criterion, Point
+from psa_casadi.design.experiment.limits import Limits
+from psa_casadi.errors import PsaError
+from psa_casadi.records.record import Record
+from psa_casadi.simulation.one_thread import one_thread_of_algebra
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.units import FloatArray
+
+Progress = Callable[[str], None]
+
+#: Samples of the grid on which voltages are compared, at most, and a cycle's samples on it.
+GRID, _CYCLE = 500, 8
+#: Step of the gradient by a coordinate, of which 1 is a whole range.
+_STEP = 1e-3
+_POOR = -1e3
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long to search: waveforms drawn of each family, how many improved (most), steps."""
+
+    draws: int = 6
+    starts: int = 2
+    steps: int = 10
+    seed: int = 1
+
+
+#: A search that takes a few seconds: enough where any good voltage tells.
+BRIEF = Effort(draws=6, starts=1, steps=5)
+
+
+@dataclass(frozen=True, eq=False)
+class Best:
+    """The best voltage found: its record in full, its family, value, and what it cost.
+
+    `drawn` is the best value before any improvement; `evaluations` counts values and gradients.
+    """
+
+    record: Record
+    kind: str
+    value: float
+    drawn: float
+    evaluations: int
+
+
+@one_thread_of_algebra()
+def search(
+    criterion: Criterion,
+    limits: Limits,
+    steepest: float,
+    *,
+    usual: Sequence[Record] = (),
+    kinds: Sequence[Kind] = KINDS,
+    effort: Effort | None = None,
+    enough: Callable[[Record], bool] = lambda _: False,
+    progress: Progress = lambda _: None,
+) -> Best:
+    """Draw waveforms of the families, improve the best ones, return the best of all.
+
+    A `usual` record within the limits that is better than all of them is returned in their place.
+    Once the best record, on the comparison's grid, is `enough`, nothing is improved any more.
+
+    Gradients are exact in the trajectories' derivatives by delta and differences by the waveform's
+    coordinates, evaluated side by side. Raises SimulationError where no waveform can be simulated.
+    """
+    effort = effort or Effort()
+    problem = _Problem(criterion, limits)
+    pool = _drawn(limits, steepest, kinds, effort)
+    progress(f"comparing {len(pool)} voltages")
+    values = problem.compare(pool)
+    order = np.argsort(values)[::-1]
+    if values[order[0]] <= _POOR:
+        raise SimulationError(
+            "None of the drawn voltages could be simulated with the models; parameter values far"
+            " from physical ones are the likely cause: check them."
+        )
+    best, found, better = values[order[0]], (pool[order[0]], pool[order[0]].start), True
+    for number, k in enumerate(order[: effort.starts]):
+        if better and enough(problem.record(*found)):
+            break
+        progress(f"improving {number + 1} of {effort.starts}: {pool[k].kind}")
+        p, value = problem.improve(pool[k], effort.steps)
+        better = value > best
+        if better:
+            best, found = value, (pool[k], p)
+    record, kind = _in_full(*found, limits), str(found[0].kind)
+    for other in usual:
+        value = problem.value(other)
+        if value > best:
+            best, record, kind = value, other, other.name
+    return Best(record, kind, best, float(values[order[0]]), problem.evaluations)
+
+
+def _drawn(
+    limits: Limits, steepest: float, kinds: Sequence[Kind], effort: Effort
+) -> list[Waveform]:
+    """Draw waveforms of every family, no faster than the grid of the comparison can show."""
+    rng = np.random.default_rng(effort.seed)
+    rate = min(limits.samples, GRID) / limits.duration
+    limits = replace(limits, bandwidth=min(limits.band, rate / _CYCLE))
+    return [draw(kind, limits, steepest, rng) for kind in kinds for _ in range(effort.draws)]
+
+
+def _in_full(wave: Waveform, p: FloatArray, limits: Limits) -> Record:
+    """Return the record of a waveform on all of its samples."""
+    time = limits.grid()
+    return Record("designed", time, np.clip(wave.voltage(p, time), limits.low, limits.high))
+
+
+def coarse(record: Record, samples: int) -> Record:
+    """Return a record on a grid of at most so many samples."""
+    if record.n <= samples:
+        return record
+    spacing = record.sample_time * record.n / samples
+    time: FloatArray = spacing * np.arange(samples, dtype=np.float64)
+    return Record(record.name, time, np.interp(time, record.time, record.voltage))
+
+
+class _Problem:
+    """The criterion as a function of a waveform's coordinates, with its gradient."""
+
+    def __init__(self, criterion: Criterion, limits: Limits) -> None:
+        self._criterion = criterion
+        self._time = limits.grid(min(limits.samples, GRID))
+        self._limits = limits
+        self.evaluations = 0
+
+    def record(self, wave: Waveform, p: FloatArray) -> Record:
+        """Return the planned record on the grid."""
+        voltage = np.clip(wave.voltage(p, self._time), self._limits.low, self._limits.high)
+        return Record(wave.kind, self._time, voltage)
+
+    def point(self, wave: Waveform, p: FloatArray) -> Point:
+        """Return the criterion at p; a poor value where the models cannot follow."""
+        self.evaluations += 1
+        try:
+            return self._criterion.at(self.record(wave, p))
+        except PsaError:
+            return Point(_POOR, lambda _: 0.0)
+
+    def value(self, record: Record) -> float:
+        """Return the criterion at a record that is no waveform, brought to the grid."""
+        self.evaluations += 1
+        try:
+            return self._criterion.at(coarse(record, len(self._time))).value
+        except PsaError:
+            return _POOR
+
+    def compare(self, pool: Sequence[Waveform]) -> FloatArray:
+        """Return the value of every waveform as drawn."""
+        return np.array(side_by_side(lambda w: self.point(w, w.start).value, pool))
+
+    def gradient(self, wave: Waveform, p: FloatArray, point: Point) -> FloatArray:
+        """Return d value / d p (k,) by steps of the frozen function, into the bounds."""
+        self.evaluations += 1
+        steps = np.full(len(p), _STEP)
+        steps = np.where(p + steps > wave.upper, -steps, steps)
+        here = point.frozen(self.record(wave, p))
+
+        def along(k: int) -> float:
+            moved = p.copy()
+            moved[k] += steps[k]
+            try:
+                return (point.frozen(self.record(wave, moved)) - here) / float(steps[k])
+            except PsaError:
+                return 0.0
+
+        return np.array(side_by_side(along, range(len(p))))
+
+    def improve(self, wave: Waveform, steps: int) -> tuple[FloatArray, float]:
+        """Return the best allowed coordinates that SLSQP comes to, and their value."""
+        points: dict[bytes, Point] = {}
+        best = (wave.start, -np.inf)
+
+        def at(p: FloatArray) -> Point:
+            nonlocal best
+            key = p.tobytes()
+            if key not in points:
+                points[key] = self.point(wave, np.clip(p, wave.lower, wave.upper))
+                if points[key].value > best[1] and np.all(wave.slack(p) >= -1e-9):
+                    best = (np.clip(p, wave.lower, wave.upper), points[key].value)
+            return points[key]
+
+        def cost(p: FloatArray) -> float:
+            return -at(p).value
+
+        def slope(p: FloatArray) -> FloatArray:
+            downhill: FloatArray = -self.gradient(wave, p, at(p))
+            return downhill
+
+        bounded = wave.slack(wave.start).size > 0
+        minimize(
+            cost,
+            wave.start,
+            jac=slope,
+            method="SLSQP",
+            bounds=Bounds(wave.lower, wave.upper),
+            constraints=[NonlinearConstraint(wave.slack, 0.0, np.inf)] if bounded else [],
+            options={"maxiter": steps, "ftol": 1e-3},
+        )
+        return best

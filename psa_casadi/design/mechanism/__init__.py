@@ -1,0 +1,1 @@
+"""How to mount a stack: preload, stiffness and the loop around it."""

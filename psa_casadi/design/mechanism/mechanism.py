@@ -1,0 +1,214 @@
+"""Design a prestress mechanism: mass, damping and stiffness for wanted dynamics (paper 5.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.components.prestress import PRESTRESS_MECHANISM, PRESTRESS_PORT
+from psa_casadi.design.mechanism.goals import Limits, check_goals, goal_texts, wanted_pairs
+from psa_casadi.design.mechanism.loop import (
+    ACTS_ON,
+    ComplexArray,
+    Mechanics,
+    Mounting,
+    bandwidth,
+    closed_polynomial,
+    damping_ratios,
+    mechanical_poles,
+    mechanics_of,
+    response_times,
+    step_response,
+    stroke_loss,
+)
+from psa_casadi.design.mechanism.search import Wish, search
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.variables import Provenance
+
+__all__ = [
+    "ACTS_ON", "Limits", "Mechanics", "MechanismDesign", "Mounting", "bandwidth",
+    "closed_polynomial", "damping_ratios", "design_mechanism", "mechanical_poles", "mechanics_of",
+    "mechanism_model", "port_model", "root_locus", "step_response", "stroke_loss",
+]  # fmt: skip
+
+FloatArray = npt.NDArray[np.float64]
+
+#: A goal counts as reached if it is missed by less than this share.
+_REACHED = 1e-3
+#: A wanted pole counts as reached if one lies within this share of its size.
+_NEAR = 1e-2
+#: Starts that lead to costs within this difference led to the same design.
+_SAME = 1e-3
+
+
+@dataclass(frozen=True)
+class Reached:
+    """What a mounted stack does: least damping ratio of its mechanical poles, bandwidths [Hz].
+
+    `bandwidth` is that of X/F, `whole_bandwidth` that of X/V with lag and amplifier; `stroke_loss`
+    [1]; `peak_force` [N] and `overshoot` [1] in a step of rated voltage.
+    """
+
+    damping: float
+    bandwidth: float
+    whole_bandwidth: float
+    stroke_loss: float
+    peak_force: float
+    overshoot: float
+
+
+@dataclass(frozen=True)
+class MechanismDesign:
+    """A designed mechanism, what was wanted, and what is reached without it and with it.
+
+    `poles` and `free_poles` [rad/s] are those of the mechanics, slowest first; `lag_pole` is -1/tau
+    [rad/s], which no mechanism moves. `attained` says whether every goal is reached within limits;
+    `binding` names the limits that the design stands at. `agreeing` of `starts` searches led here.
+    """
+
+    mechanics: Mechanics
+    mounting: Mounting
+    acts_on: str
+    goals: tuple[str, ...]
+    limits: Limits
+    poles: ComplexArray
+    free_poles: ComplexArray
+    lag_pole: float
+    reached: Reached
+    free: Reached
+    attained: bool
+    binding: tuple[str, ...]
+    agreeing: int
+    starts: int
+
+
+def design_mechanism(
+    model: Model,
+    *,
+    damping: float | None = None,
+    bandwidth: float | None = None,
+    poles: Sequence[complex] = (),
+    limits: Limits = Limits(),  # noqa: B008
+    acts_on: str = "wafers",
+    starts: int = 6,
+) -> MechanismDesign:
+    """Return the mechanism that gives a stack the wanted dynamics within limits.
+
+    `damping`: least damping ratio of all mechanical poles; the bandwidth is then the largest that
+    it allows. `bandwidth` [Hz]: least -3 dB frequency of the mechanics; the damping is then the
+    largest (up to 1). With both, both are demanded and the smallest mechanism is taken. `poles`
+    [rad/s]: one or two pairs that the stack's poles shall come near to, in natural frequency and
+    damping ratio. See `mechanism_loop` for `acts_on`.
+
+    Raises InputError for goals or limits that make no sense; a goal out of reach is no error, the
+    design then comes as near as the limits allow and `attained` is False.
+    """
+    check_goals(damping, bandwidth, poles, limits, starts)
+    mechanics = mechanics_of(model, acts_on)
+    wish = Wish(
+        damping, bandwidth, wanted_pairs(poles), limits.stroke_loss, limits.force, limits.mass,
+        limits.damping,
+    )  # fmt: skip
+    found = search(mechanics, wish, starts)
+    best = found[0]
+    if not best.converged:
+        raise InputError(
+            f"None of {len(found)} searches for a mechanism ended well; the limits exclude each"
+            " other, or the goals are far from what the stack can do: widen the limits."
+        )
+    agreeing = sum(c.converged and c.cost < best.cost + _SAME for c in found)
+    mounting, free = best.mounting, Mounting(0.0, 0.0, 0.0)
+    reached = _measured(mechanics, mounting)
+    return MechanismDesign(
+        mechanics, mounting, acts_on, goal_texts(damping, bandwidth, poles), limits,
+        poles=mechanical_poles(mechanics, mounting), free_poles=mechanical_poles(mechanics, free),
+        lag_pole=-1.0 / mechanics.lag, reached=reached, free=_measured(mechanics, free),
+        attained=_attained(mechanics, mounting, reached, damping, bandwidth, poles),
+        binding=_binding(mounting, reached, limits), agreeing=agreeing, starts=len(found),
+    )  # fmt: skip
+
+
+def mechanism_model(design: MechanismDesign, name: str = "mechanism") -> Model:
+    """Return the mechanism as a model that exports like any other; its notes say what it is for."""
+    m = design.mounting
+    notes = (
+        f"Designed for {' and '.join(design.goals)}; acts on the {design.acts_on}.",
+        f"Reached: damping ratio {design.reached.damping:.4g}, bandwidth of the mechanics"
+        f" {design.reached.bandwidth:.5g} Hz, stroke loss {100 * design.reached.stroke_loss:.3g} %,"
+        f" peak force {design.reached.peak_force:.4g} N.",
+        f"The lag's pole at {design.lag_pole:.5g} rad/s stays where it is.",
+    )
+    values = {"m_m": m.mass, "c_m": m.damping, "k_m": m.stiffness}
+    model = compose([PRESTRESS_MECHANISM], values, name=name, description="prestress mechanism")
+    return model.with_values({}, provenance=Provenance(notes=notes))
+
+
+def port_model(model: Model) -> Model:
+    """Return a stack with the port for a mechanism's force and the motion of its tip."""
+    return model.with_components((*model.plant().components, PRESTRESS_PORT))
+
+
+def root_locus(design: MechanismDesign, gains: FloatArray) -> ComplexArray:
+    """Return the mechanical poles (len(gains), order) with g H in place of H, as branches."""
+    m = design.mounting
+    rows: list[ComplexArray] = []
+    for g in gains:
+        poles = mechanical_poles(
+            design.mechanics, Mounting(g * m.mass, g * m.damping, g * m.stiffness)
+        )
+        if rows and len(poles) == len(rows[-1]):
+            poles = _continued(rows[-1], poles)
+        rows.append(poles)
+    return np.array(rows)
+
+
+def _continued(before: ComplexArray, poles: ComplexArray) -> ComplexArray:
+    """Order poles so that each stands next to the one it came from."""
+    left = list(poles)
+    return np.array([left.pop(int(np.argmin([abs(p - b) for p in left]))) for b in before])
+
+
+def _measured(mechanics: Mechanics, mounting: Mounting) -> Reached:
+    response = step_response(mechanics, mounting, response_times(mechanics, mounting, 8000))
+    x = response.displacement
+    final = (1.0 - stroke_loss(mechanics, mounting)) * mechanics.stroke
+    return Reached(
+        damping=float(damping_ratios(mechanical_poles(mechanics, mounting)).min()),
+        bandwidth=bandwidth(mechanics, mounting),
+        whole_bandwidth=bandwidth(mechanics, mounting, whole=True),
+        stroke_loss=stroke_loss(mechanics, mounting),
+        peak_force=float(np.abs(response.force).max()),
+        overshoot=max(0.0, float(x.max()) / final - 1.0),
+    )
+
+
+def _attained(
+    mechanics: Mechanics,
+    mounting: Mounting,
+    r: Reached,
+    damping: float | None,
+    width: float | None,
+    poles: Sequence[complex],
+) -> bool:
+    if poles:
+        found = mechanical_poles(mechanics, mounting)
+        return all(bool(np.abs(found - p).min() < _NEAR * abs(p)) for p in poles)
+    return (damping is None or r.damping >= damping * (1.0 - _REACHED)) and (
+        width is None or r.bandwidth >= width * (1.0 - _REACHED)
+    )
+
+
+def _binding(m: Mounting, r: Reached, limits: Limits) -> tuple[str, ...]:
+    ends = (
+        ("stroke loss", r.stroke_loss, limits.stroke_loss),
+        ("force", r.peak_force, limits.force if limits.force is not None else inf),
+        ("largest mass", m.mass, limits.mass[1]),
+        ("largest damping", m.damping, limits.damping[1]),
+    )
+    found = [name for name, value, limit in ends if value > 0.99 * limit]
+    if limits.mass[0] > 0.0 and m.mass < 1.01 * limits.mass[0]:
+        found.append("least mass")
+    return tuple(found)

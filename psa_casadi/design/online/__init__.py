@@ -1,0 +1,1 @@
+"""A stack followed while it works: observers and recursive least squares."""

@@ -1,0 +1,124 @@
+"""A linearisation tried out: a stack driven plainly, by feed-forward, and by tracked feed-forward.
+
+The plant is `DriftingStack`, which shares no code with what drives it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.design.online.drifting_stack import DriftingStack
+from psa_casadi.design.online.observer import FeedForward, stack_values
+from psa_casadi.design.online.recursive_least_squares import (
+    AdaptiveFeedForward,
+    Estimate,
+    identifier_for,
+)
+from psa_casadi.model.compose import Model
+
+FloatArray = npt.NDArray[np.float64]
+Values = Mapping[str, float]
+Drift = Callable[[float], Values]
+
+TRACKED = ("A", "beta", "gamma", "delta", "n", "k_L")
+#: Share of the stroke that the sensor's noise has (rms).
+NOISE = 1e-4
+#: The rms error of sensor and model that the identification is told, as a share of the stroke.
+ERROR = 1e-3
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A run: times [s], wanted voltage of a linear stack [V], voltage [V], displacement [m].
+
+    `linear` [m] is what the plant does on the wanted voltage without its hysteresis force.
+    """
+
+    time: FloatArray
+    wanted: FloatArray
+    voltage: FloatArray
+    displacement: FloatArray
+    linear: FloatArray
+    estimate: Estimate | None = None
+
+    def nonlinearity(self, part: slice = slice(None)) -> float:
+        """Return the largest distance from the best line through (linear, displacement) [1].
+
+        As a share of the range of the displacement, over part of the run.
+        """
+        x, line = self.displacement[part], self.linear[part]
+        table = np.column_stack([line, np.ones_like(line)])
+        best = np.linalg.lstsq(table, x, rcond=None)[0]
+        return float(np.abs(x - table @ best).max() / np.ptp(x))
+
+
+def wanted_voltage(time: FloatArray, span: float, frequency: float = 5.0) -> FloatArray:
+    """Return a scan [V] from 0, at a frequency [Hz], whose depth changes so that loops nest."""
+    depth = 0.7 + 0.3 * np.cos(2.0 * np.pi * 0.18 * frequency * time)
+    wave: FloatArray = 0.5 * span * depth * (1.0 - np.cos(2.0 * np.pi * frequency * time))
+    return wave
+
+
+def off_values(model: Model, share: float, seed: int) -> Model:
+    """Return the model with each tracked parameter off by `share`, up or down at random."""
+    draw = np.random.default_rng(seed)
+    p = model.values
+    changed = {n: p[n] * (1.0 + share * draw.choice([-1.0, 1.0])) for n in TRACKED}
+    return model.with_values(changed | {"n": max(1.0, changed["n"])})
+
+
+def ageing(model: Model, duration: float, loss: float = 0.1, growth: float = 0.3) -> Drift:
+    """Return factors of a stack that ages: less force per volt, more hysteresis, a new bend.
+
+    Both go with the logarithm of time, as depolarisation does: by `loss` and `growth` at the end.
+    """
+
+    def factors(t: float) -> Values:
+        share = float(np.log1p(20.0 * t / duration) / np.log(21.0))
+        more = 1.0 + growth * share
+        bend = 1.0 + (0.5 * growth * share) / model.values["n"]
+        shapes = dict.fromkeys(("A", "beta", "gamma", "delta"), more)
+        return {**shapes, "n": bend, "k_L": 1.0 - loss * share}
+
+    return factors
+
+
+def driven(
+    plant: Model, control: str, known: Model, time: FloatArray, *, drift: Drift | None = None,
+    memory: float = 1.0, frequency: float = 5.0,
+) -> Drive:  # fmt: skip
+    """Drive a plant on `wanted_voltage`: plainly ("none"), by "feed-forward" or "tracked".
+
+    `known` is the model that the controller has; its memory [s] is for "tracked" only. The sensor
+    has noise.
+    """
+    p, period = plant.values, float(time[1] - time[0])
+    wanted = wanted_voltage(time, p["u_rated"], frequency)
+    stroke = abs(p["k_L"]) * p["u_rated"] * (1.0 / p["k_P"] + 1.0 / p["k_B"])
+    error = NOISE * stroke * np.random.default_rng(0).normal(size=time.size)
+    stack = DriftingStack(p, period, drift)
+    estimate = None
+    voltage, moved = np.zeros(time.size), np.zeros(time.size)
+    if control == "tracked":
+        tuned = identifier_for(known, period, noise=ERROR * stroke, memory=memory)
+        adaptive = AdaptiveFeedForward(tuned.values)
+        x = 0.0
+        for k in range(time.size):
+            voltage[k] = adaptive.step(float(wanted[k]), x + float(error[k - 1] if k else 0.0))
+            moved[k] = x = stack.step(float(voltage[k]))
+        estimate = adaptive.estimate
+    else:
+        plain = FeedForward(stack_values(known, period))
+        step = plain.step if control == "feed-forward" else float
+        voltage[:] = [step(w) for w in wanted.tolist()]
+        moved[:] = [stack.step(u) for u in voltage.tolist()]
+    return Drive(time, wanted, voltage, moved, _linear(plant, wanted, period), estimate)
+
+
+def _linear(plant: Model, wanted: FloatArray, period: float) -> FloatArray:
+    """Return what the plant does without its hysteresis force and without drift [m]."""
+    bare = {**plant.values, "A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
+    stack = DriftingStack(bare, period)
+    return np.array([stack.step(w) for w in wanted.tolist()])

@@ -1,0 +1,1 @@
+"""Voltages that follow a path or reach a place soonest, within the amplifier's limits."""

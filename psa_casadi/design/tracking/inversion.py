@@ -1,0 +1,206 @@
+"""The fast way to a voltage for a path: hysteresis inverse and zero-phase inverse, then trials.
+
+The linear part is inverted without phase (`linear_part.zero_phase_inverse`), which gives the
+voltage v_e that a stack without hysteresis would need. Behind the drive it is u_e, and the exact
+inverse of the Bouc-Wen element along the path finds u with u + f_H(u)/k_L = u_e:
+
+    k_L u_e' = k_L u' + A u' - (beta s sgn(f_H) + gamma) u' (|f_H|/h_ref)^n + delta u s,
+    s = sgn(u') = sgn(u_e'),   v = (u + R_s C_p u') / G
+
+What neither inverse knows (creep's past, further effects) shows in a run of the full simulator; its
+error goes back through the same inverse, so long as it falls. Limits, where there are any, cut the
+voltage of every trial; the error of samples that stand at a limit does not go back.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
+from psa_casadi.design.tracking.dynamics import demand_stack, rest_at
+from psa_casadi.design.tracking.linear_part import LinearPart, linear_part, zero_phase_inverse
+from psa_casadi.design.tracking.saturation import held
+from psa_casadi.design.tracking.targets import Target
+from psa_casadi.design.tracking.verification import Response, TrackingError, error_of, respond
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Model
+
+FloatArray = npt.NDArray[np.float64]
+
+_PARTS = 4  # sub-intervals of a sample for the hysteresis inverse
+_LEAST_SLOPE = 0.05  # of k_L; a stack whose force falls with rising voltage has no inverse
+_WORTH = 0.8  # a trial that leaves more of the error than this is the last
+_MOST_STROKES = 5.0  # range of a path over the stroke, above which its unit is wrong
+_MOST_SAMPLES = 4  # uniform samples for each sample of a path that is not uniform
+
+
+@dataclass(frozen=True, eq=False)
+class InvertedInput:
+    """A voltage [V] from inversion, the simulator's response, its error, and the trials made."""
+
+    target: Target
+    response: Response
+    error: TrackingError
+    trials: tuple[TrackingError, ...]
+
+
+def invert(
+    model: Model, target: Target, limits: AmplifierLimits | None = None, *, trials: int = 8
+) -> InvertedInput:
+    """Return the voltage for a path, and the error that the full simulator states.
+
+    `trials` bounds the runs of the simulator whose error is fed back. The path is sampled evenly
+    inside; the voltage is given at the path's own instants. It keeps within `limits` (a current to
+    about 1 %).
+
+    Raises InputError for a model that is no stack, for a path that it cannot hold at its start, and
+    for one that is many times the stroke.
+    """
+    demand_stack(model)
+    part, even = linear_part(model), _evenly(target)
+    _demand_reach(model, part, target)
+    bounds = limits or AmplifierLimits()
+    rest, _ = rest_at(model, float(target.displacement[0]))
+    learner = _Learner(model, part, even, rest, trials)
+    best = learner.learn(zero_phase_inverse(part, even.displacement, even.step), AmplifierLimits())
+    if bounds != AmplifierLimits():
+        best = learner.learn(best.wanted, bounds)
+    voltage = np.interp(target.time, even.time, best.voltage)
+    final = respond(model, target.time, voltage)
+    errors = tuple(t.error for t in learner.made)
+    return InvertedInput(target, final, error_of(target, final.displacement), errors)
+
+
+def _demand_reach(model: Model, part: LinearPart, target: Target) -> None:
+    rated = model.values.get("u_rated", np.inf)
+    stroke = rated * float(abs(part.response(np.zeros(1))[0]))
+    if target.span > _MOST_STROKES * stroke:
+        raise InputError(
+            f"The path's range is {1e6 * target.span:.4g} um, the stack's stroke at its rated"
+            f" {rated:.4g} V about {1e6 * stroke:.3g} um; the path is likely in another unit:"
+            " correct it."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """What was wanted of the linear part [V], the voltage played [V], and the error it left."""
+
+    wanted: FloatArray
+    voltage: FloatArray
+    error: TrackingError
+
+
+class _Learner:
+    """Trials on the simulator whose errors go back through the inverse, so long as they fall."""
+
+    def __init__(
+        self, model: Model, part: LinearPart, even: Target, rest: float, trials: int
+    ) -> None:
+        self._model, self._part, self._even, self._rest = model, part, even, rest
+        self._most, self.made = trials, list[_Trial]()
+
+    def learn(self, wanted: FloatArray, limits: AmplifierLimits) -> _Trial:
+        """Return the best of the trials from a first one on."""
+        first, felt, even = len(self.made), list[float](), self._even
+        for _ in range(max(self._most, 1)):
+            free = _voltage(self._model, even, wanted, self._rest)
+            voltage = held(self._model, limits, even.time, free)
+            shown = respond(self._model, even.time, voltage).displacement
+            self.made.append(_Trial(wanted, voltage, error_of(even, shown)))
+            left = np.where(voltage == free, even.displacement - shown, 0.0)
+            felt.append(float(np.linalg.norm(left)))
+            if len(felt) > 1 and felt[-1] > _WORTH * felt[-2]:
+                break
+            wanted = wanted + zero_phase_inverse(self._part, left, even.step)
+        return min(self.made[first:], key=lambda t: t.error.rms)
+
+
+def correct(model: Model, target: Target, voltage: FloatArray, measured: FloatArray) -> FloatArray:
+    """Return the voltage (n,) corrected by what a trial on the real stack showed.
+
+    `measured` (n,) [m] is the displacement that `voltage` (n,) [V] gave at the path's instants,
+    which must be uniform. The voltage is scaled by g, the path's range over the measured one, which
+    takes out every error of the gain; what is left goes through the model's linear inverse:
+
+        v -> v_0 + g (v - v_0) + s H^-1 (path - d_0 - g (measured - d_0)),
+
+    s the mean slope of the linear part over that of the trial. An error of the other parameters
+    counts only by its product with the error that is left.
+    """
+    part = linear_part(model)
+    gain = float(np.ptp(target.displacement) / np.ptp(measured))
+    rest = float(measured[0])
+    expected = float(np.ptp(voltage) * abs(part.response(np.zeros(1))[0]))
+    left = target.displacement - rest - gain * (measured - rest)
+    change = zero_phase_inverse(part, left, target.step) * gain * expected / target.span
+    corrected = voltage[0] + gain * (voltage - voltage[0]) + change
+    corrected[:2] = voltage[0]
+    return np.asarray(corrected)
+
+
+def _evenly(target: Target) -> Target:
+    steps = np.diff(target.time)
+    if np.ptp(steps) < 1e-6 * target.step:
+        return target
+    n = len(target.time)
+    wanted = int(np.ceil((target.time[-1] - target.time[0]) / np.min(steps))) + 1
+    time = np.linspace(target.time[0], target.time[-1], min(wanted, _MOST_SAMPLES * n))
+    return Target(time, np.interp(time, target.time, target.displacement))
+
+
+def _voltage(model: Model, even: Target, wanted: FloatArray, rest: float) -> FloatArray:
+    """Return the voltage (n,) that `wanted` becomes with hysteresis; at rest for one sample."""
+    voltage = wanted if "h_ref" not in model.values else _through_hysteresis(model, even, wanted)
+    voltage = np.array(voltage)
+    voltage[:2] = rest
+    return voltage
+
+
+def _through_hysteresis(model: Model, even: Target, wanted: FloatArray) -> FloatArray:
+    """Drive, exact inverse of the Bouc-Wen element, drive back."""
+    p = model.values
+    constant, dt = p["R_s"] * p["C_p"], even.step / _PARTS
+    fine = np.interp(
+        np.arange((len(wanted) - 1) * _PARTS + 1) / _PARTS, np.arange(len(wanted)), wanted
+    )
+    behind = _lagged(p["G"] * fine, constant, dt)
+    march = _march(model).mapaccum("march", len(fine) - 1)
+    u = np.array(march(ca.DM([behind[0], 0.0]), np.diff(behind)[None, :], dt)).T
+    u = np.concatenate([[behind[0]], u[:, 0]])
+    rate = np.diff(u) / dt
+    ends = np.concatenate([rate[:1], rate, rate[-1:]])
+    slope = 0.5 * (ends[:-1] + ends[1:])
+    return np.asarray(((u + constant * slope) / p["G"])[::_PARTS])
+
+
+def _lagged(values: FloatArray, constant: float, dt: float) -> FloatArray:
+    """Return the answer of 1/(constant s + 1) to a line through samples, from rest; exact."""
+    decay = np.exp(-dt / constant)
+    later = 1.0 - constant / dt * (1.0 - decay)
+    first = values[0] * (1.0 - later)
+    return np.asarray(
+        lfilter([later, 1.0 - decay - later], [1.0, -decay], values, zi=[first - 0.0])[0]
+    )
+
+
+def _march(model: Model) -> ca.Function:
+    """Return ((u, f_H), du_e, dt) -> (u, f_H) after a step, by the midpoint rule."""
+    p = model.values
+    state, change, dt = ca.SX.sym("s", 2), ca.SX.sym("du_e"), ca.SX.sym("dt")
+    rate = change / dt
+    sign = rate / ca.sqrt(rate**2 + p["hold_rate"] ** 2)
+
+    def increments(u: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        power = ca.fabs(force / p["h_ref"]) ** p["n"]
+        slope = p["k_L"] + p["A"] - (p["beta"] * sign * ca.sign(force) + p["gamma"]) * power
+        slope = ca.fmax(slope, _LEAST_SLOPE * p["k_L"])
+        du = (p["k_L"] * change - p["delta"] * u * sign * dt) / slope
+        return du, p["k_L"] * (change - du)
+
+    du, df = increments(state[0], state[1])
+    du, df = increments(state[0] + 0.5 * du, state[1] + 0.5 * df)
+    return ca.Function("step", [state, change, dt], [state + ca.vertcat(du, df)])

@@ -1,0 +1,267 @@
+"""Further attempts at the base fit: a base that is lost looks like a base that lacks something."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from psa_casadi.diagnosis.base_fit.ringing import images, ringing
+from psa_casadi.diagnosis.search.extension import Extension
+from psa_casadi.diagnosis.task import shows_ringing
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.search.force_start import retuned
+from psa_casadi.identification.search.multistart import search
+from psa_casadi.identification.search.refinement import without_blur
+from psa_casadi.identification.search.refitting import Progress, quick_from, refit
+from psa_casadi.identification.start.linear import linear_start
+from psa_casadi.identification.start.ordinary import ordinary_values
+from psa_casadi.identification.start.starting_points import resolved
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.timings import stage
+
+#: A base fit from an extension's parameters counts if its rms falls to this share.
+BETTER_BASE = 0.95
+#: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
+#: of another effect.
+_AS_GOOD, _LIKE = 10.0, 3.0
+#: To what share of the rms one beside the causes found must lead.
+_MUCH = 0.985
+#: n ln(ratio of rms) by which a fit with resonances must be better to count.
+_CLEAR = 15.0
+#: Multiple of the sampling rate about which the images of a mode's tone are tried at most.
+_IMAGES = 3
+_QUICK, _FIRST, _BEST = 8, 4, 2
+#: How far above what is of use the cost after the first evaluations may be.
+_HOPEFUL = 2.0
+#: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
+_AGAIN = 1.5
+#: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band; the
+#: decrease of the whitened sum of squares from which ringing is seen, and resonances at most.
+_NEAR_BAND, _SEEN, _RESONANCES = (300.0, 10_000.0), 40.0, 2
+
+
+@stage("base fit again")
+def from_extension(
+    first: Fit, extension: Extension, experiments: Sequence[Experiment]
+) -> Fit | None:
+    """Fit the base again from an extension's parameters; None where that cannot be simulated."""
+    names, least = first.unknowns.names, BETTER_BASE * first.rms
+    return _moved(first, extension.fit, names, experiments, least)
+
+
+@stage("base fit again")
+def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
+    """Fit the base from resonances and lags that fast records show; None if none explain more.
+
+    Ordinary lags lead nowhere for a stack that rings within the record's band. The search begins
+    with an ordinary loop and, while it misses something, with that of the base.
+    """
+    if "k_P" not in base.model.values:
+        return None
+    records = [e.record for e in experiments]
+    progress("resonances and lags that the records show")
+    linear = linear_start(records, base.model.values)
+    fastest = min(r.sample_time for r in records)
+    if linear is None or not resolved(base.model, linear.candidates, fastest):
+        return None
+    ordinary = base.model.with_values(ordinary_values(base.model, records))
+    best = base
+    for model in (ordinary, base.model):
+        with suppress(PsaError):
+            own = search(model, experiments, linear=linear.candidates, progress=progress).best
+            best = min(best, own, key=lambda f: f.rms)
+            if own.cost < _AGAIN * len(own.residuals):
+                break
+    return best if _short(base, best) > _CLEAR else None
+
+
+@stage("base fit again")
+def from_band(
+    base: Fit, before: Fit, experiments: Sequence[Experiment], progress: Progress
+) -> Fit | None:
+    """Fit the base with resonances near or above the band; None where none explains much more.
+
+    `before` is the model with the causes found so far. Steps excite such a resonance, and what a
+    slow record shows of its ringing looks like noise after each step.
+    """
+    found = before
+    for _ in range(_RESONANCES):
+        more = _with_ringing(found, experiments, progress, _SEEN)
+        if more is None:
+            break
+        found = more
+    if found.rms > _MUCH * before.rms:
+        return None
+    resonant = _in_base(base, before, found, experiments)
+    return None if resonant is None else _tuned(resonant, experiments, progress)
+
+
+@stage("base fit again")
+def from_mode(
+    base: Fit,
+    before: Fit,
+    mode: Extension,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+) -> Fit | None:
+    """Fit the base with a resonance of its own where a further mode was found.
+
+    `before` is the model, perhaps with causes named before, to which the mode was added. A stack
+    that rings near the sampling rate shows a tone at one of its images, |k f_s + f| and
+    |k f_s - f|, which decays as fast: its damping ratio times its frequency is the same. None where
+    no mass explains the data about as well as the mode.
+    """
+    progress("base fit, with the mode as a resonance of the stack's own")
+    found, values = mode.fit.model.values, before.model.values
+    tone, damping = found[mode.effect.tone or ""], found["mode_damping"]
+    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    near = images(tone, rate, _IMAGES)
+    starts = [m for f in near for m in _masses(values, [f], damping * tone / f)]
+    final = _with_masses(before, starts, experiments, _as_good(mode.fit, _AS_GOOD))
+    if final is None or _short(final, mode.fit) >= _AS_GOOD:
+        return None
+    return _in_base(base, before, final, experiments)
+
+
+@stage("base fit again")
+def instead_of(
+    base: Fit, extension: Extension, experiments: Sequence[Experiment], progress: Progress
+) -> Fit | None:
+    """Fit the base with resonances of its own where an effect was found.
+
+    None where no masses explain the data about as well as the effect. A resonance above the band
+    delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
+    what looks like a further mode.
+    """
+    if not rings(extension):
+        found = _with_ringing(base, experiments, progress, least=_as_good(extension.fit, _LIKE))
+        if found is not None and _short(found, extension.fit) < _LIKE:
+            return _tuned(found, experiments, progress)
+    if not shows_ringing(experiments):
+        return None
+    again = retuned(base, experiments, progress, reached=extension.fit.rms)
+    if _short(base, again) <= _CLEAR:
+        return None
+    return without_blur(again, experiments) if _short(again, extension.fit) < _LIKE else None
+
+
+def rings(extension: Extension) -> bool:
+    """Whether an effect is a further resonance of the plant."""
+    return extension.effect.tone is not None and extension.effect.belongs_to == "plant"
+
+
+def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+    """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
+    left = ringing(found, experiments)
+    if left is None or left.decrease >= _SEEN:
+        found = retuned(found, experiments, progress)
+    return without_blur(found, experiments)
+
+
+def _short(found: Fit, other: Fit) -> float:
+    """Return n ln(rms of a fit / rms of another one)."""
+    return len(other.residuals) * float(np.log(found.rms / other.rms))
+
+
+def _as_good(other: Fit, short: float) -> float:
+    """Return the rms [m] that falls short of another fit's by n ln(ratio of rms) = `short`."""
+    return other.rms * float(np.exp(short / len(other.residuals)))
+
+
+def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experiment]) -> Fit | None:
+    """Return the base fitted from where a fit with more masses, and perhaps causes, has led."""
+    if before is base:
+        return found
+    names = [n for n in found.unknowns.names if n in base.model.values]
+    return _moved(base, found, names, experiments)
+
+
+def _moved(
+    base: Fit,
+    found: Fit,
+    names: Sequence[str],
+    experiments: Sequence[Experiment],
+    least: float = np.inf,
+) -> Fit | None:
+    values = {n: found.model.values[n] for n in names}
+    try:
+        moved = replace(base, model=base.model.with_values(values))
+        return refit(moved, experiments, names, least=least)
+    except PsaError:
+        return None
+
+
+def _with_ringing(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+    seen: float = 0.0,
+    least: float = np.inf,
+) -> Fit | None:
+    """Fit with a mass free, from the resonances that the residual's ringing may be of.
+
+    None where it shows less than `seen`, a decrease of the whitened sum of squares, or where none
+    explains clearly more, down to the rms `least` [m]. A mass that is free already is tried
+    elsewhere, too.
+    """
+    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
+        return None
+    tone = ringing(fit, experiments)
+    if tone is None or tone.decrease < seen:
+        return None
+    progress(f"base fit, with a resonance that may be seen at {tone.tone:.3g} Hz")
+    starts = [m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z)]
+    return _with_masses(fit, starts, experiments, least)
+
+
+def _masses(
+    p: Mapping[str, float], frequencies: Sequence[float], damping: float
+) -> Iterator[dict[str, float]]:
+    """Yield mass and damping of wafers or bonding layers for resonances [Hz] at a damping ratio."""
+    for part in ("_P", "_B") if "k_B" in p else ("",):
+        for frequency in frequencies:
+            mass = p[f"k{part}"] / (2.0 * np.pi * frequency) ** 2
+            lost = 2.0 * damping * float(np.sqrt(mass * p[f"k{part}"]))
+            yield {f"m{part}": mass, f"c{part}": lost}
+
+
+def _with_masses(
+    before: Fit,
+    starts: Sequence[Mapping[str, float]],
+    experiments: Sequence[Experiment],
+    least: float = np.inf,
+) -> Fit | None:
+    """Fit with one mass free from several starts; None where none explains clearly more.
+
+    None as well where no rms comes near the `least` that is of use [m].
+    """
+    least = min(least, before.rms * float(np.exp(-_CLEAR / len(before.residuals))))
+
+    def begun(start: Mapping[str, float]) -> Fit | None:
+        free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
+        return quick_from(
+            before, before.model, experiments, free,
+            start_states=before.starts(), evaluations=_FIRST, start=start,
+        )  # fmt: skip
+
+    def further(quick: Fit) -> Fit | None:
+        names, states = quick.unknowns.names, quick.starts()
+        return quick_from(
+            quick, quick.model, experiments, names, start_states=states, evaluations=_QUICK
+        )
+
+    limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
+    found = [f for f in side_by_side(begun, starts) if f is not None and f.cost < limit]
+    ended = side_by_side(further, sorted(found, key=lambda f: f.cost)[:_BEST])
+    best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
+    if best is None:
+        return None
+    try:
+        final = refit(best, experiments, best.unknowns.names, least=least)
+    except PsaError:
+        return None
+    return final if _short(before, final) > _CLEAR else None

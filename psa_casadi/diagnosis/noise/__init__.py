@@ -1,0 +1,1 @@
+"""The noise of a record: its colour, its level, and what no noise explains."""

@@ -1,0 +1,157 @@
+"""The noise floor of every record: from repeats, from holds, or from the fast part."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.noise.colour import Colour, noise_rms
+from psa_casadi.records.quality.noise import first_order_noise
+from psa_casadi.records.quality.quantum import quantum_of
+from psa_casadi.records.quality.repeats import MeasuredNoise, holds, repeats
+from psa_casadi.records.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+Source = Literal["repeats", "holds", "fast part"]
+
+#: Fewer samples than this give no level to a few per cent.
+ENOUGH = 200
+#: Noise is called white where no autocorrelation exceeds this.
+VISIBLE = 0.1
+#: Lags of the autocovariance that a first-order autoregression is given with.
+_LAGS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFloor:
+    """The noise of one record: standard deviation `level` [m, or counts] and where it comes from.
+
+    `autocovariance` (lags,) [m^2] begins at lag 0 and is that of `level`; `autoregression` (p,) is
+    empty for white noise; `samples` is what the level rests on. `quantum` is the step between the
+    sensor's levels, None where it shows none; `sentence` says all this in words.
+    """
+
+    record: str
+    level: float
+    source: Source
+    samples: int
+    autocovariance: FloatArray
+    autoregression: FloatArray
+    quantum: float | None
+    sentence: str
+
+
+def noise_floor(
+    records: Sequence[Record], residuals: Sequence[FloatArray]
+) -> tuple[NoiseFloor, ...]:
+    """Return the noise floor of every record, from the best source that it offers.
+
+    Repeats come first, then holds: no model is involved in them. Else the fast part of the residual
+    (n,), nan where nothing counts, shows the noise, white or of first order (`first_order_noise`).
+    No level is below quantum/sqrt(12), the rms of rounding to a quantum.
+    """
+    return tuple(_floor(r, e) for r, e in zip(records, residuals, strict=True))
+
+
+def pooled_level(
+    noise: Sequence[NoiseFloor], residuals: Sequence[FloatArray], colour: Colour
+) -> float:
+    """Return the rms of the noise over all records [m].
+
+    Where no voltage was repeated that of the residual's fast part counts, at most that of noise of
+    the given colour and at least that of rounding: a hold may ring.
+    """
+    counts = [np.count_nonzero(np.isfinite(e)) for e in residuals]
+    powers = [
+        n.level**2
+        if n.source == "repeats"
+        else max(noise_rms(e[np.isfinite(e)], colour), _rounding(n.quantum)) ** 2
+        for n, e in zip(noise, residuals, strict=True)
+    ]
+    return float(np.sqrt(np.average(powers, weights=counts)))
+
+
+#: Samples from which the colour of the noise is known without a model.
+_COLOUR = 500
+
+
+def known_colour(record: Record) -> FloatArray | None:
+    """Return the autoregression of a record's noise where repeats tell it, else None.
+
+    Holds do not: what rings or hums during a hold would count as the noise's colour.
+    """
+    source, found, _ = _source(record)
+    known = found is not None and source == "repeats" and found.samples >= _COLOUR
+    return found.autoregression if known and found is not None else None
+
+
+def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
+    valid = residual[np.isfinite(residual)]
+    y = record.displacement
+    quantum = quantum_of(y[np.isfinite(y)]) if y is not None else None
+    source, found, how = _source(record)
+    if found is None:
+        level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
+        covariance = np.asarray(level**2 * r ** np.arange(_LAGS if r > 0 else 1), np.float64)
+        found = MeasuredNoise(level, covariance, np.array([r] if r > 0 else []), valid.size)
+    rounding = _rounding(quantum)
+    level, covariance = found.level, found.autocovariance.copy()
+    if level < rounding:
+        covariance[0] += rounding**2 - level**2
+        level = rounding
+    coloured = np.any(np.abs(covariance[1:]) > VISIBLE * covariance[0])
+    colour = "correlated from sample to sample" if coloured else "white"
+    said = (
+        f"The noise of {record.name} is {quantity(level, record.displacement_unit)} rms, {how}"
+        f" ({found.samples} samples)"
+    )
+    said += f", and {colour}."
+    if quantum is not None:
+        step = quantity(quantum, record.displacement_unit)
+        least = quantity(rounding, record.displacement_unit)
+        said += f" The sensor counts in steps of {step}, which alone give {least} rms."
+    return NoiseFloor(
+        record.name, level, source, found.samples, covariance, found.autoregression, quantum, said
+    )
+
+
+def _rounding(quantum: float | None) -> float:
+    """Rms of rounding to a quantum, 0 where there is none."""
+    return (quantum or 0.0) / float(np.sqrt(12.0))
+
+
+@lru_cache(maxsize=64)
+def _source(record: Record) -> tuple[Source, MeasuredNoise | None, str]:
+    """Return the best source that needs no model, what it says, and how it does so in words."""
+    again = repeats(record)
+    if again is not None and again.samples >= ENOUGH:
+        apart = quantity(again.distances[0], "s")
+        return "repeats", again, f"from what differs when the same voltage returns after {apart}"
+    still = holds(record)
+    if still is not None and still.samples >= ENOUGH:
+        spans = "a held voltage" if still.count == 1 else f"{still.count} held voltages"
+        return "holds", still, f"from {spans} after smooth creep is taken off"
+    return "fast part", None, "from the fast part of what the model leaves"
+
+
+def figure(value: float) -> str:
+    """Return a number with two significant digits, "0" if it is none."""
+    return f"{float(f'{value:.1e}'):g}" if np.isfinite(value) else "no number"
+
+
+_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
+    "m": (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9)),
+    "s": (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)),
+}
+
+
+def quantity(value: float, unit: str) -> str:
+    """Return a value in SI units with two digits in a handy unit, such as "0.12 um"."""
+    sizes = _UNITS.get(unit, ((unit, 1.0),))
+    name, size = next((u for u in sizes if abs(value) >= 0.1 * u[1]), sizes[-1])
+    if value == 0:
+        return f"0 {'um' if unit == 'm' else unit}"
+    return f"{figure(value / size)} {name}"

@@ -1,0 +1,143 @@
+"""Is anything missing at all? Tests of a residual that need no named effect."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from psa_casadi.diagnosis.noise.colour import Colour
+
+FloatArray = npt.NDArray[np.float64]
+
+#: The tests alarm below this probability, which they share.
+ALARM = 1e-3
+_LAGS = 25
+#: Squares of the residual over their mean that count at most.
+_MOST = 9.0
+
+
+@dataclass(frozen=True)
+class Omnibus:
+    """Probability of the residual under noise alone, the test that says so, and where it shows."""
+
+    p_value: float
+    excess: float
+    where: str
+
+    @property
+    def alarm(self) -> bool:
+        """Whether something besides noise is in the residual."""
+        return self.p_value < ALARM
+
+
+def omnibus(
+    residual: FloatArray,
+    voltage: FloatArray,
+    time: FloatArray,
+    colour: Colour,
+    floor: float,
+    *,
+    even: bool,
+) -> Omnibus:
+    """Test a residual (samples,) [m] for structure that noise of the given colour does not have.
+
+    Three tests with Bonferroni's correction: Ljung-Box on the whitened residual; Fisher's g for a
+    line in its spectrum; and an F test on general features of the voltage and time. With `even` a
+    fourth one asks whether its size is the same everywhere: a sensor's noise is, what a colour may
+    have swallowed of a misfit is not. `excess` is the share of the residual's power above the noise
+    `floor` [m].
+    """
+    white = colour.whiten(residual)
+    tests = {
+        "neighbouring samples are correlated": whiteness(white),
+        "its spectrum has a line": _fisher_line(white),
+        "it depends on voltage, rate or time": _features(white, voltage, time, colour),
+    }
+    if even:
+        tests["the size depends on voltage, rate or time"] = _sizes(white, voltage, time, colour)
+    where, p = min(tests.items(), key=lambda item: item[1])
+    power = float(np.mean(residual**2))
+    excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
+    return Omnibus(min(1.0, len(tests) * p), excess, f"In the residual {where}.")
+
+
+def whiteness(white: FloatArray) -> float:
+    """Return the p-value of Ljung and Box's test (1978) that neighbours are not correlated."""
+    n = len(white)
+    centred = white - np.mean(white)
+    power = float(centred @ centred)
+    if power <= 0 or n <= 2 * _LAGS:
+        return 1.0
+    r = np.array([centred[k:] @ centred[:-k] / power for k in range(1, _LAGS + 1)])
+    statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, _LAGS + 1)))
+    return float(special.chdtrc(_LAGS, statistic))
+
+
+def _fisher_line(white: FloatArray) -> float:
+    power = np.abs(np.fft.rfft(white - np.mean(white))[1:-1]) ** 2
+    count = len(power)
+    if count < 8 or not np.sum(power) > 0:
+        return 1.0
+    share = float(np.max(power) / np.sum(power))
+    return float(min(1.0, count * (1.0 - share) ** (count - 1)))
+
+
+def _features(white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour) -> float:
+    """F test of the residual on u, u^2, u^3, sgn(u'), |u'|, u sgn(u'), a trend and slow waves."""
+    u, rate, turn, t = _drive(voltage, time)
+    columns = [np.ones_like(u), u, u**2, u**3, turn, np.abs(rate), u * turn, u**2 * turn, t, t**2]
+    columns += [f(np.pi * k * t) for k in (1, 2, 3) for f in (np.sin, np.cos)]
+    x = colour.whiten(np.column_stack(columns))
+    return _f_test(x, white)
+
+
+def _sizes(white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour) -> float:
+    """F test of the squares on voltage, rate, time and way since the last reversal.
+
+    Breusch and Pagan, Econometrica 47 (1979) 1287, with Koenker's correction; squares are over
+    their mean in each record, and those above `_MOST` count as that.
+    """
+    ends = np.cumsum(colour.lengths)[:-1]
+    powers = np.array([np.mean(part**2) for part in np.split(white, ends)])
+    if not np.all(powers > 0):
+        return 1.0
+    u, rate, turn, t = _drive(voltage, time)
+    speed = np.abs(rate) / (float(np.max(np.abs(rate))) or 1.0)
+    way, age = _since_reversal(u, turn)
+    columns = [u, u**2, speed, np.sqrt(speed), way, np.exp(-20.0 * way), np.exp(-0.1 * age), t]
+    x = np.column_stack([*columns, t**2])
+    squares = np.minimum(white**2 / np.repeat(powers, colour.lengths), _MOST)
+    return _f_test(x - np.mean(x, axis=0), squares - np.mean(squares))
+
+
+def _drive(
+    voltage: FloatArray, time: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return voltage about its mean over its range, its rate, direction, and the time in 0 to 1."""
+    u = (voltage - np.mean(voltage)) / (np.ptp(voltage) or 1.0)
+    rate = np.gradient(u)
+    turn = np.sign(rate) * (np.abs(rate) > 1e-3 * np.max(np.abs(rate)))
+    return u, rate, turn, (time - time[0]) / ((time[-1] - time[0]) or 1.0)
+
+
+def _since_reversal(u: FloatArray, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the distance |u - u_r| from the last reversal and the samples since it."""
+    index = np.arange(len(u))
+    moving = np.flatnonzero(turn)
+    reversed_at = moving[1:][turn[moving[1:]] != turn[moving[:-1]]]
+    last = np.zeros(len(u), dtype=np.int64)
+    last[reversed_at] = reversed_at
+    last = np.maximum.accumulate(last)
+    return np.abs(u - u[last]), (index - last).astype(np.float64)
+
+
+def _f_test(x: FloatArray, y: FloatArray) -> float:
+    """Return the p-value that columns x (n, k) tell nothing of y (n,)."""
+    coefficients, _, rank, _ = np.linalg.lstsq(x, y, rcond=None)
+    explained = float(np.sum((x @ coefficients) ** 2))
+    rest = float(y @ y) - explained
+    freedom = len(y) - rank
+    if rest <= 0 or freedom <= 0:
+        return 1.0
+    return float(special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))

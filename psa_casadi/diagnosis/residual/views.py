@@ -1,0 +1,227 @@
+"""A residual against one coordinate: binned means, their errors, and the share they explain."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.noise.floor import figure, quantity
+from psa_casadi.records.quality.noise import correlation_inflation
+
+FloatArray = npt.NDArray[np.float64]
+IndexArray = npt.NDArray[np.int64]
+
+#: Most bins of a view, bins of a decade on a logarithmic axis, fewest samples of a bin.
+BINS, PER_DECADE, FEWEST = 24, 5, 8
+#: Blocks that are fitted and judged in turn: for what changes slowly, and for the drive's state.
+FINE, COARSE = 128, 32
+#: Samples that quantiles are taken from.
+_DRAWN = 20_000
+#: A bin's mean is mentioned beyond so many standard errors.
+_CLEAR = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Residual against one coordinate; arrays (bins,), `x` in the unit `x_unit`.
+
+    `mean` is the mean residual [m, or counts] of a bin and `spread` its standard error, correlation
+    included. `share` is what the view explains of the residual's power above the noise, judged on
+    blocks of samples that the means were not taken from; 0 unless `significant`.
+    """
+
+    name: str
+    title: str
+    x_label: str
+    x_unit: str
+    x: FloatArray
+    mean: FloatArray
+    spread: FloatArray
+    share: float
+    significant: bool
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What all views share: `index` (m,) of the samples that count of the record's n, and there.
+
+    `residual` (m,) is without its mean, `excess` [m^2] its power above the noise, at least a tenth
+    of all; `unit` is "m" or "counts".
+    """
+
+    n: int
+    index: IndexArray
+    residual: FloatArray
+    excess: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A coordinate of the samples `x` (n,), nan where it has no value, and how to show it.
+
+    `sign` (n,) is multiplied to the residual, 0 where it does not count; `noun` names the axis in a
+    sentence.
+    """
+
+    name: str
+    title: str
+    x_label: str
+    x_unit: str
+    noun: str
+    x: FloatArray
+    log: bool = False
+    blocks: int = COARSE
+    sign: FloatArray | None = None
+
+
+def ground_of(residual: FloatArray, level: float, unit: str) -> Ground:
+    """Return the samples of a residual (n,) that count; `level` [m] is that of the noise."""
+    index = np.flatnonzero(np.isfinite(residual))
+    values = residual[index] - np.mean(residual[index]) if index.size else residual[index]
+    power = float(np.mean(values**2)) if index.size else 0.0
+    return Ground(residual.size, index, values, max(power - level**2, 0.1 * power), unit)
+
+
+def view(ground: Ground, axis: Axis) -> View:
+    """Return the view of a residual along one axis. Work grows with the number of samples."""
+    x, r = axis.x[ground.index], ground.residual
+    there = np.isfinite(x)
+    if axis.sign is not None:
+        r = r * axis.sign[ground.index]
+        there &= axis.sign[ground.index] != 0
+    if np.count_nonzero(there) < 8 * FEWEST:
+        return _nothing(axis, f"This record is too short for {axis.noun}, or has none.")
+    x, r, where = x[there], r[there], ground.index[there]
+    x = np.log10(x) if axis.log else _rounded(x)
+    edges = _edges(x, axis.log)
+    if not edges.size:
+        return _nothing(axis, f"This record has a single value of {axis.noun}.")
+    bins = np.searchsorted(edges, x, side="right")
+    blocks = 2 * max(2, min(axis.blocks, r.size // 24) // 2)
+    block = where * blocks // ground.n
+    count = _table(bins, block, None, edges.size + 1, blocks)
+    kept = count.sum(1) >= FEWEST
+    if np.count_nonzero(kept) < 2:
+        return _nothing(axis, f"This record is too short for {axis.noun}.")
+    count, total = count[kept], _table(bins, block, r, edges.size + 1, blocks)[kept]
+    place = np.bincount(bins, weights=x, minlength=kept.size)[kept] / count.sum(1)
+    square = np.bincount(bins, weights=r**2, minlength=kept.size)[kept]
+    mean = total.sum(1) / count.sum(1)
+    variance = np.maximum(square / count.sum(1) - mean**2, 0.0)
+    inflation = _inflation(count, total, mean, variance, r)
+    gain, significant = _explained(count, total, max(inflation, 1.0) * float(np.mean(variance)))
+    explained = gain / ground.residual.size
+    found = replace(
+        _nothing(axis, f"Against {axis.noun}, nothing is seen beyond the noise."),
+        x=10.0**place if axis.log else place,
+        mean=mean,
+        spread=np.sqrt(inflation * variance / count.sum(1)),
+    )
+    if not significant:
+        return found
+    share = float(min(1.0, explained / max(ground.excess, explained)))
+    return _worded(replace(found, share=share, significant=True), axis, ground.unit)
+
+
+def _table(
+    bins: IndexArray, block: IndexArray, weights: FloatArray | None, rows: int, columns: int
+) -> FloatArray:
+    """Return the number or the weights of the samples of every bin and block."""
+    code = bins * columns + block
+    table = np.bincount(code, weights=weights, minlength=rows * columns)
+    return table.reshape(rows, columns).astype(np.float64)
+
+
+def _rounded(x: FloatArray) -> FloatArray:
+    """Return the coordinate without rounding errors, which would make bins of one value."""
+    step = 1e-6 * float(np.ptp(x))
+    rounded: FloatArray = np.round(x / step) * step if step > 0 else x
+    return rounded
+
+
+def _edges(x: FloatArray, log: bool) -> FloatArray:
+    """Return inner edges of the bins: equal shares of the samples, or of the decades."""
+    low, high = float(x.min()), float(x.max())
+    most = min(BINS, x.size // (2 * FEWEST))
+    if log:
+        size = int(np.clip(PER_DECADE * (high - low), 1, most))
+        return np.linspace(low, high, size + 1)[1:-1]
+    if x.size > _DRAWN:
+        x = x[np.random.default_rng(0).integers(0, x.size, _DRAWN)]
+    inner = np.unique(np.quantile(x, np.arange(1, most) / most, method="lower"))
+    edges: FloatArray = inner[inner > low]
+    # two values of which the greater is rare have no edge among the quantiles
+    return edges if edges.size or high <= low else np.array([high])
+
+
+def _inflation(
+    count: FloatArray, total: FloatArray, mean: FloatArray, variance: FloatArray, r: FloatArray
+) -> float:
+    """Return by how much correlation enlarges the variance of means, from sums over blocks.
+
+    Sums of white noise over n_bj samples of bin b and block j differ from n_bj times the bin's mean
+    by a variance that adds up to s_b^2 n_b (1 - sum_j (n_bj/n_b)^2).
+    """
+    found = float(np.sum((total - count * mean[:, None]) ** 2))
+    size = count.sum(1)
+    white = float(np.sum(variance * size * (1.0 - np.sum((count / size[:, None]) ** 2, axis=1))))
+    if white <= 1e-3 * float(np.sum(variance * size)):
+        return correlation_inflation(r)
+    return found / white
+
+
+def _explained(count: FloatArray, total: FloatArray, noise: float) -> tuple[float, bool]:
+    """Return the sum of squares that the means of one half of the blocks explain in the other.
+
+    The halves follow Thue and Morse, so that no period of the drive falls in with them. Under noise
+    the gain has mean -2 B s^2 and deviation 4 sqrt(B) s^2 for B bins and the variance s^2 of
+    independent samples; it is significant some five deviations above, if most blocks agree.
+    """
+    blocks = count.shape[1]
+    half = np.array([k.bit_count() % 2 for k in range(blocks)], dtype=np.bool_)
+    gain = np.zeros(blocks)
+    for part in (half, ~half):
+        size = count[:, ~part].sum(1)
+        mean = np.where(size >= FEWEST, total[:, ~part].sum(1) / np.maximum(size, 1.0), 0.0)
+        gain[part] = 2.0 * mean @ total[:, part] - mean**2 @ count[:, part]
+    gain = gain[count.sum(0) > 0]
+    explained = float(np.sum(gain))
+    agree = float(np.mean(gain)) > 1.5 * float(np.std(gain)) / np.sqrt(max(gain.size, 1))
+    # the variance itself is uncertain where blocks are few
+    least = (8.0 * float(np.sqrt(count.shape[0])) + 12.0) * (1.0 + 20.0 / blocks) * noise
+    return explained, agree and explained > least
+
+
+def _nothing(axis: Axis, sentence: str) -> View:
+    none = np.zeros(0)
+    return View(
+        axis.name, axis.title, axis.x_label, axis.x_unit, none, none, none, 0.0, False, sentence
+    )
+
+
+def _worded(v: View, axis: Axis, unit: str) -> View:
+    """Return the view with its sentence: the extremes that stand clear of their errors."""
+    clear = np.flatnonzero(np.abs(v.mean) > _CLEAR * v.spread)
+    ends = {int(clear[f(v.mean[clear])]) for f in (np.argmax, np.argmin)} if clear.size else set()
+    seen = " and ".join(
+        f"{signed(v.mean[k], unit)} at {_at(v.x[k], v.x_unit)}"
+        for k in sorted(ends, key=lambda k: -abs(v.mean[k]))
+    )
+    said = f"The residual follows {axis.noun}{f': {seen}' if seen else ''}; {explains(v.share)}."
+    return replace(v, sentence=said)
+
+
+def explains(share: float) -> str:
+    """Return the share of a view as the end of a sentence."""
+    return f"this view explains {100.0 * share:.0f} % of the excess"
+
+
+def signed(value: float, unit: str) -> str:
+    """Return a residual with its sign and unit."""
+    return f"{'+' if value > 0 else ''}{quantity(value, unit)}"
+
+
+def _at(value: float, unit: str) -> str:
+    return quantity(value, unit) if unit in ("m", "s") else f"{figure(value)} {unit}"

@@ -1,0 +1,1 @@
+"""What each effect would add to the base model, before it is fitted."""

@@ -1,0 +1,133 @@
+"""How much the data speak for one more effect: Laplace's approximation of the Bayes factor.
+
+    ln B = n/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
+
+S are sums of squares of the whitened residuals, the noise level being the data's own; H is the
+information on the unknowns that the effect adds, those of the model before projected out, and P
+their prior standard deviations. An unknown that the data do not tell costs nothing, a sharp one
+costs what its prior range is wider than its interval (MacKay, Neural Computation 4 (1992), 415).
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.screening.screen import Score, Screening
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
+
+FloatArray = npt.NDArray[np.float64]
+
+#: ln B is divided by this, or by this share of the largest, before it becomes a probability: the
+#: effects are not the true equations, so that their evidence differs by more than noise, and the
+#: more the stronger the effect is. Checked by the reliability table of the benchmark `diagnose`.
+TEMPERATURE, FORM = 2.0, 0.004
+#: The set of effects that cannot be told apart holds the cause with this probability.
+CREDIBLE = 0.95
+
+
+def evidence(before: Fit, after: Fit, colour: Colour) -> float:
+    """Return ln B of a fit with one more effect over the fit without it."""
+    n = len(before.residuals)
+    sums = [float(np.sum(colour.whiten(f.residuals) ** 2)) for f in (before, after)]
+    gained = 0.5 * n * float(np.log(sums[0] / max(sums[1], 1e-300)))
+    added = _added(before, after)
+    level = float(np.sqrt(sums[1] / n))
+    jacobian = colour.whiten(after.jacobian) / max(level, 1e-300)
+    kept = [k for k in range(after.unknowns.size) if k not in added]
+    new, old = jacobian[:, added], jacobian[:, kept]
+    free = new - old @ np.linalg.lstsq(old, new, rcond=1e-10)[0]
+    prior = after.unknowns.prior[added]
+    scaled = free * np.where(np.isfinite(prior), prior, 1.0)
+    _, penalty = np.linalg.slogdet(np.eye(len(added)) + scaled.T @ scaled)
+    return gained - 0.5 * float(penalty)
+
+
+def estimated(before: Fit, screening: Screening) -> dict[str, float]:
+    """Return every effect's ln B as its trial directions tell it, without a full fit.
+
+    Linear in the gain g with prior N(0, s^2), s = `LINEAR_PRIOR` ordinary sizes, and estimated to
+    sigma: ln B = n/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged over
+    the probe values, each as likely as the others.
+    """
+    found: dict[str, list[float]] = {}
+    total = float(np.sum(screening.colour.whiten(before.residuals) ** 2))
+    for score in screening.scores:
+        share = min(score.decrease * screening.colour.level**2 / max(total, 1e-300), 1.0 - 1e-9)
+        gained = -0.5 * len(before.residuals) * float(np.log1p(-share))
+        found.setdefault(score.direction.effect.name, []).append(_linear(score, gained))
+    return {name: float(np.logaddexp.reduce(v) - np.log(len(v))) for name, v in found.items()}
+
+
+def levelled(
+    evidences: Mapping[str, float],
+    alike: Sequence[Sequence[str]],
+    judged: Collection[str] = (),
+) -> dict[str, float]:
+    """Return the evidence with that of the best one for all effects that are `alike`.
+
+    They are the same but for a form that none of them is known to have. Where some of a group are
+    `judged` by a full fit, the best one of those counts.
+    """
+    found = dict(evidences)
+    for group in alike:
+        present = [n for n in group if n in found]
+        known = [n for n in present if n in judged] or present
+        found |= dict.fromkeys(present, max((found[n] for n in known), default=0.0))
+    return found
+
+
+def probabilities(evidences: Mapping[str, float]) -> dict[str, float]:
+    """Return the probability of each effect, given that one of them is the cause."""
+    if not evidences:
+        return {}
+    given = np.array(list(evidences.values()))
+    values = given / max(TEMPERATURE, FORM * float(np.max(given)))
+    weights = np.exp(values - np.logaddexp.reduce(values))
+    return dict(zip(evidences, weights.tolist(), strict=True))
+
+
+def bic_probabilities(before: Fit, after: Mapping[str, Fit], colour: Colour) -> dict[str, float]:
+    """Return probabilities from the Bayesian information criterion of fits with one more effect.
+
+    They are proportional to exp(-BIC/2), BIC = n ln(S/n) + k ln(n) of k unknowns: those of
+    `evidence` are better calibrated, which the controls of the benchmark `diagnose` show.
+    """
+    n = len(before.residuals)
+    values = {
+        name: -0.5 * n * float(np.log(np.mean(colour.whiten(fit.residuals) ** 2)))
+        - 0.5 * len(_added(before, fit)) * float(np.log(n))
+        for name, fit in after.items()
+    }
+    total = float(np.logaddexp.reduce(list(values.values()))) if values else 0.0
+    return {name: float(np.exp(v - total)) for name, v in values.items()}
+
+
+def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, ...]:
+    """Return the fewest effects whose probabilities sum to `level`, the most probable first."""
+    chosen, total = [], 0.0
+    for name, p in sorted(probability.items(), key=lambda item: -item[1]):
+        if total >= level:
+            break
+        chosen.append(name)
+        total += p
+    return tuple(chosen)
+
+
+def _linear(score: Score, gained: float) -> float:
+    if not np.isfinite(score.detectable_gain) or score.detectable_gain == 0.0:
+        return 0.0
+    width = LINEAR_PRIOR * score.direction.unit_gain / abs(score.detectable_gain)
+    return gained * width**2 / (1.0 + width**2) - 0.5 * float(np.log1p(width**2))
+
+
+def _added(before: Fit, after: Fit) -> list[int]:
+    """Return the coordinates of `after` that `before` has not."""
+    known, names = before.unknowns, after.unknowns
+    added = [k for k, n in enumerate(names.names) if n not in known.names]
+    for record, states in enumerate(names.started):
+        first = names.first(record)
+        added += [first + k for k, s in enumerate(states) if s not in known.started[record]]
+    return added

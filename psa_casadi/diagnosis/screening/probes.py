@@ -1,0 +1,177 @@
+"""Trial directions: what each effect would add to the prediction at its trial values."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import RECORD_DURATION, SPECTRAL_PEAKS, Component
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import measured, predict_record
+from psa_casadi.model.compose import Model
+from psa_casadi.records.drive import among_harmonics
+from psa_casadi.records.quality.filtering import peaks as highest_peaks
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.start import memory_names
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
+_PEAKS, _FINER = 4, 8
+_RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """One effect at one set of trial values.
+
+    `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
+    times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
+    history. `one_sided` says that only positive multiples make sense.
+    """
+
+    effect: Component
+    values: dict[str, float]
+    memory: tuple[dict[str, float], ...]
+    unit_gain: float
+    column: FloatArray
+    one_sided: bool
+    finite: bool
+
+
+def directions(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    effects: Sequence[Component],
+    *,
+    finite_steps: bool = True,
+) -> list[Direction]:
+    """Return the directions of all effects over their probe values, at the fitted model.
+
+    Without `finite_steps` only derivatives are taken, which some effects have not at their null.
+    They are simulated side by side.
+    """
+    peaks = residual_peaks(fit, experiments)
+    tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
+
+    def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
+        return list(_directions_at(fit, experiments, *task, finite_steps))
+
+    return [d for found in side_by_side(one, tasks) for d in found]
+
+
+def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Frequencies [Hz] of the highest peaks in the spectrum of the first record's residual.
+
+    Samples that do not count are 0, so that a line keeps its phase across them. The range of a
+    periodic drive's harmonics is left out: it may be distortion.
+    """
+    experiment = experiments[0]
+    count = experiment.stop
+    used = experiment.used[:count]
+    residual = np.zeros(count)
+    residual[used] = fit.residuals[: int(used.sum())]
+    residual[used] -= np.mean(residual[used])
+    power = np.abs(np.fft.rfft(residual * np.hanning(count), _FINER * count)) ** 2
+    frequency = np.fft.rfftfreq(_FINER * count, experiment.record.sample_time)
+    lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
+    order = highest_peaks(power[lowest:], apart, 5 * _PEAKS) + lowest
+    tones = [k for k in order if not among_harmonics(frequency[k], experiment.record)]
+    strongest = np.array(tones[:_PEAKS], dtype=int)
+    return tuple(float(f) for f in np.sort(frequency[strongest])) or (
+        0.1 / experiment.record.sample_time,
+    )
+
+
+def _probe_values(
+    effect: Component, experiments: Sequence[Experiment], peaks: tuple[float, ...]
+) -> Iterator[dict[str, float]]:
+    longest = max(e.record.duration for e in experiments)
+    grids: list[tuple[float, ...]] = []
+    for name, grid in effect.probe.items():
+        if grid == SPECTRAL_PEAKS:
+            low, high = next(p.bounds for p in effect.parameters if p.name == name)
+            grids.append(tuple(f for f in peaks if low < f < high))
+        elif grid == RECORD_DURATION:
+            grids.append((longest,))
+        elif isinstance(grid, tuple):
+            grids.append(grid)
+    for point in product(*grids):
+        yield dict(zip(effect.probe, point, strict=True))
+
+
+def _directions_at(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    effect: Component,
+    values: dict[str, float],
+    finite_steps: bool,
+) -> Iterator[Direction]:
+    model = fit.model.with_effect(effect, values)
+    gain = effect.gain or ""
+    parameter = model.parameter(gain)
+    scale = parameter.typical({**model.values, gain: 0.0})
+    one_sided = parameter.bounds[0] >= 0
+    for memory in _histories(fit, experiments, effect, model):
+        steps = [s * scale for s in effect.finite_step if finite_steps] or [0.0]
+        for step in steps:
+            try:
+                column = _column(fit, experiments, model, gain, memory, step, scale)
+            except PsaError:
+                continue
+            if np.all(np.isfinite(column)) and np.any(column):
+                yield Direction(
+                    effect, values, memory, step or scale, column, one_sided, bool(step)
+                )
+
+
+def _histories(
+    fit: Fit, experiments: Sequence[Experiment], effect: Component, model: Model
+) -> list[tuple[dict[str, float], ...]]:
+    """The effect's memories at rest, and for settling ones also as after long cycling."""
+    known = fit.starts()
+    settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
+    variants = [tuple(known)]
+    if settling:
+        cycled = []
+        for memory, e in zip(known, experiments, strict=True):
+            y = measured(e.record)[e.used]
+            cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
+        variants.append(tuple(cycled))
+    if effect.trial_starts:
+        return [tuple({**k, **trial} for k in known) for trial in effect.trial_starts]
+    return variants
+
+
+def _column(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    model: Model,
+    gain: str,
+    memory: tuple[dict[str, float], ...],
+    step: float,
+    scale: float,
+) -> FloatArray:
+    changed = model.with_values({gain: step}) if step else model
+    names = memory_names(model.structure)
+    parts: list[FloatArray] = []
+    first = 0
+    for e, start in zip(experiments, memory, strict=True):
+        states = dict.fromkeys(names, 0.0) | start
+        y, by_gain, _ = predict_record(
+            changed, e.record, states, [gain], stop=e.stop, rtol=fit.way.rtol if step else _RTOL
+        )
+        used = e.used[: e.stop]
+        count = int(used.sum())
+        if step:
+            index = len(parts)
+            prediction = measured(e.record)[: e.stop][used] - fit.residuals[first : first + count]
+            parts.append(y[used] + fit.offset(index) - prediction)
+        else:
+            parts.append(by_gain[used, 0] * scale)
+        first += count
+    return np.concatenate(parts)

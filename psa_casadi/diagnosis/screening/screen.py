@@ -1,0 +1,176 @@
+"""Screening: which effects would lower the residual, the base parameters being free to follow.
+
+Every direction is prewhitened, the fitted parameters' directions are projected out, and the
+decrease of the sum of squares is compared with one threshold for the maximum over all directions,
+drawn from Gaussian noise along the actual directions (family-wise; Davies 1987, Hansen 1996).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.noise.colour import Colour, colour_of
+from psa_casadi.diagnosis.screening.probes import Direction
+from psa_casadi.identification.fitting.fit import Fit
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Chance that clean data exceed the threshold.
+FALSE_ALARM = 0.005
+_DRAWS = 4000
+_SEED = 20150810  # of the threshold's simulation: the same data give the same verdict
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """One direction's decrease of the whitened sum of squares, and the gain it suggests."""
+
+    direction: Direction
+    decrease: float
+    gain: float
+    detectable_gain: float
+
+    @property
+    def start(self) -> float:
+        """Gain to start a fit from: the linear estimate, or the finite step that was tried.
+
+        A base fit without a one-sided effect may overshoot in its place, so that the estimate has
+        the wrong sign; the fit then starts from an ordinary size.
+        """
+        if self.direction.finite or (self.direction.one_sided and self.gain <= 0):
+            return self.direction.unit_gain
+        return self.gain
+
+
+@dataclass(frozen=True, eq=False)
+class Screening:
+    """Scores in falling order, the threshold for the largest, and the noise they were judged by."""
+
+    scores: tuple[Score, ...]
+    threshold: float
+    colour: Colour
+
+    def best_by_effect(self) -> dict[str, Score]:
+        """Return each effect's best score, in falling order."""
+        best: dict[str, Score] = {}
+        for score in self.scores:
+            best.setdefault(score.direction.effect.name, score)
+        return best
+
+
+def screen(
+    fit: Fit,
+    trials: Sequence[Direction],
+    lengths: Sequence[int],
+    known: Sequence[FloatArray | None] | None = None,
+    *,
+    colour: Colour | None = None,
+) -> Screening:
+    """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples.
+
+    `known` is the colour of the records' noise where it is known without a model; `colour` replaces
+    the whole estimate.
+    """
+    basis = independent(fit.jacobian)
+    none: FloatArray = np.zeros((len(fit.residuals), 0))
+    columns = np.hstack([none, *(d.column[:, None] for d in trials)])
+    if colour is None:
+        every = independent(np.hstack([basis, without(columns, basis)]))
+        colour = colour_of(without(fit.residuals, every), lengths, known, every)
+    white_basis = independent(colour.whiten(fit.jacobian))
+    residual = without(colour.whiten(fit.residuals), white_basis)
+    white = without(colour.whiten(columns), white_basis)
+    raw = np.linalg.norm(colour.whiten(columns), axis=0)
+    norm = np.linalg.norm(white, axis=0)
+    usable = norm > 1e-6 * raw
+    norm = np.where(usable, norm, 1.0)
+    unit = np.where(usable, white / norm, 0.0)
+    t = unit.T @ residual / colour.level
+    scores = []
+    for k, direction in enumerate(trials):
+        allowed = usable[k] and (t[k] > 0 or not direction.finite)
+        scores.append(
+            Score(
+                direction,
+                float(t[k] ** 2) if allowed else 0.0,
+                float(t[k] * colour.level / norm[k] * direction.unit_gain),
+                float(direction.unit_gain * colour.level / norm[k]) if usable[k] else np.inf,
+            )
+        )
+    scores.sort(key=lambda s: -s.decrease)
+    return Screening(tuple(scores), _threshold(unit), colour)
+
+
+@dataclass(frozen=True, eq=False)
+class Copy:
+    """How well an effect can copy what another one adds.
+
+    `share` of the contribution's power, with all of the effect's directions; the `direction` that
+    does best alone, and the `gain` at which it does.
+    """
+
+    share: float
+    direction: Direction
+    gain: float
+
+
+def copies(
+    fit: Fit, added: FloatArray, trials: Sequence[Direction], colour: Colour
+) -> tuple[float, dict[str, Copy]]:
+    """Return the power of a contribution over the noise's, and how each effect can copy it.
+
+    `added` (samples,) [m] is what another effect adds to the prediction. The fitted parameters are
+    projected out of it and of the trial directions.
+    """
+    basis = independent(colour.whiten(fit.jacobian))
+    target = without(colour.whiten(added), basis)
+    power = float(target @ target)
+    found: dict[str, Copy] = {}
+    for name in dict.fromkeys(d.effect.name for d in trials):
+        own = [d for d in trials if d.effect.name == name]
+        columns = np.column_stack([d.column for d in own])
+        free = without(colour.whiten(columns), basis)
+        norms = np.linalg.norm(free, axis=0)
+        large = np.flatnonzero(norms > 1e-6 * np.linalg.norm(columns, axis=0))
+        if power <= 0 or not large.size:
+            continue
+        share = float(np.sum((independent(free[:, large]).T @ target) ** 2)) / power
+        along = free[:, large].T @ target / norms[large]
+        best = int(np.argmax(np.abs(along)))
+        direction, norm = own[int(large[best])], float(norms[large[best]])
+        found[name] = Copy(share, direction, float(along[best]) / norm * direction.unit_gain)
+    return power / colour.level**2, found
+
+
+def independent(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the columns' span; tiny directions are dropped.
+
+    The columns are scaled first.
+    """
+    norm = np.linalg.norm(columns, axis=0)
+    scaled: FloatArray = columns[:, norm > 0] / norm[norm > 0]
+    if not scaled.shape[1]:
+        return scaled
+    u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    basis: FloatArray = u[:, s > 1e-7 * s[0]]
+    return basis
+
+
+def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return vectors (samples,) or columns less what an orthonormal basis spans of them."""
+    projected: FloatArray = vectors - basis @ (basis.T @ vectors)
+    return projected
+
+
+def _threshold(unit: FloatArray) -> float:
+    """Quantile of the largest squared projection of white noise on the unit directions."""
+    if not unit.shape[1]:
+        return np.inf
+    gram = unit.T @ unit
+    values, vectors = np.linalg.eigh(gram)
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    noise = np.random.default_rng(_SEED).standard_normal((_DRAWS, len(gram)))
+    largest = np.max((noise @ root.T) ** 2, axis=1)
+    return float(np.quantile(largest, 1.0 - FALSE_ALARM))

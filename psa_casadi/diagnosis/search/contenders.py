@@ -1,0 +1,93 @@
+"""The fitted effects that a diagnosis could not choose among, for the design of what would tell."""
+
+from collections.abc import Sequence
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.result import Contender
+from psa_casadi.diagnosis.screening.evidence import CREDIBLE, credible_set
+from psa_casadi.diagnosis.search.extension import extend, polish
+from psa_casadi.diagnosis.search.rounds import Round, examine
+from psa_casadi.diagnosis.search.selection import starts_of
+from psa_casadi.diagnosis.task import Task, same_curves
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search.refitting import Progress
+from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.model.compose import Model
+from psa_casadi.records.quality.suspects import cleaned
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment, whole
+
+
+def contenders(
+    r: Round, experiments: Sequence[Experiment], names: Sequence[str] = ()
+) -> tuple[Contender, ...]:
+    """Return effects of one step of the search with their fits; those not fitted are fitted now.
+
+    Without `names` they are the fewest that hold the cause with the probability `CREDIBLE`. An
+    effect whose fit fails is left out.
+    """
+    names = names or credible_set(r.probability, CREDIBLE)
+    found = {e.effect.name: e for e in r.extensions}
+    evidence = dict(r.evidence)
+    for name in names:
+        if name not in found:
+            scores = starts_of(r.screening, name)
+            fitted = extend(r.fit, experiments, scores, r.screening.colour) if scores else None
+            if fitted is not None:
+                found[name] = polish(r.fit, fitted, experiments, r.screening.colour)
+                evidence[name] = found[name].evidence
+    return tuple(Contender(n, found[n].fit, evidence[n]) for n in names if n in found)
+
+
+def one_of_each(
+    found: Sequence[Contender], experiments: Sequence[Experiment]
+) -> tuple[tuple[Contender, ...], str]:
+    """Return contenders of which a voltage may tell one from another, and what none will tell.
+
+    Of effects that bend the same curve the best fit stands for all; the sentence is empty where
+    there are none.
+    """
+    best = sorted(found, key=lambda c: c.fit.cost)
+    own = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
+    groups = same_curves(experiments, own, best[0].fit) if best else ()
+    rest = {name for group in groups for name in group[1:]}
+    said = " ".join(same_curve_note(group) for group in groups)
+    return tuple(c for c in found if c.effect not in rest), said
+
+
+def same_curve_note(names: Sequence[str]) -> str:
+    """Return the sentence on effects that bend the same curve."""
+    return (
+        f"{' and '.join(names)} bend the same curve: no voltage below the resonances tells one from"
+        " another. Measure with another sensor or elsewhere in the range of this one, or without"
+        " the load; or sample fast enough to excite and see the resonances."
+    )
+
+
+def fit_contenders(
+    records: Sequence[Record],
+    effects: Sequence[Component],
+    *,
+    model: Model | None = None,
+    progress: Progress = lambda _: None,
+) -> tuple[Fit, tuple[Contender, ...], tuple[Experiment, ...]]:
+    """Fit the base and each of the named effects to records in full, without a verdict.
+
+    Raises InputError where an effect cannot be fitted to them.
+    """
+    experiments = tuple(whole(cleaned(r)) for r in records)
+    start = chosen_start(records, model, None)[0].without(e.name for e in effects)
+    base = fit_base(start, experiments, progress=progress)
+    predicted = tuple(base.predicted(experiments))
+    found = examine(base, predicted, Task(experiments, tuple(effects), progress=progress))
+    progress("fitting the rivals")
+    chosen = contenders(found, experiments, [e.name for e in effects])
+    lost = {e.name for e in effects} - {c.effect for c in chosen}
+    if lost:
+        raise InputError(
+            f"{', '.join(sorted(lost))} could not be fitted to these records, so there is nothing"
+            " to tell apart; leave the records out to design from ordinary sizes."
+        )
+    return base, chosen, experiments

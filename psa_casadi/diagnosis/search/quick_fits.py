@@ -1,0 +1,92 @@
+"""Fits with one more effect that stop early: a few iterations from each start."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from psa_casadi.component import Component
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.search.multistart import FIXED
+from psa_casadi.identification.search.refitting import quick_rtol
+from psa_casadi.records.split import Experiment
+
+#: Evaluations of a quick fit from a direction.
+QUICK = 8
+
+#: An effect's values without its gain, the gain, and the records' memories.
+Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
+
+
+def quick_fit(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    effect: Component,
+    starts: Sequence[Start],
+    reset: dict[str, float],
+    evaluations: int = QUICK,
+) -> Fit | None:
+    """A few iterations from every start; the best of them.
+
+    Where none comes below the fit without the effect, some more from there, with the gain at 0: the
+    loop may be such that no other start of the gain fits to it.
+    """
+    fits = [fit_from(before, experiments, effect, start, reset, evaluations) for start in starts]
+    found = [f for f in fits if f is not None]
+    if not any(f.cost < before.cost for f in found):
+        states = tuple(before.starts())
+        nested = (starts[0][0], 0.0, states)
+        last = fit_from(before, experiments, effect, nested, {}, 3 * QUICK)
+        found += [last] if last is not None else []
+    return min(found, key=lambda f: f.cost) if found else None
+
+
+def fit_from(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    effect: Component,
+    start: Start,
+    reset: dict[str, float],
+    evaluations: int,
+) -> Fit | None:
+    """Fit with one more effect from a start, the other values `reset`; None if that fails."""
+    values, gain, memory = start
+    names = list(before.unknowns.names)
+    names += [p.name for p in effect.parameters if p.name not in FIXED and p.name not in names]
+    low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
+    for share in (1.0, 0.3):
+        value = float(np.clip(share * gain, 0.9 * low, 0.9 * high))
+        try:
+            return fit(
+                before.model.with_effect(effect, {**values, **reset, effect.gain or "": value}),
+                experiments,
+                names,
+                sigma=before.sigma,
+                start_states=memory,
+                evaluations=evaluations,
+                tolerance=1e-3,
+                rtol=quick_rtol(before.sigma, experiments),
+            )
+        except PsaError:
+            continue
+    return None
+
+
+def continued(
+    current: Fit,
+    experiments: Sequence[Experiment],
+    rtol: float,
+    tolerance: float,
+    evaluations: int,
+) -> Fit:
+    """Go on with a fit from where it stopped. Raises PsaError."""
+    return fit(
+        current.model,
+        experiments,
+        current.unknowns.names,
+        sigma=current.sigma,
+        start_states=current.starts(),
+        evaluations=evaluations,
+        tolerance=tolerance,
+        rtol=rtol,
+    )

@@ -1,0 +1,1 @@
+"""`psa check`: what an FMU says and does, row by row."""

@@ -1,0 +1,174 @@
+"""Trajectories of an FMU against an independent computation of the same model."""
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.export.fmu.model_description import time_scale
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
+from psa_casadi.model.compose import Model
+from psa_casadi.reference import Signal, from_samples, simulate
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import nominal_value
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Largest difference from the independent computation, as a share of the range.
+LIMIT = 1e-6
+#: The same where the importer asks for no tolerance (1e-6 by default).
+DEFAULT_LIMIT = 1e-5
+
+_TOLERANCE = 1e-10
+_SLOW_STEPS = (1e-2, 1e-3, 1e-4)
+_MOST_STEPS = 6000
+_FAST_STEP, _FAST_COUNT = 1e-6, 3000
+_SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The largest difference of one run over the range, its limit, and which output has it."""
+
+    name: str
+    figure: float
+    limit: float
+    remark: str
+
+
+def signals_of(model: Model, segment: float) -> Signals:
+    """Return a test signal: six straight segments [s each] from 0 up to every input's nominal."""
+    times = np.array([segment * k for k in range(len(_SHAPE))])
+    columns = []
+    for i, declared in enumerate(model.structure.inputs):
+        shape = np.roll(_SHAPE[1:], 2 * i)
+        columns.append(nominal_value(declared.nominal, model.values) * np.array([0.0, *shape]))
+    return Signals(model.input_names, times, np.array(columns).T.reshape(len(times), -1))
+
+
+def has_reference(model: Model) -> bool:
+    """Say whether the model is the paper's, which `psa_casadi.reference` computes independently."""
+    names = {c.name for c in model.components}
+    base, simplified = ({c.name for c in family} for family in (BASE, SIMPLIFIED))
+    return any(f - {"sensor"} <= names <= f for f in (base, simplified))
+
+
+def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+    """Return the outputs (n, ny) by the reference, or by the simulator for a model with effects.
+
+    Of a model without outputs: its states (n, nx).
+
+    At a jump of inputs that are held the outputs are those before it; with sampled states, which
+    take their samples after it, those after it.
+    """
+    if not has_reference(model):
+        return _simulated(model, times, inputs)
+    cascade = "k_B" in model.values
+    signals = {name: _signal(inputs, i) for i, name in enumerate(inputs.names)}
+    found = simulate(
+        model.values,
+        signals["voltage"],
+        times,
+        load_force=signals["load_force"],
+        breakpoints=list(inputs.times),
+        mechanics="cascade" if cascade else "single_mass",
+        rtol=_TOLERANCE,
+    )
+    return np.array(
+        [
+            getattr(found, "displacement" if n == "measured_displacement" else n)
+            for n in model.output_names
+        ]
+    ).T
+
+
+def _signal(inputs: Signals, column: int) -> Signal:
+    if not inputs.held:
+        return from_samples(inputs.times, inputs.values[:, column])
+    times, values = inputs.times.tolist(), inputs.values[:, column].tolist()
+    return lambda t: float(values[max(bisect_left(times, t) - 1, 0)])
+
+
+def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+    quiet = not model.output_names
+    grid = np.union1d(times, inputs.times[inputs.times <= times[-1]])
+    start = np.array([s.start for s in model.structure.states])
+    hold = "zero" if inputs.held else "linear"
+    steps = run(model, grid, inputs.at(grid), start, rtol=1e-11, hold=hold)
+    if quiet or not inputs.held or model.sampled_names:
+        return (steps.x if quiet else steps.y)[np.isin(grid, times)]
+    p = np.array([[model.values[n]] * len(grid) for n in model.parameter_names])
+    before = inputs.at(grid, before=True)
+    found = np.array(model.structure.f(grid[None, :], steps.x.T, before.T, p)[1])
+    return found.T[np.isin(grid, times)]
+
+
+def agreements(fmu: Fmu, model: Model) -> Iterator[Agreement]:
+    """Compare both interfaces with the independent computation, communication steps 1 us to 10 ms.
+
+    A slow run has knots every 10 ms, or every multiple of 10 ms that lets the model settle; a fast
+    run of 3 ms has knots every half millisecond. Inputs are linear between knots; in co-simulation
+    of FMI 3.0, which has no input derivatives, they are held. The scale is the range of each output
+    in the slow run; that of other outputs than displacement is at least their nominal.
+    """
+    segment = 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
+    slow, fast = signals_of(model, segment), signals_of(model, 5e-4)
+    grids = {step: _grid(step, slow.times[-1]) for step in _SLOW_STEPS}
+    times = np.unique(np.concatenate([*grids.values(), slow.times]))
+    linear = expected_outputs(model, times, slow)
+    names, grid = model.output_names or model.state_names, grids[1e-3]
+    compare = _Comparison(model, names, _scale(model, names, linear))
+    settled = bool(model.sampled_names)
+    found = integrate(fmu, grid, slow, names, tolerance=_TOLERANCE)
+    yield compare("model exchange", found, linear[np.searchsorted(times, grid)])
+    if fmu.version == 3:
+        slow, fast = (replace(s, held=True) for s in (slow, fast))
+    expected = expected_outputs(model, times, slow) if slow.held else linear
+    for step, grid in grids.items():
+        found = co_simulate(fmu, grid, slow, names, tolerance=_TOLERANCE, settled=settled)
+        truth = expected[np.searchsorted(times, grid)]
+        yield compare(f"co-simulation, step {step:g} s", found, truth)
+    grid = grids[1e-3]
+    truth = expected[np.searchsorted(times, grid)]
+    found = co_simulate(fmu, grid, slow, names, settled=settled)
+    yield compare("co-simulation, default tolerance", found, truth, DEFAULT_LIMIT)
+    grid = _grid(_FAST_STEP, _FAST_STEP * _FAST_COUNT)
+    truth = expected_outputs(model, grid, fast)
+    found = co_simulate(fmu, grid, fast, names, tolerance=_TOLERANCE, settled=settled)
+    yield compare(f"co-simulation, step {_FAST_STEP:g} s", found, truth)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """Says how far outputs (n, ny) are from the truth, in shares of a scale (ny,)."""
+
+    model: Model
+    names: tuple[str, ...]
+    scale: FloatArray
+
+    def __call__(
+        self, name: str, found: FloatArray, truth: FloatArray, limit: float = LIMIT
+    ) -> Agreement:
+        error = np.max(np.abs(found - truth), axis=0) / self.scale
+        worst = int(np.argmax(error))
+        by = "reference" if has_reference(self.model) else "simulator"
+        remark = f"largest in {self.names[worst]}, against the {by}"
+        return Agreement(name, float(error[worst]), limit, remark)
+
+
+def _grid(step: float, end: float) -> FloatArray:
+    count = min(_MOST_STEPS, round(end / step))
+    return np.array([round(step * k, 12) for k in range(count + 1)])
+
+
+def _scale(model: Model, names: tuple[str, ...], expected: FloatArray) -> FloatArray:
+    ranges = np.ptp(expected, axis=0)
+    nominals = model.output_nominals() if model.output_names else model.state_nominals()
+    strict = np.array(["displacement" in n for n in names])
+    scale: FloatArray = np.where(strict & (ranges > 0.0), ranges, np.maximum(ranges, nominals))
+    return scale

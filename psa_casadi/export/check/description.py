@@ -1,0 +1,118 @@
+"""What modelDescription.xml and the binaries say by themselves, without a call."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.importer.archive import FUNCTIONS, Archive
+from psa_casadi.export.importer.binary_file import read_binary
+from psa_casadi.export.importer.calls import MODEL_EXCHANGE
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.units import parse_unit
+
+#: The newest version of the GNU C library that a binary may need.
+_NEWEST_LIBC = (2, 17)
+_BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+
+def _reals(archive: Archive) -> list[Any]:
+    kinds = ("Real", "Float64")
+    return [v for v in archive.description.modelVariables if v.type in kinds]
+
+
+def undefined_units(archive: Archive) -> Iterator[str]:
+    """Every variable but an event indicator has a unit, with a definition; so has its display."""
+    units = archive.description.unitDefinitions
+    defined = {u.name: {d.name for d in u.displayUnits} for u in units}
+    for v in _reals(archive):
+        if v.unit is None and v.name in archive.indicators():
+            continue
+        if v.unit not in defined:
+            yield f"'{v.name}' has the unit '{v.unit}', which is not defined"
+        elif v.displayUnit and v.displayUnit not in defined[v.unit]:
+            yield f"'{v.name}' has the undefined display unit '{v.displayUnit}'"
+
+
+def inconsistent_units(archive: Archive) -> Iterator[str]:
+    """A unit is defined as what its name says, and a derivative has the unit of its state per s."""
+    powers = {}
+    for unit in archive.description.unitDefinitions:
+        base = unit.baseUnit
+        if base is None:
+            yield f"the unit '{unit.name}' has no definition in base units"
+            continue
+        powers[unit.name] = {n: int(getattr(base, n)) for n in _BASE if int(getattr(base, n))}
+        yield from _misnamed(unit, powers[unit.name])
+    for entry in archive.description.derivatives:
+        rate, state = entry.variable, entry.variable.derivative
+        expected = dict(powers.get(state.unit, {}))
+        expected["s"] = expected.get("s", 0) - 1
+        if powers.get(rate.unit) != {n: k for n, k in expected.items() if k}:
+            yield f"'{rate.name}' is in '{rate.unit}', but '{state.name}' is in '{state.unit}'"
+
+
+def _misnamed(unit: Any, powers: dict[str, int]) -> Iterator[str]:
+    """Compare a definition, and the factors of its display units, with the names."""
+    try:
+        meant = parse_unit(unit.name)
+        expected = {n: k for n, k in meant.base_exponents.items() if k}
+        if powers != expected or not math.isclose(float(unit.baseUnit.factor), meant.factor):
+            yield f"the unit '{unit.name}' is defined as {powers or 'no unit'}"
+        for display in unit.displayUnits:
+            factor = float(meant.ratio / parse_unit(display.name).ratio)
+            if not math.isclose(float(display.factor), factor):
+                yield f"the display unit '{display.name}' has the factor {display.factor}"
+    except InputError as error:
+        yield f"the unit '{unit.name}' is not known: {error}"
+
+
+def wrong_nominals(fmu: Fmu) -> Iterator[str]:
+    """Nominal values are positive; those of the states are the same in description and binary."""
+    for name, nominal in fmu.nominals.items():
+        if not 0.0 < nominal < math.inf:
+            yield f"'{name}' has the nominal value {nominal:g}"
+    states = fmu.states()
+    with fmu.start(MODEL_EXCHANGE) as instance:
+        found = instance.vector("GetNominalsOfContinuousStates", len(states))
+    for name, nominal in zip(states, found, strict=True):
+        if nominal != fmu.nominals[name]:
+            yield f"'{name}' has another nominal value in the binary, {nominal:g}"
+
+
+def missing_functions(archive: Archive) -> Iterator[str]:
+    """Every function of the standard is in every binary, as importers look them all up."""
+    for place, _, exports in _exports(archive):
+        for name in _functions(archive) - exports:
+            yield f"{name} is missing in {place}"
+
+
+def needless_symbols(archive: Archive) -> Iterator[str]:
+    """Nothing but the functions of the standard is exported: two FMUs in a process stay apart."""
+    for place, _, exports in _exports(archive):
+        for name in exports - _functions(archive):
+            yield f"{name} is exported by {place}"
+
+
+def new_libraries(archive: Archive) -> Iterator[str]:
+    """No Linux binary needs a GNU C library newer than 2.17 (of 2012)."""
+    for place, needs, _ in _exports(archive):
+        for need in sorted(n for n in needs if n.startswith("GLIBC_")):
+            version = need.removeprefix("GLIBC_").split(".")
+            if not all(p.isdigit() for p in version) or tuple(map(int, version)) > _NEWEST_LIBC:
+                yield f"{place} needs {need}"
+
+
+def _functions(archive: Archive) -> frozenset[str]:
+    return frozenset(archive.prefix + name for name in FUNCTIONS[archive.version])
+
+
+def _exports(archive: Archive) -> Iterator[tuple[str, frozenset[str], frozenset[str]]]:
+    """Yield folder, needs and exports of every binary; an archive without any is an error."""
+    count = 0
+    for path in archive.binaries():
+        found = read_binary(path)
+        yield path.parent.name, found.needs, found.exports
+        count += 1
+    if not count:
+        raise InputError("The FMU has no binary; export it with --platforms host or all.")

@@ -1,0 +1,154 @@
+"""What modelDescription.xml claims about an FMU, measured on its binary."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE, Instance
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.instance3 import Instance3
+from psa_casadi.model.compose import Model
+
+FloatArray = npt.NDArray[np.float64]
+_POINTS = 3
+
+
+def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
+    """Return values of time, states, inputs and parameters; no gain is 0, all keep their bounds."""
+    point = {"time": float(generator.uniform(0.1, 1.0))}
+    for v in fmu.description.modelVariables:
+        if v.causality == "parameter":
+            start = float(v.start) or 0.1 * fmu.nominals[v.name]
+            value = start * generator.uniform(0.95, 1.05)
+            point[v.name] = min(max(value, float(v.min or -np.inf)), float(v.max or np.inf))
+    for name in (*fmu.states(), *fmu.names("input")):
+        point[name] = float(fmu.nominals[name] * generator.uniform(-1.0, 1.0))
+    return point
+
+
+def evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) -> FloatArray:
+    """Return unknowns at a point."""
+    fmu = instance.fmu
+    states = np.array([point[n] for n in fmu.states()])
+    others = {n: v for n, v in point.items() if n not in fmu.states() and n != "time"}
+    instance.derivatives(point["time"], states, others)
+    return instance.get(unknowns)
+
+
+def held_values(instance: Instance) -> list[FloatArray]:
+    """Return the vector of the sampled states in a list; an empty list if there are none."""
+    names = instance.fmu.sampled()
+    return [instance.get(names)] if names else []
+
+
+def sampled_starts(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
+    """Return values of the sampled states to start from, within their nominals."""
+    return {n: float(fmu.nominals[n] * generator.uniform(-1.0, 1.0)) for n in fmu.sampled()}
+
+
+def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
+    """Whatever moves an output, derivative or indicator is listed, parameters included."""
+    generator = np.random.default_rng(1)
+    described = fmu.description
+    entries = [*described.outputs, *described.derivatives, *described.initialUnknowns]
+    entries += described.eventIndicators if fmu.version == 3 else []
+    for entry in entries:
+        if entry.dependencies is None:
+            yield f"'{entry.variable.name}' lists no dependencies"
+    unknowns = list(dict.fromkeys(e.variable.name for e in entries))
+    found: dict[str, set[str]] = {name: set() for name in unknowns}
+    starts = sampled_starts(fmu, np.random.default_rng(6))
+    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
+        for _ in range(_POINTS):
+            point = random_point(fmu, generator)
+            here = evaluate(instance, point, unknowns)
+            for known in point:
+                moved = {**point, known: point[known] * 1.01}
+                changed = evaluate(instance, moved, unknowns) != here
+                for name in np.array(unknowns)[changed]:
+                    found[name].add(known)
+    claims = [(e.variable.name, {d.name for d in e.dependencies or []}) for e in entries]
+    missing = {(name, known) for name, claimed in claims for known in found[name] - claimed}
+    for name, known in sorted(missing):
+        yield f"'{name}' depends on '{known}', which its dependencies do not list"
+
+
+def directional_error(fmu: Fmu) -> float:
+    """Return the largest difference of directional derivatives from central differences.
+
+    Relative to the size of each unknown's derivative in nominal units of the knowns.
+    """
+    generator = np.random.default_rng(2)
+    unknowns = [u.variable.name for u in (*fmu.description.outputs, *fmu.description.derivatives)]
+    unknowns += fmu.indicators()
+    worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
+    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
+        for _ in range(_POINTS):
+            point = random_point(fmu, generator)
+            knowns = [k for k in point if k != "time"]
+            seeds = np.array([fmu.nominals[k] * generator.uniform(-1.0, 1.0) for k in knowns])
+            step = 1e-6
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = {k: point[k] + sign * step * d for k, d in zip(knowns, seeds, strict=True)}
+                ends.append(evaluate(instance, {**point, **moved}, unknowns))
+            here = evaluate(instance, point, unknowns)
+            exact = instance.directional(unknowns, knowns, seeds)
+            difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
+            worst = max(worst, float(np.max(difference / (np.abs(exact) + np.abs(here) + 1e-300))))
+    return worst
+
+
+def adjoint_error(fmu: Fmu) -> float:
+    """Return the largest difference of adjoint from directional derivatives, FMI 3.0 only.
+
+    Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step;
+    each row in nominal units of the knowns, relative to its largest entry. Sampled states are held;
+    a step into which an instant falls is not differentiated.
+    """
+    generator = np.random.default_rng(4)
+    unknowns = [*fmu.names("output"), *(u.variable.name for u in fmu.description.derivatives)]
+    unknowns += fmu.indicators()
+    point = random_point(fmu, generator)
+    knowns = [k for k in point if k != "time"]
+    size = np.array([fmu.nominals[k] for k in knowns])
+    with fmu.start3(MODEL_EXCHANGE) as instance:
+        evaluate(instance, point, unknowns)
+        worst = _transposed(instance, unknowns, knowns, size)
+    with fmu.start3(CO_SIMULATION) as instance:
+        instance.set({n: point[n] for n in fmu.names("input")})
+        instance.step(0.0, fmu.step_size)
+        through = [] if fmu.sampled() else fmu.states()
+        return max(worst, _transposed(instance, [*unknowns, *through], knowns, size))
+
+
+def _transposed(
+    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray
+) -> float:
+    """Return the largest difference of the matrix by rows from the one by columns."""
+    columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))]
+    rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))]
+    forward, backward = np.array(columns).T * size, np.array(rows) * size
+    largest = np.max(np.abs(forward), axis=1, initial=1e-300)
+    return float(np.max(np.abs(forward - backward) / largest[:, None]))
+
+
+def equation_error(fmu: Fmu, model: Model) -> float:
+    """Return the largest relative difference of derivatives and outputs from the model's."""
+    generator = np.random.default_rng(3)
+    unknowns = [*(f"der({n})" for n in model.state_names), *model.output_names]
+    worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
+    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
+        for _ in range(_POINTS):
+            point = random_point(fmu, generator)
+            found = evaluate(instance, point, unknowns)
+            vectors = [
+                np.array([point[n] for n in names])
+                for names in (model.state_names, model.input_names, model.parameter_names)
+            ]
+            xdot, y = model.structure.f(point["time"], *vectors, *held_values(instance))
+            expected = np.concatenate([np.array(xdot).ravel(), np.array(y).ravel()])
+            size = np.abs(expected) + np.abs(found) + 1e-300
+            worst = max(worst, float(np.max(np.abs(found - expected) / size)))
+    return worst

@@ -1,0 +1,1 @@
+"""What FMU, Modelica and SSP share: the table of variables, markup, the icon."""

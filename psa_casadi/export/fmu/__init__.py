@@ -1,0 +1,1 @@
+"""A model as an FMU of FMI 2.0 or 3.0."""

@@ -1,0 +1,105 @@
+"""An FMU: description, binaries and sources of a model in one archive of fixed bytes."""
+
+import os
+import re
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from psa_casadi.components import COMPONENTS
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.common.icon import ICONS, drawing_of, png
+from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
+from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.fmu.model_description import model_description
+from psa_casadi.export.fmu.model_description3 import model_description3
+from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
+from psa_casadi.export.fmu.reference_results import reference_entries
+from psa_casadi.export.fmu.sources import compiled_files, export_token, source_files
+from psa_casadi.export.fmu.terminals import terminal_entries
+from psa_casadi.files import atomic_path
+from psa_casadi.model.compose import Model
+from psa_casadi.model.model_file import dumps
+from psa_casadi.simulation.stepper import SimulationError
+
+#: Where an FMU carries the model it was made from.
+MODEL_ENTRY = "resources/model.json"
+#: The writer of modelDescription.xml of each version of the standard.
+DESCRIPTIONS = {2: model_description, 3: model_description3}
+_FIXED_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def export_fmu(
+    model: Model,
+    path: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    include_sensor: bool = False,
+    platforms: Sequence[str] = ("host",),
+    fmi: int = 2,
+) -> Path:
+    """Write a model as an FMU (co-simulation and model exchange) and return its path.
+
+    `fmi` is the version of the standard, 2 (FMI 2.0) or 3 (FMI 3.0). Sensor and environment stay
+    out unless `include_sensor`. `name` is the model identifier, a C identifier; by default the
+    model's name. `platforms` are names of `PLATFORMS`, "host" or "all". The same model gives the
+    same bytes. The file is written whole or not at all.
+
+    Raises InputError for an impossible name, an unknown platform or version, or a model without
+    states, and PsaError if a compiler fails.
+    """
+    identifier = name or model.name
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
+        raise InputError(
+            f"'{identifier}' cannot name an FMU; use letters, digits, underscores, no digit first."
+        )
+    if fmi not in DESCRIPTIONS:
+        raise InputError(f"FMI {fmi} is not known; choose 2 (FMI 2.0) or 3 (FMI 3.0).")
+    targets = chosen_platforms(platforms)
+    exported = model if include_sensor else model.plant()
+    token = export_token(exported, identifier, fmi)
+    texts = source_files(exported, identifier, token, fmi)
+    xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+    entries = {"modelDescription.xml": xml.encode("utf-8"), **_companions(exported, fmi)}
+    entries |= {f"sources/{n}": t.encode("utf-8") for n, t in texts.items()}
+    for target in targets:
+        folder = target.binaries(fmi)
+        entries[f"binaries/{folder}/{identifier}{target.suffix}"] = compile_library(
+            texts, identifier, target
+        )
+    with atomic_path(path) as temporary:
+        write_archive(temporary, entries)
+    return Path(path)
+
+
+def _companions(model: Model, fmi: int) -> dict[str, bytes]:
+    """Return what is beside description, sources and binaries: for people and for other tools.
+
+    A model that cannot be simulated with its own values is exported without a reference run.
+    """
+    try:
+        entries = reference_entries(model)
+    except SimulationError:
+        entries = {}
+    page = documentation(model, reference_run=bool(entries))
+    entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
+    drawing = png(ICONS[drawing_of(model)])
+    entries |= {"model.png": drawing} if fmi == 2 else terminal_entries(model)
+    if all(c in (*COMPONENTS.values(), *EFFECTS.values()) for c in model.components):
+        entries[MODEL_ENTRY] = dumps(model).encode("utf-8")
+    return entries
+
+
+def write_archive(path: Path, entries: Mapping[str, bytes]) -> None:
+    """Write a zip archive with sorted entries and fixed dates and permissions.
+
+    The entries are stored: what a compressor makes of them depends on the version of its library.
+    """
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in sorted(entries.items()):
+            entry = zipfile.ZipInfo(name, _FIXED_DATE)
+            entry.create_system = 3
+            executable = name.startswith("binaries/")
+            entry.external_attr = (0o100755 if executable else 0o100644) << 16
+            archive.writestr(entry, content)

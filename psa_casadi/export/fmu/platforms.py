@@ -1,0 +1,124 @@
+"""The platforms an FMU can carry a binary for, and how each is compiled."""
+
+import hashlib
+import platform
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.fmu.sources import compiled_files
+from psa_casadi.files import atomic_path
+from psa_casadi.simulation.compiler import (
+    OPTIMISE,
+    cache_directory,
+    compiler_command,
+    run_compiler,
+    zig_command,
+)
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A platform: target of the `ziglang` compiler, FMI folder, suffix and flags of the library.
+
+    `name` is FMI 3's platform tuple and its folder; `folder` is the one of FMI 2.
+    Old systems are asked for, so that the binary loads everywhere: GNU libc 2.17 (of 2012) on
+    Linux, and macOS 11 (of 2020), the first for both processors.
+    """
+
+    name: str
+    target: str | None
+    folder: str
+    suffix: str
+    flags: tuple[str, ...] = ()
+
+    def binaries(self, fmi: int = 2) -> str:
+        """Return the name of the folder below binaries/ in an archive of FMI 2 or FMI 3."""
+        return self.folder if fmi == 2 else self.name
+
+
+_PIC = ("-fPIC", "-Wl,-s")
+
+PLATFORMS: dict[str, Platform] = {
+    p.name: p
+    for p in (
+        Platform("x86_64-linux", "x86_64-linux-gnu.2.17", "linux64", ".so", _PIC),
+        Platform("aarch64-linux", "aarch64-linux-gnu.2.17", "aarch64-linux", ".so", _PIC),
+        Platform("x86_64-windows", "x86_64-windows-gnu", "win64", ".dll", ("-Wl,-s",)),
+        Platform("x86-windows", "x86-windows-gnu", "win32", ".dll", ("-Wl,-s",)),
+        Platform("x86_64-darwin", "x86_64-macos.11.0", "darwin64", ".dylib", ("-fPIC",)),
+        Platform("aarch64-darwin", "aarch64-macos.11.0", "aarch64-darwin", ".dylib", ("-fPIC",)),
+    )
+}
+
+
+def host_platform() -> Platform:
+    """Return this machine's platform; one that is not in the table uses the machine's compiler."""
+    machine = {"amd64": "x86_64", "arm64": "aarch64", "i686": "x86"}.get(
+        platform.machine().lower(), platform.machine().lower()
+    )
+    system = platform.system().lower()
+    name = f"{machine}-{system}"
+    return PLATFORMS.get(name, Platform(name, None, name, ".so", ("-fPIC",)))
+
+
+def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
+    """Return the platforms named: names of `PLATFORMS`, "host" or "all"; each once, in order.
+
+    Raises InputError for a name that is not known.
+    """
+    unknown = [n for n in names if n not in (*PLATFORMS, "host", "all")]
+    if unknown or not names:
+        wanted = ", ".join(repr(n) for n in unknown) or "(none)"
+        raise InputError(
+            f"The platform {wanted} is not known; choose host, all, or some of"
+            f" {', '.join(PLATFORMS)}."
+        )
+    chosen: dict[str, Platform] = {}
+    for name in names:
+        found = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
+        chosen.update({p.name: p for p in found})
+    return tuple(chosen.values())
+
+
+def compile_library(texts: Mapping[str, str], identifier: str, target: Platform) -> bytes:
+    """Compile sources to a shared library that exports only FMI functions; return its bytes.
+
+    What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
+    version, so that the same model is compiled once. A machine's own compiler may change unseen.
+
+    Raises PsaError with the compiler's messages if it fails.
+    """
+    output = identifier + target.suffix
+    own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
+    libraries = ("-lm",) if target.suffix == ".so" else ()
+    arguments = [
+        *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
+        "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
+    ]  # fmt: skip
+    if target.target is None:
+        return _compiled(texts, [*compiler_command(), *arguments], output)
+    arguments = ["-target", target.target, *arguments]
+    content = (version("ziglang"), arguments, sorted(texts.items()))
+    digest = hashlib.sha256(repr(content).encode("utf-8")).hexdigest()[:32]
+    kept = cache_directory() / "binaries" / (digest + target.suffix)
+    try:
+        return kept.read_bytes()
+    except FileNotFoundError:
+        made = _compiled(texts, [*zig_command(), *arguments], output)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(kept) as temporary:
+        temporary.write_bytes(made)
+    return made
+
+
+def _compiled(texts: Mapping[str, str], command: Sequence[str], output: str) -> bytes:
+    """Run a compiler in a folder of the sources; return the bytes of the file it wrote."""
+    with tempfile.TemporaryDirectory() as directory:
+        for name, text in texts.items():
+            (Path(directory) / name).write_text(text, encoding="utf-8", newline="\n")
+        run_compiler(command, Path(directory))
+        return (Path(directory) / output).read_bytes()

@@ -1,0 +1,159 @@
+"""A run inside the FMU to try an importer on: inputs, parameters and the outputs to expect.
+
+The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives alike.
+
+Source: FMI Layered Standard References (FMI-LS-REF) 1.0.0-alpha.1 and the Experiments Format of
+the Modelica Association that it refers to.
+"""
+
+import hashlib
+import math
+from collections.abc import Sequence
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.export.common.markup import number, time_scale, xml_text
+from psa_casadi.export.common.parameter_sets import parameter_set
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import nominal_value
+
+FloatArray = npt.NDArray[np.float64]
+
+FOLDER = "extra/org.fmi-standard.fmi-ls-ref"
+NOTES = "documentation/fmi-ls-ref.txt"
+INPUTS, OUTPUTS, PARAMETERS, EXPERIMENTS = "in.csv", "ref.csv", "parameters.ssv", "smoke_test.exp"
+
+#: Relative tolerance that the experiment asks for, and the one the outputs were computed to.
+TOLERANCE = 1e-6
+_OWN_TOLERANCE = 1e-12
+_NAMESPACE = "http://fmi-standard.org/fmi-ls-manifest"
+_SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
+_STEPS_PER_SEGMENT = 100
+_DIGITS = 7
+
+_NOTES = """\
+Reference run of '{name}'
+
+One smoke test: every input follows straight lines with kinks every {segment:g} s, from 0 to
+{stop:g} s, and starts at its start value; so does every state. {inputs} holds the inputs, linear
+between its rows; {outputs} the outputs to expect at the same times; {parameters} the parameter
+values, which are also the start values in modelDescription.xml. All in SI units.
+
+The outputs were computed by psa_casadi to a relative tolerance of {own:g} and rounded to {digits}
+digits of their largest value. An importer that stops at the kinks (model exchange), or passes on
+the slope of the inputs (co-simulation of FMI 2), meets them to its own tolerance. One that holds
+the inputs over a communication step of {step:g} s is late by half a step: up to a hundredth of
+the range of displacement, charge and force, and more for current and velocity, which jump at the
+kinks.
+"""
+
+
+def reference_entries(model: Model) -> dict[str, bytes]:
+    """Return the files of the reference run by their place in the archive.
+
+    Raises SimulationError if the model cannot be simulated with its own values.
+    """
+    times, inputs = _inputs(model)
+    start = np.array([s.start for s in model.structure.states])
+    outputs = _rounded(run(model, times, inputs, start, rtol=_OWN_TOLERANCE).y)
+    texts = {
+        INPUTS: _table(("time", *model.input_names), times, inputs),
+        OUTPUTS: _table(("time", *model.output_names), times, outputs),
+        PARAMETERS: parameter_set(model),
+        EXPERIMENTS: _experiments(model, times),
+    }
+    notes = _NOTES.format(
+        name=model.name, segment=_segment(model), stop=times[-1], step=times[1], inputs=INPUTS,
+        outputs=OUTPUTS, parameters=PARAMETERS, own=_OWN_TOLERANCE, digits=_DIGITS,
+    )  # fmt: skip
+    texts["fmi-ls-manifest.xml"] = _manifest({**texts, f"../../{NOTES}": notes})
+    entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
+    return {**entries, NOTES: notes.encode("utf-8")}
+
+
+def _segment(model: Model) -> float:
+    """Return the length of a segment [s]: 10 ms, or the multiple of it that lets it settle."""
+    return 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
+
+
+def _inputs(model: Model) -> tuple[FloatArray, FloatArray]:
+    """Return times (n,) and inputs (n, nu): from start to start + nominal, each shape shifted.
+
+    A temperature moves by a tenth of its nominal.
+    """
+    count = _STEPS_PER_SEGMENT * (len(_SHAPE) - 1)
+    step = _segment(model) / _STEPS_PER_SEGMENT
+    times = np.array([round(k * step, 12) for k in range(count + 1)])
+    places = np.arange(count + 1) / _STEPS_PER_SEGMENT
+    columns = []
+    for i, declared in enumerate(model.structure.inputs):
+        shape = np.concatenate([[0.0], np.roll(_SHAPE[1:], 2 * i)])
+        size = nominal_value(declared.nominal, model.values) * (0.1 if declared.start else 1.0)
+        columns.append(declared.start + size * np.interp(places, range(len(_SHAPE)), shape))
+    return times, _rounded(np.array(columns).T.reshape(count + 1, -1))
+
+
+def _rounded(columns: FloatArray) -> FloatArray:
+    """Return columns (n, k) with `_DIGITS` digits of each one's largest value.
+
+    Digits below that differ from machine to machine.
+    """
+    peaks = np.max(np.abs(columns), axis=0, initial=0.0)
+    places = [_DIGITS - 1 - math.floor(math.log10(p)) if p > 0.0 else 0 for p in peaks]
+    rows = [[round(float(v), d) + 0.0 for v, d in zip(r, places, strict=True)] for r in columns]
+    return np.array(rows).reshape(columns.shape)
+
+
+def _table(names: Sequence[str], times: FloatArray, columns: FloatArray) -> str:
+    """Return a CSV table with a header."""
+    rows = [",".join(names)]
+    for time, values in zip(times, columns, strict=True):
+        rows.append(",".join(f"{v:.12g}" for v in (time, *values)))
+    return "\n".join([*rows, ""])
+
+
+def _experiments(model: Model, times: FloatArray) -> str:
+    root = ET.Element("Experiments", {"name": "smoke test"})
+    attributes = {
+        "name": "segments",
+        "description": f"straight segments of every input of {model.name}",
+        "startTime": "0.0",
+        "stopTime": number(times[-1]),
+        "tolerance": number(TOLERANCE),
+        "stepSize": number(times[1]),
+    }
+    experiment = ET.SubElement(root, "Experiment", attributes)
+    for tag, source in (("Parameters", PARAMETERS), ("Stimuli", INPUTS), ("References", OUTPUTS)):
+        ET.SubElement(experiment, tag, {"source": source})
+    return xml_text(root)
+
+
+#: MIME type, role and meaning of each file of the run.
+_RELATED = {
+    PARAMETERS: ("application/x-ssp-parameter-set", "parameter", "values of all parameters"),
+    EXPERIMENTS: (
+        "application/x-ma-hs-experiments",
+        "experiment/smoke-test",
+        "a run over straight segments of every input",
+    ),
+    INPUTS: ("text/csv", "other", "inputs of the smoke test"),
+    OUTPUTS: ("text/csv", "result", "outputs of the smoke test"),
+    f"../../{NOTES}": ("text/plain", "document", "how the smoke test is meant"),
+}
+
+
+def _manifest(texts: dict[str, str]) -> str:
+    """Return fmi-ls-manifest.xml, which lists the files with their SHA3-256 checksums."""
+    ET.register_namespace("fmi-ls", _NAMESPACE)
+    said = "Layered Standard providing information on related files included in an FMU."
+    name = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-alpha.1", "description": said}
+    attributes = {f"{{{_NAMESPACE}}}fmi-ls-{key}": value for key, value in name.items()}
+    root = ET.Element("fmiReferences", attributes)
+    for source, (kind, role, meaning) in _RELATED.items():
+        digest = hashlib.sha3_256(texts[source].encode("utf-8")).hexdigest()
+        attributes = {"type": kind, "source": source, "role": role, "description": meaning}
+        ET.SubElement(root, "Related", {**attributes, "checksum": digest})
+    return xml_text(root)

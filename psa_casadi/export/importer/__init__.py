@@ -1,0 +1,1 @@
+"""A small importer: loads an FMU of either version and calls it."""

@@ -1,0 +1,111 @@
+"""The files of an FMU of either version, extracted, and what its description says."""
+
+import re
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import fmpy
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.importer import fmi2_functions, fmi3_functions
+
+#: The functions of each version of the standard, without their prefix.
+FUNCTIONS = {2: fmi2_functions.FUNCTIONS, 3: fmi3_functions.FUNCTIONS}
+_LIBRARY = re.compile(r".*\.(so|dll|dylib)")
+
+
+class Archive:
+    """An extracted FMU; a context manager that removes the extracted files.
+
+    `version` is 2 or 3, `description` fmpy's record of the XML, `references` and `nominals` map the
+    names of variables to value references and nominal values.
+
+    Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        try:
+            self.directory = Path(fmpy.extract(str(path), unzipdir=self._folder.name))
+            self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
+        except Exception as error:  # fmpy raises it for any damage
+            self._folder.cleanup()
+            problem = f"{path}: cannot be read as an FMU ({error}); export it again."
+            raise InputError(problem) from error
+        said = str(self.description.fmiVersion)
+        interface = self.description.coSimulation or self.description.modelExchange
+        if said[:2] not in ("2.", "3.") or interface is None:
+            self._folder.cleanup()
+            raise InputError(
+                f"{path}: is of FMI {said} or has no interface that is known; export it again with"
+                " --fmi 2 or --fmi 3."
+            )
+        self.version = int(said[0])
+        self.identifier = str(interface.modelIdentifier)
+        self.references = {v.name: int(v.valueReference) for v in self.description.modelVariables}
+        self.nominals = {
+            v.name: 1.0 if v.nominal is None else float(v.nominal)
+            for v in self.description.modelVariables
+        }
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._folder.cleanup()
+
+    @property
+    def prefix(self) -> str:
+        """What the names of all C functions start with."""
+        return f"fmi{self.version}"
+
+    @property
+    def token(self) -> str:
+        """The GUID (FMI 2.0) or instantiation token (FMI 3.0)."""
+        return str(self.description.guid)
+
+    @property
+    def step_size(self) -> float:
+        """Step size of the default experiment [s], 1 ms if there is none."""
+        return float(getattr(self.description.defaultExperiment, "stepSize", None) or 1e-3)
+
+    def names(self, causality: str) -> list[str]:
+        """Return the names of the variables of one causality, in the order of the description."""
+        return [v.name for v in self.description.modelVariables if v.causality == causality]
+
+    def states(self) -> list[str]:
+        """Return the names of the continuous states, in the order of the state vector."""
+        return [u.variable.derivative.name for u in self.description.derivatives]
+
+    def sampled(self) -> list[str]:
+        """Return the names of the sampled states: local variables that are discrete."""
+        variables = self.description.modelVariables
+        found = (v for v in variables if v.causality == "local" and v.variability == "discrete")
+        return [v.name for v in found]
+
+    def indicators(self) -> list[str]:
+        """Return the names of the variables that repeat the event indicators, in their order."""
+        names = (v.name for v in self.description.modelVariables)
+        return [n for n in names if n.startswith("switch.")]
+
+    def indicator_count(self) -> int:
+        """Return how many event indicators the description announces."""
+        if self.version == 3:
+            return len(self.description.eventIndicators)
+        return int(self.description.numberOfEventIndicators or 0)
+
+    def binaries(self) -> Iterator[Path]:
+        """Yield the paths of the libraries for all platforms, sorted."""
+        for path in sorted((self.directory / "binaries").rglob("*")):
+            if path.is_file() and _LIBRARY.fullmatch(path.name):
+                yield path
+
+    def host_binary(self) -> Path | None:
+        """Return the path of the library for this machine, if there is one."""
+        folders = (fmpy.platform_tuple, fmpy.platform)[: 1 if self.version == 3 else 2]
+        name = self.identifier + fmpy.sharedLibraryExtension
+        places = [self.directory / "binaries" / folder / name for folder in folders]
+        return next((p for p in places if p.is_file()), None)

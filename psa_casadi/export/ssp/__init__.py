@@ -1,0 +1,1 @@
+"""A system of models as an SSP archive."""

@@ -1,0 +1,171 @@
+"""SystemStructure.ssd: the parts of a system, their connectors, their wires and its drawing.
+
+Source: SSP 1.0, section 5 (system structure description) and section 4.4 (common elements).
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from xml.etree import ElementTree as ET
+
+from psa_casadi.export.common.markup import (
+    base_unit,
+    describe,
+    generation_tool,
+    number,
+    xml_text,
+)
+from psa_casadi.export.ssp.layout import OUTSIDE, Box, Layout, Port, Wire
+from psa_casadi.model.compose import Model
+from psa_casadi.units import parse_unit
+
+SSD = "http://ssp-standard.org/SSP1/SystemStructureDescription"
+SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+SSV_TYPE = "application/x-ssp-parameter-set"
+SSM_TYPE = "application/x-ssp-parameter-mapping"
+
+
+@dataclass(frozen=True)
+class WiredParts:
+    """A system as SSP sees it: models by the names of the parts, wires, and its own ports.
+
+    A wire from or to `OUTSIDE` makes a port of the system, with the unit of the part's port.
+    """
+
+    name: str
+    parts: Mapping[str, Model]
+    wires: tuple[Wire, ...]
+
+    def unit(self, port: Port) -> str:
+        """Return the unit of a port; that of the system is the unit of what it is wired to."""
+        if port.part == OUTSIDE:
+            ends = [w.end for w in self.wires if w.start == port]
+            port = ends[0] if ends else next(w.start for w in self.wires if w.end == port)
+        s = self.parts[port.part].structure
+        units = {v.name: v.unit for v in s.inputs} | {v.name: v.unit for v in s.outputs}
+        return units[port.name]
+
+    def ports(self, part: str) -> tuple[tuple[str, str], ...]:
+        """Return (name, kind) of the connected ports of a part, or of the system, inputs first."""
+        ends = dict.fromkeys(w.end.name for w in self.wires if w.end.part == part)
+        starts = dict.fromkeys(w.start.name for w in self.wires if w.start.part == part)
+        if part == OUTSIDE:
+            ends, starts = starts, ends
+        return (*((n, "input") for n in ends), *((n, "output") for n in starts))
+
+
+@dataclass(frozen=True)
+class Binding:
+    """Files in the archive that set parameters: of one part, or of the system (`OUTSIDE`)."""
+
+    part: str
+    values: str
+    mapping: str | None = None
+
+
+def structure_description(
+    wiring: WiredParts, layout: Layout, bindings: Sequence[Binding], stop_time: float
+) -> str:
+    """Return the XML text of SystemStructure.ssd; FMUs are `resources/<part>.fmu`."""
+    ET.register_namespace("ssd", SSD)
+    ET.register_namespace("ssc", SSC)
+    root = _element(
+        None, "SystemStructureDescription",
+        {"version": "1.0", "name": wiring.name, "generationTool": generation_tool()},
+    )  # fmt: skip
+    system = _element(root, "System", {"name": wiring.name, "description": _about(wiring)})
+    _connectors(system, OUTSIDE, wiring, layout)
+    _bindings(system, OUTSIDE, bindings)
+    elements = _element(system, "Elements", {})
+    for box in layout.boxes:
+        _component(elements, box, wiring, layout, bindings)
+    _connections(system, layout)
+    _element(system, "SystemGeometry", _corners(0.0, layout.lower, layout.width, layout.upper))
+    _units(root, {wiring.unit(port) for wire in wiring.wires for port in (wire.start, wire.end)})
+    _element(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": number(stop_time)})
+    return xml_text(root)
+
+
+def _element(parent: ET.Element | None, name: str, attributes: dict[str, str]) -> ET.Element:
+    tag = f"{{{SSD}}}{name}"
+    return ET.Element(tag, attributes) if parent is None else ET.SubElement(parent, tag, attributes)
+
+
+def _about(wiring: WiredParts) -> str:
+    return (
+        f"{wiring.name.replace('_', ' ')}: {', '.join(n.replace('_', ' ') for n in wiring.parts)}"
+    )
+
+
+def _connectors(parent: ET.Element, part: str, wiring: WiredParts, layout: Layout) -> None:
+    ports = wiring.ports(part)
+    if not ports:
+        return
+    listed = _element(parent, "Connectors", {})
+    for name, kind in ports:
+        port = Port(part, name)
+        connector = _element(listed, "Connector", {"name": name, "kind": kind})
+        unit = wiring.unit(port)
+        ET.SubElement(connector, f"{{{SSC}}}Real", {"unit": unit} if unit else {})
+        x, y = layout.relative(port)
+        _element(connector, "ConnectorGeometry", {"x": _place(x), "y": _place(y)})
+
+
+def _component(
+    parent: ET.Element, box: Box, wiring: WiredParts, layout: Layout, bindings: Sequence[Binding]
+) -> None:
+    attributes = {
+        "name": box.name,
+        "description": describe(wiring.parts[box.name]),
+        "type": "application/x-fmu-sharedlibrary",
+        "source": f"resources/{box.name}.fmu",
+        "implementation": "CoSimulation",
+    }
+    element = _element(parent, "Component", attributes)
+    _connectors(element, box.name, wiring, layout)
+    _element(element, "ElementGeometry", _corners(box.x1, box.y1, box.x2, box.y2))
+    _bindings(element, box.name, bindings)
+
+
+def _bindings(parent: ET.Element, part: str, bindings: Sequence[Binding]) -> None:
+    own = [b for b in bindings if b.part == part]
+    if not own:
+        return
+    listed = _element(parent, "ParameterBindings", {})
+    for binding in own:
+        attributes = {"type": SSV_TYPE, "source": binding.values}
+        element = _element(listed, "ParameterBinding", attributes)
+        if binding.mapping is not None:
+            _element(element, "ParameterMapping", {"type": SSM_TYPE, "source": binding.mapping})
+
+
+def _connections(parent: ET.Element, layout: Layout) -> None:
+    listed = _element(parent, "Connections", {})
+    for wire, path in zip(layout.wires, layout.paths, strict=True):
+        attributes = {}
+        for side, port in (("start", wire.start), ("end", wire.end)):
+            if port.part != OUTSIDE:
+                attributes[f"{side}Element"] = port.part
+            attributes[f"{side}Connector"] = port.name
+        connection = _element(listed, "Connection", attributes)
+        inner = path[1:-1]
+        if inner:
+            points = {
+                "pointsX": " ".join(_place(x) for x, _ in inner),
+                "pointsY": " ".join(_place(y) for _, y in inner),
+            }
+            _element(connection, "ConnectionGeometry", points)
+
+
+def _units(root: ET.Element, names: Iterable[str]) -> None:
+    listed = _element(root, "Units", {})
+    for name in sorted(n for n in names if n):
+        unit = ET.SubElement(listed, f"{{{SSC}}}Unit", {"name": name})
+        ET.SubElement(unit, f"{{{SSC}}}BaseUnit", base_unit(parse_unit(name)))
+
+
+def _corners(x1: float, y1: float, x2: float, y2: float) -> dict[str, str]:
+    return {n: _place(v) for n, v in (("x1", x1), ("y1", y1), ("x2", x2), ("y2", y2))}
+
+
+def _place(value: float) -> str:
+    return f"{round(value, 6):.6g}"

@@ -1,0 +1,1 @@
+"""What to measure next so that more is determined."""

@@ -1,0 +1,1 @@
+"""What the records determine: intervals, combinations, profiles, information."""

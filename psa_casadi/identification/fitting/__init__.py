@@ -1,0 +1,1 @@
+"""Prediction-error fits: unknowns, predictions with derivatives, least squares."""

@@ -1,0 +1,242 @@
+"""Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum, minimise
+from psa_casadi.identification.fitting.prediction import (
+    Simulated,
+    measured,
+    motions_of,
+    predict,
+    simulated,
+)
+from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
+from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.simulation.ways import Way
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Relative tolerance of a step in fits.
+FIT_RTOL = 1e-6
+#: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
+#: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
+#: then the stepper is taken.
+_OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of a prediction-error fit.
+
+    `model` carries the estimates; `residuals` (used samples of every record, stacked) [m] are
+    measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
+    `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
+    the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
+    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
+    each record was run and how accurately; it is empty after an interrupt.
+    """
+
+    model: Model
+    unknowns: Unknowns
+    theta: FloatArray
+    residuals: FloatArray
+    jacobian: FloatArray
+    sigma: tuple[float, ...]
+    cost: float
+    converged: bool
+    interrupted: bool
+    evaluations: int
+    way: Way
+    simulated: tuple[Simulated, ...]
+
+    def of_record(self, experiments: Sequence[Experiment], record: int) -> slice:
+        """Where the used samples of one record stand in `residuals` and `jacobian`."""
+        counts = [int(e.used.sum()) for e in experiments[: record + 1]]
+        return slice(sum(counts[:-1]), sum(counts))
+
+    def residuals_of(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+        """Residuals [m] record by record."""
+        return [self.residuals[self.of_record(experiments, r)] for r in range(len(experiments))]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals [m]."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    def start(self, record: int) -> dict[str, float]:
+        """Deviations of one record's initial state from where its voltage and rate put it."""
+        return self.unknowns.start(self.theta, record)
+
+    def starts(self) -> list[dict[str, float]]:
+        """The same for every record: where a further fit continues from."""
+        return [self.start(r) for r in range(self.unknowns.records)]
+
+    def offset(self, record: int) -> float:
+        """Sensor offset of one record [m]."""
+        return self.unknowns.offset(self.theta, record)
+
+    def predicted(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+        """Predict whole records [m], held-out samples included."""
+        full = predict(
+            self.model, experiments, self.unknowns, self.theta, way=self.way, everything=True
+        )
+        return [p.displacement for p in full]
+
+
+def fit(
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    *,
+    sigma: Sequence[float],
+    start: Mapping[str, float] | None = None,
+    start_states: Sequence[Mapping[str, float]] | None = None,
+    evaluations: int = 40,
+    tolerance: float = 1e-5,
+    rtol: float = FIT_RTOL,
+    goal: float = np.inf,
+) -> Fit:
+    """Fit the free parameters, every record's initial state and offset to the used samples.
+
+    Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
+    Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
+    those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
+    cost will stay above the `goal`. Raises InputError when no sample can be used, SimulationError
+    when the start cannot be simulated.
+    """
+    if not any(e.used.any() for e in experiments):
+        raise InputError(["No sample with a displacement is left to fit; give more data."])
+    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
+    placed = model.with_values(start or {})
+    motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
+    first = [float(e.record.voltage[0]) for e in experiments]
+    unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
+    theta = _starting_point(model, experiments, unknowns, start or {}, start_states)
+    weights = np.concatenate(
+        [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
+    )
+    linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
+    effort = _Effort(tolerance, evaluations, goal, linear)
+    minimum, way, told = _minimum(model, experiments, unknowns, weights, theta, sigma, rtol, effort)
+    return Fit(
+        model=model.with_values(unknowns.values(minimum.theta)),
+        unknowns=unknowns,
+        theta=minimum.theta,
+        residuals=-minimum.residual[: len(weights)] * weights,
+        jacobian=minimum.jacobian[: len(weights)] * weights[:, None],
+        sigma=tuple(sigma),
+        cost=minimum.cost,
+        converged=minimum.converged,
+        interrupted=minimum.interrupted,
+        evaluations=minimum.evaluations,
+        way=way,
+        simulated=tuple(told),
+    )
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """How far a minimum is sought: see `minimise`."""
+
+    tolerance: float
+    evaluations: int
+    goal: float
+    linear: tuple[int, ...]
+
+
+def _minimum(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    weights: FloatArray,
+    theta: FloatArray,
+    sigma: Sequence[float],
+    rtol: float,
+    effort: _Effort,
+) -> tuple[Minimum, Way, list[Simulated]]:
+    """Return the minimum, found by a simulation that is accurate there, and how that was done."""
+    allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
+    ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
+    ways.append(Way(rtol, 0.1 * rtol, stepped=True))
+    spent = 0
+    for way in ways:
+        evaluate = objective(model, experiments, unknowns, weights, way)
+        found = minimise(
+            evaluate,
+            theta,
+            unknowns.bounds(),
+            tolerance=effort.tolerance,
+            evaluations=max(effort.evaluations - spent, 2),
+            goal=effort.goal,
+            linear=effort.linear,
+        )
+        if found is None:
+            raise SimulationError(
+                "The model cannot be simulated at the start of the fit; start from other values."
+            )
+        minimum, theta = found, found.theta
+        spent += found.evaluations
+        if minimum.interrupted:  # whoever interrupts does not wait for the error
+            return replace(minimum, evaluations=spent), way, []
+        told = simulated(model, experiments, unknowns, theta, way=way)
+        if not any(t.error > a for t, a in zip(told, allowed, strict=True)):
+            break
+    return replace(minimum, evaluations=spent), way, told
+
+
+def _allowed(experiment: Experiment, sigma: float) -> float:
+    """Return the rms error [m] that a record's simulation may have."""
+    y = measured(experiment.record)[experiment.used]
+    return max(_OF_NOISE * sigma, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0)
+
+
+def objective(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    weights: FloatArray,
+    way: Way,
+) -> Evaluate:
+    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian."""
+    target = np.concatenate([measured(e.record)[e.used] for e in experiments])
+    used = [e.used[: e.stop] for e in experiments]
+    prior = 1.0 / unknowns.prior
+
+    def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        try:
+            parts = predict(model, experiments, unknowns, theta, way=way)
+        except PsaError:
+            return None
+        y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
+        j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
+        return (
+            np.concatenate([(y - target) / weights, theta * prior]),
+            np.vstack([j / weights[:, None], np.diag(prior)]),
+        )
+
+    return evaluate
+
+
+def _starting_point(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    start: Mapping[str, float],
+    start_states: Sequence[Mapping[str, float]] | None,
+) -> FloatArray:
+    values = {**model.values, **start}
+    theta = np.zeros(unknowns.size)
+    theta[: len(unknowns.names)] = unknowns.coordinates(values)
+    for r, experiment in enumerate(experiments):
+        given = start_states[r] if start_states else {}
+        y, v = measured(experiment.record)[experiment.used], experiment.record.voltage
+        slope = values["G"] * values["k_L"] * static_compliance(values)
+        unknowns.place(theta, r, given, float(np.mean(y) - slope * np.mean(v[experiment.used])))
+    return theta

@@ -1,0 +1,199 @@
+"""Predictions of a model for a set of experiments, and their exact derivatives."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.unknowns import Unknowns
+from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.start import (
+    initial_slope,
+    memory_names,
+    settling_time,
+    start_on,
+    start_state,
+)
+from psa_casadi.simulation.ways import Traced, Way, trace
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Steps between two samples beyond which a trial point counts as failed; dozens are ordinary.
+_STEPS = 2000
+OUTPUT = "measured_displacement"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted displacement (n,) [m] of one record and its derivative (n, size) by theta.
+
+    `way` tells how the record was integrated.
+    """
+
+    displacement: FloatArray
+    jacobian: FloatArray
+    way: str
+
+
+def measured(record: Record) -> FloatArray:
+    """Return the measured displacement [m]; raises InputError when a record has none."""
+    if record.displacement is None:
+        raise InputError([f"Record '{record.name}' has no displacement; a fit compares with one."])
+    return record.displacement
+
+
+def predict_record(
+    model: Model,
+    record: Record,
+    start: Mapping[str, float],
+    wanted: Sequence[str],
+    *,
+    stop: int,
+    rtol: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return displacement (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
+
+    `start` holds deviations of the initial states from where the first inputs and their rates put
+    them, in the states' units. Time counts from the record's first sample. `rtol` is the tolerance
+    of a step.
+    """
+    found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
+    count = len(wanted)
+    return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
+
+
+def trace_record(
+    model: Model,
+    record: Record,
+    start: Mapping[str, float],
+    wanted: Sequence[str],
+    *,
+    stop: int,
+    way: Way,
+) -> Traced:
+    """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
+    names = model.state_names
+    t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
+    memories = memory_names(model.structure)
+    found = start_on(model, t, u, {n: start.get(n, 0.0) for n in memories})
+    x0, searched = found.x.copy(), [names.index(n) for n in start]
+    by_start = np.zeros((len(names), len(start)))
+    for column, name in enumerate(start):
+        if name in memories:
+            by_start[:, column] = found.by_memory[:, memories.index(name)]
+        else:
+            x0[searched[column]] += start[name]
+            by_start[searched[column], column] = 1.0
+    columns = [model.parameter_names.index(n) for n in wanted]
+    s0 = np.hstack([found.by_parameter[:, columns], by_start])
+    unknowns: list[str | int] = [*wanted, *searched]
+    return trace(
+        model, t, u, x0, way=way, output=OUTPUT, unknowns=unknowns, s0=s0, steps_limit=_STEPS
+    )
+
+
+def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
+    """Return the states beside the memories whose start a record leaves open, with their size.
+
+    A record starts where its first voltage and rate put the stack. That is wrong for one that
+    starts amid motion which changes within the stack's settling time T by more than the noise [m]:
+    gain |v(t+T) - 2 v(t) + v(t-T)| > 3 noise. Sizes are what a steady motion at the record's rms
+    rate changes, in the states' units. Empty for a record that starts at rest or changes slowly.
+    """
+    u = record_inputs(model, record, record.n)
+    v, column = record.voltage, model.input_names.index("voltage")
+    settling = settling_time(model)
+    lag = int(settling / record.sample_time)
+    if lag < 2 or 2 * lag >= record.n or initial_slope(record.time, v) == 0.0:
+        return {}
+    bend = v[2 * lag :] - 2.0 * v[lag:-lag] + v[: -2 * lag]
+    rest = start_state(model, list(u[0]))
+    rates = np.zeros(u.shape[1])
+    rates[column] = float(np.sqrt(np.mean((np.diff(v) / np.diff(record.time)) ** 2)))
+    moving = start_state(model, list(u[0]), rates.tolist())
+    gain = float(np.nanstd(measured(record))) / max(float(np.std(v)), 1e-300)
+    if not gain * float(np.sqrt(np.mean(bend**2))) > 3.0 * noise:
+        return {}
+    memories = memory_names(model.structure)
+    nominal = model.state_nominals()
+    return {
+        name: max(abs(float(moving.x[i] - rest.x[i])), 1e-6 * float(nominal[i]))
+        for i, name in enumerate(model.state_names)
+        if name not in memories
+    }
+
+
+def predict(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    *,
+    way: Way,
+    everything: bool = False,
+) -> list[Prediction]:
+    """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
+
+    Records are simulated side by side.
+    """
+    current = model.with_values(unknowns.values(theta))
+    slopes = unknowns.slopes(theta)
+
+    def one(index: int) -> Prediction:
+        experiment = experiments[index]
+        stop = experiment.record.n if everything else experiment.stop
+        found = trace_record(
+            current,
+            experiment.record,
+            unknowns.start(theta, index),
+            unknowns.names,
+            stop=stop,
+            way=way,
+        )
+        start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
+        count = len(unknowns.names)
+        jacobian = found.sensitivity[:, count:] @ start_slopes
+        jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
+        jacobian += offset_slopes
+        return Prediction(found.output + unknowns.offset(theta, index), jacobian, found.way)
+
+    return side_by_side(one, range(len(experiments)))
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """How a record was run, and what a finer run differs by (rms of its used samples) [m]."""
+
+    way: str
+    error: float
+
+
+def simulated(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    *,
+    way: Way,
+) -> list[Simulated]:
+    """Tell how every record is run; a tenth of the tolerance and half the step show its error."""
+    current = model.with_values(unknowns.values(theta))
+
+    def one(index: int) -> Simulated:
+        experiment, start = experiments[index], unknowns.start(theta, index)
+        used = experiment.used[: experiment.stop]
+        plain, finer = (
+            trace_record(current, experiment.record, start, (), stop=experiment.stop, way=w)
+            for w in (way, way.finer)
+        )
+        gap = (plain.output - finer.output)[used]
+        error = float(np.sqrt(np.mean(gap**2))) if gap.size else 0.0
+        return Simulated(plain.way, error if plain.way == finer.way else float("inf"))
+
+    return side_by_side(one, range(len(experiments)))

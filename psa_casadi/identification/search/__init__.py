@@ -1,0 +1,1 @@
+"""Several starts, the best ones followed to the end, what can be told besides."""

@@ -1,0 +1,192 @@
+"""The search for a fit: several starts, the best ones to the end, then what can be told besides."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.search.force_start import retuned
+from psa_casadi.identification.search.refinement import exchanged, with_fast, without_blur
+from psa_casadi.identification.search.refitting import (
+    Progress,
+    differing,
+    equal,
+    noise_levels,
+    quick_rtol,
+    refit,
+    residual_noise,
+    same_place,
+)
+from psa_casadi.identification.start.linear import LinearCandidate
+from psa_casadi.identification.start.starting_points import resolved, starting_points
+from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.timings import stage
+
+#: Parameters that voltage and displacement determine in every record with loops.
+CORE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "c")
+#: Parameters of effects that only set a scale, or choose between two forms, and are never fitted.
+FIXED = frozenset({"drift_span", "temperature_reference", "ageing_by_travel", "rate_by_threshold"})
+
+#: Where there are more starts than finalists, all get the first evaluations, those the rest.
+_QUICK, _FINALISTS, _FIRST = 12, 3, 5
+#: The second best is followed to the end where its cost is at most this much larger.
+_NEAR = 1.5
+#: A fit misses the records where its mean weighted square exceeds this; so many starts are then
+#: followed to the end.
+_MISSED, _FOLLOWED = 2.0, 4
+#: A start whose quick fit comes this close to the best one's cost is followed to the end.
+_CLOSE = 1.02
+
+
+@dataclass(frozen=True)
+class StartOutcome:
+    """One start of the search: its name, the cost and rms [m] it led to, and what became of it.
+
+    `agrees` is True where it led to the same minimum as the best, False where it led elsewhere,
+    None where the quick fit was so much worse that it was not followed to the end.
+    """
+
+    name: str
+    cost: float
+    rms: float
+    agrees: bool | None
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The best fit, what became of every start, and parameters that equally good fits differ in."""
+
+    best: Fit
+    starts: tuple[StartOutcome, ...]
+    not_unique: tuple[str, ...]
+
+
+def free_parameters(model: Model) -> list[str]:
+    """Return the core parameters and those of the model's effects (units of time excepted)."""
+    effects = [p.name for c in model.effects for p in c.parameters if p.name not in FIXED]
+    return [n for n in CORE if n in model.values] + effects
+
+
+@stage("base fit")
+def fit_base(
+    model: Model, experiments: Sequence[Experiment], *, progress: Progress = lambda _: None
+) -> Fit:
+    """Return the best fit of `search`, without the account of its starts."""
+    return search(model, experiments, progress=progress).best
+
+
+def search(
+    model: Model,
+    experiments: Sequence[Experiment],
+    *,
+    linear: Sequence[LinearCandidate] = (),
+    thorough: bool = False,
+    progress: Progress = lambda _: None,
+) -> Search:
+    """Fit the core parameters from several starts, then whatever else the data can tell.
+
+    The starts are the records' loops and ordinary shapes with the first of the `linear` candidates
+    (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
+    best and the second best are followed to the end, if that one is close or, with `thorough`, not
+    far, to tell whether starts agree; with `thorough` more of them while all miss the records. A
+    keyboard interrupt ends the search at the best fit so far. Raises PsaError when no start can be
+    simulated.
+    """
+    core = free_parameters(model)
+    fastest = min(e.record.sample_time for e in experiments)
+    told = resolved(model, linear, fastest)
+    starts = starting_points(model, linear, [e.record for e in experiments])
+    found = _quick_fits(model, experiments, [*core, *told], starts, progress)
+    free = found[0][1].unknowns.names
+    sigma = residual_noise(found[0][1], experiments)
+    polished: list[Fit] = []
+    for name, quick in found:
+        near = quick.cost < (_NEAR if thorough else _CLOSE) * found[0][1].cost
+        missed = thorough and len(polished) < _FOLLOWED and all(map(_misses, polished))
+        if polished and (polished[0].interrupted or not (missed or (near and len(polished) < 2))):
+            break
+        if polished and not thorough and same_place(found[0][1], quick, experiments):
+            continue
+        progress(f"base fit, {name} to the end")
+        ended = quick if quick.interrupted else refit(quick, experiments, free, sigma=sigma)
+        polished.append(ended)
+    best = min(polished, key=lambda f: f.cost)
+    outcomes, not_unique = _outcomes(found, polished, best, experiments)
+    if not best.interrupted:
+        best = with_fast(best, experiments, progress)
+        tuned = retuned(best, experiments, progress) if told else best
+        if tuned is not best:
+            best = tuned
+            outcomes, not_unique = _outcomes(found, polished, best, experiments)
+        best = without_blur(best, experiments)
+    if thorough and not best.interrupted:
+        best, open_ones = exchanged(best, experiments, progress)
+        not_unique |= set(open_ones)
+    names = best.unknowns.names
+    return Search(best, outcomes, tuple(n for n in names if n in not_unique))
+
+
+def _misses(found: Fit) -> bool:
+    """Whether a fit leaves much more than the noise, or lost itself on the way there."""
+    return found.cost > _MISSED * len(found.residuals)
+
+
+def _outcomes(
+    found: Sequence[tuple[str, Fit]],
+    polished: Sequence[Fit],
+    best: Fit,
+    experiments: Sequence[Experiment],
+) -> tuple[tuple[StartOutcome, ...], set[str]]:
+    """Tell what became of every start, and which parameters equally good fits differ in."""
+    outcomes, not_unique = [], set[str]()
+    for k, (name, quick) in enumerate(found):
+        if k >= len(polished):
+            outcomes.append(StartOutcome(name, quick.cost, quick.rms, None))
+            continue
+        final = polished[k]
+        names = differing(best, final, experiments)
+        agrees = final is best or (names == () and equal(best, final))
+        not_unique |= set(names)
+        outcomes.append(StartOutcome(name, final.cost, final.rms, agrees))
+    return tuple(outcomes), not_unique
+
+
+def _quick_fits(
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    starts: Sequence[tuple[str, dict[str, float]]],
+    progress: Progress,
+) -> list[tuple[str, Fit]]:
+    """Fit from every start with few evaluations; return those that could be simulated."""
+    sigma = noise_levels(experiments)
+    quickly: dict[str, Any] = {"sigma": sigma, "rtol": quick_rtol(sigma, experiments)}
+    found: list[tuple[str, Fit]] = []
+    rounds: tuple[int, ...] = (_QUICK,) if len(starts) <= _FINALISTS else (_FIRST, _QUICK - _FIRST)
+    for name, start in starts:
+        progress(f"base fit from {name}")
+        try:
+            quick = fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
+        except PsaError:
+            continue
+        found.append((name, quick))
+        if quick.interrupted:
+            break
+    found.sort(key=lambda pair: pair[1].cost)
+    for k, (name, quick) in enumerate(found[: _FINALISTS if len(rounds) > 1 else 0]):
+        if any(f.interrupted for _, f in found):
+            break
+        progress(f"base fit from {name}, continued")
+        states = quick.starts()
+        further = fit(
+            quick.model, experiments, free, start_states=states, evaluations=rounds[1], **quickly
+        )
+        found[k] = (name, further)
+    if not found:
+        raise PsaError(
+            "The base model could not be simulated from any start; the voltage's unit or the"
+            " displacement's sign is the likely cause: check the record."
+        )
+    return sorted(found, key=lambda pair: pair[1].cost)

@@ -1,0 +1,1 @@
+"""Where fits begin: from loops, from frequency responses, from ordinary values."""

@@ -1,0 +1,1 @@
+"""Models wired to a system, and the nanopositioner made of them."""

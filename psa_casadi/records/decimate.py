@@ -1,0 +1,205 @@
+"""Block averages of a record, taken only as far as they lose nothing that a fit could use."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.errors import InputError
+from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
+
+#: As many samples are left at least.
+FEWEST = 2000
+#: An error of this share of the noise is none.
+SHARE = 0.1
+#: The largest of a million samples of white noise, in standard deviations.
+LARGEST = 6.0
+#: Blocks over which a bend of the displacement is averaged before it is held against the noise.
+ACROSS = 5
+
+
+def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
+    """Return a record of block averages over q samples, and q, which is 1 where nothing may go.
+
+    `noise` is the standard deviation of the displacement's white noise, `slope` the displacement
+    per volt. q doubles as long as, with blocks of length h:
+
+    * the voltage is uniform in time, and straight lines between its averages meet every sample
+      to within 0.1 noise/slope, the voltage's own white noise aside; so do those of a load force
+      to within a thousandth of its range;
+    * averaging moves the displacement, y'' h^2 / 24 in a block, by less than 0.1 noise/sqrt(q);
+    * what averaging takes out of the displacement is white: no line and no hump in the spectrum;
+    * 2000 samples or more are left.
+
+    A block's displacement is the mean of its valid samples, brought to the block's middle along the
+    line to its neighbour; a block of which more than half is missing is masked, and where samples
+    are missing, q stands for the valid ones of the emptiest block. Fewer than q samples at the end
+    are dropped. Name, source and `sha256` are kept.
+
+    Raises:
+        InputError: the noise or the slope is not positive.
+    """
+    for name, value in (("noise", noise), ("slope", abs(slope))):
+        if not 0.0 < value < np.inf:
+            raise InputError(
+                f"record '{record.name}': the {name} is {value:g}, expected a positive number; give"
+                f" what was measured."
+            )
+    best, factor = record, 1
+    if not _uniform(record.time):
+        return best, factor
+    while record.n // (2 * factor) >= FEWEST:
+        wider = _averages(record, 2 * factor)
+        if not _nothing_lost(record, wider, 2 * factor, noise, SHARE * noise / abs(slope)):
+            break
+        best, factor = wider, 2 * factor
+    return best, factor
+
+
+def _uniform(time: FloatArray) -> bool:
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    return bool(np.all(np.abs(steps - usual) < 1e-3 * usual))
+
+
+def _averages(record: Record, q: int) -> Record:
+    """Return the record of block averages over q samples."""
+    time = _means(record.time, q)
+
+    def averaged(array: FloatArray | None) -> FloatArray | None:
+        return None if array is None else _means(array, q)
+
+    return replace(
+        record,
+        time=time,
+        voltage=_means(record.voltage, q),
+        displacement=None if record.displacement is None else _valid_means(record, time, q),
+        load_force=averaged(record.load_force),
+        current=averaged(record.current),
+        temperature=averaged(record.temperature),
+    )
+
+
+def _means(array: FloatArray, q: int) -> FloatArray:
+    return np.asarray(array[: array.size // q * q].reshape(-1, q).mean(axis=1), dtype=float)
+
+
+def _valid(record: Record, q: int) -> NDArray[np.int64]:
+    """Return the number of valid samples in each block."""
+    blocks = record.n // q
+    there = record.mask[: blocks * q].reshape(blocks, q)
+    return np.asarray(there.sum(axis=1), dtype=np.int64)
+
+
+def _valid_means(record: Record, time: FloatArray, q: int) -> FloatArray:
+    """Return the displacement at the middle of each block, nan where more than half is missing."""
+    blocks = record.n // q
+    there = record.mask[: blocks * q].reshape(blocks, q)
+    count = _valid(record, q)
+    known = 2 * count >= q
+    y = np.nan_to_num(np.asarray(record.displacement, dtype=float), nan=0.0)
+    y = y[: blocks * q].reshape(blocks, q).sum(axis=1)
+    t = np.where(there, record.time[: blocks * q].reshape(blocks, q), 0.0).sum(axis=1)
+    means = np.full(blocks, np.nan)
+    if known.any():
+        centres, levels = t[known] / count[known], y[known] / count[known]
+        whole = count[known] == q
+        centres[whole] = time[known][whole]
+        means[known] = np.interp(time[known], centres, levels)
+    return means
+
+
+def _nothing_lost(record: Record, wider: Record, q: int, noise: float, allowed: float) -> bool:
+    """Whether block averages over q samples keep voltage, load and displacement."""
+    if not _followed(record, wider, record.voltage, wider.voltage, q, allowed):
+        return False
+    if record.load_force is not None and wider.load_force is not None:
+        least = 1e-3 * float(np.ptp(record.load_force)) + 1e-300
+        if not _followed(record, wider, record.load_force, wider.load_force, q, least):
+            return False
+    if record.displacement is None or wider.displacement is None:
+        return True
+    if wider.mask.sum() < 0.98 * record.mask.sum() / q:
+        return False
+    valid = _valid(record, q)
+    least = int(np.min(valid[2 * valid >= q], initial=q))
+    return _straight(wider.displacement, noise / np.sqrt(least)) and _white(record, wider, q)
+
+
+def _followed(
+    record: Record, wider: Record, signal: FloatArray, means: FloatArray, q: int, allowed: float
+) -> bool:
+    """Whether straight lines between the means meet the signal, but for its white noise."""
+    error = signal - _lines(record.time, wider.time, means)
+    own = fast_noise(signal)
+    smooth = np.convolve(error, np.ones(q) / q, mode="valid")
+    return bool(
+        np.max(np.abs(error)) <= allowed + LARGEST * own * np.sqrt(1.0 + 1.0 / q)
+        and np.max(np.abs(smooth)) <= allowed + LARGEST * own / np.sqrt(q)
+    )
+
+
+def _lines(time: FloatArray, centres: FloatArray, means: FloatArray) -> FloatArray:
+    """Return straight lines between the means, continued before the first and after the last."""
+    found = np.interp(time, centres, means)
+    for end, inner, outside in (
+        (0, 1, time < centres[0]),
+        (-1, -2, time > centres[-1]),
+    ):
+        rate = (means[end] - means[inner]) / (centres[end] - centres[inner])
+        found[outside] = means[end] + rate * (time[outside] - centres[end])
+    return found
+
+
+def _straight(means: FloatArray, noise: float) -> bool:
+    """Whether averaging moved no mean by more than a tenth of its noise.
+
+    A bend of the means, y'' h^2, is 24 times that. Over five means the noise of a bend is 0.4 of
+    theirs; one alone is held against its own noise, 2.45 times theirs.
+    """
+    bends = np.diff(means, 2)
+    bends = bends[np.isfinite(bends)]
+    if bends.size < ACROSS:
+        return False
+    across = np.convolve(bends, np.ones(ACROSS) / ACROSS, mode="valid")
+    return bool(
+        np.max(np.abs(across)) <= 24.0 * SHARE * noise
+        and np.max(np.abs(bends)) <= (24.0 * SHARE + LARGEST * np.sqrt(6.0)) * noise
+    )
+
+
+def _white(record: Record, wider: Record, q: int) -> bool:
+    """Whether what averaging took out of the displacement has no line and no hump.
+
+    Above the new Nyquist frequency the power of white noise at neighbouring frequencies is
+    independent and exponentially distributed: no line beyond ln(n) + 10 times the local mean, no
+    mean of 64 lines beyond twice it.
+    """
+    if record.displacement is None or wider.displacement is None:
+        return True
+    known = np.isfinite(wider.displacement)
+    lines = _lines(record.time, wider.time[known], wider.displacement[known])
+    taken = np.where(record.mask, np.nan_to_num(record.displacement) - lines, 0.0)
+    power = np.abs(np.fft.rfft(taken)) ** 2
+    upper = power[int(np.ceil(record.n / (2 * q))) : -1]
+    local = _local_mean(upper)
+    hump = np.convolve(upper / local, np.ones(_HUMP) / _HUMP, mode="valid")
+    return bool(
+        np.max(upper / local) < np.log(upper.size) + 10.0
+        and np.max(hump) < 1.0 + 8.0 / np.sqrt(_HUMP)
+    )
+
+
+_HUMP, _AROUND = 64, 2048
+
+
+def _local_mean(power: NDArray[np.float64]) -> FloatArray:
+    """Return the mean power around each frequency from medians, which lines do not move."""
+    count = max(1, power.size // _AROUND)
+    medians = [float(np.median(part)) for part in np.array_split(power, count)]
+    sizes = [part.size for part in np.array_split(power, count)]
+    middle = np.cumsum(sizes) - np.array(sizes) / 2.0
+    found = np.interp(np.arange(power.size), middle, np.array(medians) / np.log(2.0))
+    return np.asarray(np.maximum(found, 1e-300), dtype=float)

@@ -1,0 +1,46 @@
+"""The periodicity of a drive voltage: its dominant line and harmonics."""
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.records.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+
+_DOMINANT = 0.5
+_SIDE_LINES = 5
+_ORDERS = 12
+
+
+def drive_frequency(record: Record) -> float | None:
+    """Return the frequency [Hz] of the line that holds most of the voltage's alternating power.
+
+    None where no line, with five neighbours on each side for modulation, holds half of it.
+    """
+    even = np.linspace(record.time[0], record.time[-1], record.n)
+    v = np.interp(even, record.time, record.voltage)
+    power = np.abs(np.fft.rfft((v - np.mean(v)) * np.hanning(record.n))) ** 2
+    power[0] = 0.0
+    total = float(np.sum(power))
+    if total <= 0:
+        return None
+    peak = int(np.argmax(power))
+    low, high = max(1, peak - _SIDE_LINES), peak + _SIDE_LINES + 1
+    share = float(np.sum(power[low:high])) / total
+    return peak / record.duration if share > _DOMINANT and peak > _SIDE_LINES else None
+
+
+def among_harmonics(frequency: float, record: Record) -> bool:
+    """Whether a frequency [Hz] lies in the range of a periodic drive's first twelve harmonics.
+
+    A resonance answers a periodic drive at the drive's harmonics only, and so does distortion: in
+    that range such a record cannot tell the two apart.
+    """
+    drive = drive_frequency(record)
+    return drive is not None and frequency < (_ORDERS + 0.5) * drive
+
+
+def turns(voltage: FloatArray, share: float = 0.1) -> bool:
+    """Whether a voltage moves both ways, by this share of its range or more in all."""
+    moves = np.diff(voltage)
+    return bool(min(moves[moves > 0].sum(), -moves[moves < 0].sum()) > share * np.ptp(voltage))

@@ -1,0 +1,175 @@
+"""The noise of a record without any model: from voltages played twice, and from held voltages."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.sparse import csr_array
+
+from psa_casadi.records.quality.repetitions import ENOUGH, FEWEST, SHORTEST_HOLD, held, repetitions
+from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
+
+#: Intervals of the line that follows a slow drift.
+DRIFT_INTERVALS = 32
+_LAGS, _ORDER = 256, 8
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredNoise:
+    """Noise of a displacement: standard deviation `level` [m, or counts], colour, and its base.
+
+    `autocovariance` (lags,) [m^2] begins at lag 0. `autoregression` (p,) holds a_1 ... a_p of
+    e_k = a_1 e_(k-1) + ... + w_k by Yule and Walker, p chosen by Schwarz' criterion, empty if
+    white. `samples` is the number of samples it rests on.
+    """
+
+    level: float
+    autocovariance: FloatArray
+    autoregression: FloatArray
+    samples: int
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats(MeasuredNoise):
+    """Noise from repeats, `distances` [s] apart."""
+
+    distances: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Holds(MeasuredNoise):
+    """Noise from `count` held voltages."""
+
+    count: int
+
+
+def repeats(record: Record) -> Repeats | None:
+    """Return the noise that differs between two plays of the same voltage, None without any.
+
+    With y = s + e, s repeated: y(t + T) - y(t) has the autocovariance 2 c(k) for noise that forgets
+    within T. A slow drift (a line of at most 32 intervals) and what follows from the small
+    difference of the two voltages are removed. Several distances T are averaged, so that a tone
+    counts with about its power. Missing samples are left out.
+    """
+    if record.displacement is None:
+        return None
+    found = repetitions(record)
+    if not found:
+        return None
+    pieces = []
+    for r in found:
+        first, second = slice(r.settled, r.stop), slice(r.settled + r.lag, r.stop + r.lag)
+        change = record.displacement[second] - record.displacement[first]
+        apart = record.voltage[second] - record.voltage[first]
+        if np.count_nonzero(np.isfinite(change)) >= FEWEST:
+            pieces.append(_without_drift(change, apart, r.lag))
+    apart_s = {r.lag: float(record.time[r.start + r.lag] - record.time[r.start]) for r in found}
+    noise = _pooled(pieces, 0.5, len(apart_s))
+    if noise is None:
+        return None
+    return Repeats(*noise, tuple(apart_s.values()))
+
+
+def holds(record: Record) -> Holds | None:
+    """Return the noise around a smooth creep a + b t + c t^2 + d ln t while the voltage is held.
+
+    The first quarter of every hold is left to transients. None where holds are too short.
+    """
+    if record.displacement is None:
+        return None
+    pieces = []
+    for start, stop in held(record):
+        first = start + (stop - start) // 4
+        part = slice(first, min(stop, first + ENOUGH))
+        t = (record.time[part] - record.time[start]) / (record.time[stop - 1] - record.time[start])
+        x = np.column_stack([np.ones_like(t), t, t**2, np.log(t)])
+        y = record.displacement[part]
+        there = np.isfinite(y)
+        if np.count_nonzero(there) < SHORTEST_HOLD // 2:
+            continue
+        pieces.append((y - x @ np.linalg.lstsq(x[there], y[there])[0], 4))
+    noise = _pooled(pieces, 1.0, 1)
+    return None if noise is None else Holds(*noise, len(pieces))
+
+
+def _without_drift(change: FloatArray, apart: FloatArray, lag: int) -> tuple[FloatArray, int]:
+    """Return a difference of repeats without slow drift, and the number of coefficients removed.
+
+    `apart` is the difference of the voltages; knots are a distance `lag` apart at least.
+    """
+    n = change.size
+    intervals = int(np.clip(n // lag, 1, DRIFT_INTERVALS))
+    place = np.linspace(0.0, intervals, n)
+    cell = np.minimum(place.astype(np.int64), intervals - 1)
+    share = place - cell
+    scale = float(np.max(np.abs(apart)))
+    third = apart / scale if scale > 0 else apart
+    values = np.column_stack([1.0 - share, share, third]).ravel()
+    columns = np.column_stack([cell, cell + 1, np.full(n, intervals + 1)]).ravel()
+    x = csr_array((values, columns, np.arange(0, 3 * n + 1, 3)), shape=(n, intervals + 2))
+    there = np.isfinite(change)
+    used = x if there.all() else x[np.flatnonzero(there)]
+    normal = (used.T @ used).toarray()
+    coefficients = np.linalg.lstsq(normal, used.T @ change[there])[0]
+    return change - x @ coefficients, intervals + 1 + (scale > 0)
+
+
+def _pooled(
+    pieces: list[tuple[FloatArray, int]], share: float, uses: int
+) -> tuple[float, FloatArray, FloatArray, int] | None:
+    """Return level, autocovariance, autoregression and number of samples of remainders.
+
+    c(k) = share * mean(d_i d_(i+k)) over all pieces, enlarged for the coefficients removed. The
+    pieces use every sample `uses` times.
+    """
+    used = sum(int(np.count_nonzero(np.isfinite(d))) for d, _ in pieces)
+    if used < FEWEST:
+        return None
+    lags = int(np.clip(max(d.size for d, _ in pieces) // 8, 1, _LAGS))
+    products, pairs = np.zeros(lags), np.zeros(lags)
+    for d, _ in pieces:
+        there = np.isfinite(d)
+        products += _products(np.where(there, d, 0.0), lags)
+        pairs += _products(there.astype(np.float64), lags)
+    lags = int(np.argmin(pairs >= 0.25 * FEWEST)) or lags
+    covariance = share * products[:lags] / pairs[:lags]
+    if not covariance[0] > 0:
+        return 0.0, covariance, np.zeros(0), used // uses
+    r = float(np.clip(covariance[min(1, lags - 1)] / covariance[0], 0.0, 0.95)) if lags > 1 else 0.0
+    lost = sum(p for _, p in pieces) * (1.0 + r) / (1.0 - r)
+    covariance *= used / max(used - lost, 0.5 * used)
+    samples = used // uses
+    return float(np.sqrt(covariance[0])), covariance, autoregression(covariance, samples), samples
+
+
+def _products(d: FloatArray, lags: int) -> FloatArray:
+    """Return sum_i d_i d_(i+k) for k < lags."""
+    size = next_fast_len(d.size + lags, real=True)
+    result = np.zeros(lags)
+    found = irfft(np.abs(rfft(d, size)) ** 2, size)[: min(lags, d.size)]
+    result[: found.size] = found
+    return result
+
+
+def autoregression_of(signal: FloatArray) -> FloatArray:
+    """Return the autoregression (p,) of a signal (n,), of at most eighth order."""
+    covariance = _products(signal - np.mean(signal), _ORDER + 1) / signal.size
+    return autoregression(covariance, signal.size) if covariance[0] > 0 else np.zeros(0)
+
+
+def autoregression(covariance: FloatArray, samples: int) -> FloatArray:
+    """Return the coefficients of the order that Schwarz' criterion chooses (Levinson, Durbin)."""
+    a, best = np.zeros(0), np.zeros(0)
+    variance = float(covariance[0])
+    least = samples * float(np.log(variance))
+    for p in range(1, min(_ORDER, covariance.size - 1) + 1):
+        k = float(covariance[p] - a @ covariance[p - 1 : 0 : -1]) / variance
+        if not abs(k) < 1:
+            break
+        a = np.r_[a - k * a[::-1], k]
+        variance *= 1.0 - k**2
+        criterion = samples * float(np.log(variance)) + p * float(np.log(samples))
+        if criterion < least:
+            least, best = criterion, a
+    return best

@@ -1,0 +1,48 @@
+"""Which array of a file is which column: `time=t:ms,voltage=log.u,displacement=y:um`."""
+
+import difflib
+import re
+
+from psa_casadi.errors import Problems
+from psa_casadi.records.read.columns import COLUMNS, ColumnMap, Source, check_unit
+
+_NAMES = ", ".join(COLUMNS)
+_PART = re.compile(
+    r"(?P<name>[^=]*)=(?P<array>[^\[\]]*?)(?::(?P<unit>[^:\[\]]*)|\[(?P<in>[^]]*)\])?"
+)
+_FORM = "write NAME=ARRAY:UNIT, several joined by commas, such as time=t:ms,displacement=y:um"
+
+
+def parse_columns(text: str) -> ColumnMap:
+    """Return what `NAME=ARRAY:UNIT,...` says (`NAME=ARRAY[UNIT]` is read too).
+
+    NAME is a column of a record. ARRAY is a column's name in the header of a CSV or Parquet file,
+    or a MATLAB array: a field of a structure is written `log.u`, the second column of a matrix
+    `m.2`. Without UNIT the header's own unit counts, else the SI unit; a displacement is never
+    guessed.
+
+    Raises:
+        InputError: every part that is not of this form, names no column or no unit of it.
+    """
+    found: dict[str, Source] = {}
+    problems = Problems()
+    for part in text.split(","):
+        where = f"--columns, '{part.strip()}'"
+        match = _PART.fullmatch(part.strip())
+        if match is None or not match["array"].strip():
+            problems.add(f"{where}: is not understood; {_FORM}.")
+            continue
+        name = re.sub(r"[\s-]+", "_", match["name"].strip().lower())
+        unit = match["unit"] if match["in"] is None else match["in"]
+        if name not in COLUMNS:
+            near = difflib.get_close_matches(name, COLUMNS, n=1, cutoff=0.6)
+            meant = f"is '{near[0]}' meant? There are" if near else "there are"
+            problems.add(f"{where}: '{name}' is no column of a record; {meant} {_NAMES}.")
+        elif name in found:
+            problems.add(f"{where}: '{name}' is given twice; remove one of the two.")
+        else:
+            if unit is not None:
+                check_unit(COLUMNS[name], unit, where, problems)
+            found[name] = Source(match["array"].strip(), unit)
+    problems.raise_if_any()
+    return found

@@ -1,0 +1,41 @@
+"""Columns from CSV files.
+
+A header names each column with its unit in brackets, in any order:
+`time [s],voltage [V],displacement [um],load_force [N],temperature [degC]`. Lines before it that
+begin with # are comments. Cells are separated by commas, semicolons or tabs, as in the header.
+Missing samples are allowed in `displacement` (an empty cell or nan).
+"""
+
+from collections.abc import Sequence
+
+from psa_casadi.errors import Problems
+from psa_casadi.records.read.columns import ColumnMap, parse_header
+from psa_casadi.records.read.csv_table import load_text, parse_numbers
+from psa_casadi.records.read.samples import Samples
+
+
+def read_csv(
+    path: str, required: Sequence[str], wanted: ColumnMap, problems: Problems
+) -> Samples | None:
+    """Return the columns of a CSV file, or None where its header names none.
+
+    `wanted` says which name in the header is which column, where they differ. Mistakes are added to
+    `problems`, each with file, line and column.
+
+    Raises:
+        InputError: the file cannot be read, or is not text.
+    """
+    text = load_text(path)
+    fields = parse_header(text.header, required, text.where_header, problems, wanted)
+    if not fields:
+        return None
+    numbers = parse_numbers(text, fields, problems)
+    return Samples(
+        path=text.path,
+        sha256=text.sha256,
+        place="line",
+        units={name: field.unit for name, field in fields.items()},
+        values=numbers.values,
+        lines=numbers.lines,
+        reported=numbers.reported,
+    )

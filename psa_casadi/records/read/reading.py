@@ -1,0 +1,135 @@
+"""Records from files: read, checked as a whole, converted to SI units.
+
+The format follows the ending: `.mat` (MATLAB), `.parquet` or `.pq`, and CSV for everything else.
+"""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.read.checks import (
+    Located,
+    check_complete,
+    check_displacement,
+    check_excitation,
+    check_length,
+    check_time,
+)
+from psa_casadi.records.read.column_map import parse_columns
+from psa_casadi.records.read.columns import ColumnMap
+from psa_casadi.records.read.read_csv import read_csv
+from psa_casadi.records.read.read_mat import read_mat
+from psa_casadi.records.read.read_parquet import read_parquet
+from psa_casadi.records.read.samples import Samples
+from psa_casadi.records.record import Record
+from psa_casadi.units import parse_unit, to_si
+
+AnyPath = str | os.PathLike[str]
+
+#: What reads a file, by its ending; a file with another ending is CSV.
+READERS = {".mat": read_mat, ".parquet": read_parquet, ".pq": read_parquet}
+
+
+def read_record(
+    path: AnyPath,
+    *,
+    need_displacement: bool = True,
+    need_excitation: bool = False,
+    columns: str | ColumnMap | None = None,
+) -> Record:
+    """Return the record in one file: CSV, MATLAB or Parquet.
+
+    `need_displacement` demands a displacement column with values, as a comparison does;
+    `need_excitation` a voltage that changes, as a fit does. `columns` names the arrays of the file
+    that are the columns, such as "time=t:ms,voltage=log.u,displacement=m.2:um" (`parse_columns`).
+
+    Raises:
+        InputError: every mistake found in the file, one sentence each: file, line, column, what was
+            found, what was expected, what to do. At most 20 are listed, the others counted.
+    """
+    problems = Problems()
+    wanted = parse_columns(columns) if isinstance(columns, str) else columns or {}
+    required = ("time", "voltage", *(("displacement",) if need_displacement else ()))
+    reader = READERS.get(Path(path).suffix.lower(), read_csv)
+    samples = reader(str(path), required, wanted, problems)
+    if samples is not None:
+        _check(samples, problems, need_excitation=need_excitation)
+    problems.raise_if_any()
+    if samples is None:
+        raise InputError(f"{path}: holds no columns; export the record again.")
+    return _record(samples)
+
+
+def read_records(
+    paths: Iterable[AnyPath],
+    *,
+    need_displacement: bool = True,
+    need_excitation: bool = False,
+    columns: str | ColumnMap | None = None,
+) -> tuple[Record, ...]:
+    """Return the records in several files, which are experiments on the same device.
+
+    Raises:
+        InputError: the mistakes of all files together, or no file was named.
+    """
+    wanted = parse_columns(columns) if isinstance(columns, str) else columns
+    records: list[Record] = []
+    problems: list[str] = []
+    for path in paths:
+        try:
+            record = read_record(
+                path,
+                need_displacement=need_displacement,
+                need_excitation=need_excitation,
+                columns=wanted,
+            )
+            records.append(record)
+        except InputError as error:
+            problems.extend(error.problems)
+    if not records and not problems:
+        problems.append("no record was named; name at least one CSV file.")
+    if problems:
+        raise InputError(problems)
+    return tuple(records)
+
+
+def _check(samples: Samples, problems: Problems, *, need_excitation: bool) -> None:
+    check_length(samples.path, len(samples.lines), problems)
+    for k, name in enumerate(samples.units):
+        column = Located(
+            samples.path,
+            name,
+            samples.values[:, k],
+            samples.lines,
+            samples.reported[:, k],
+            samples.place,
+        )
+        if name == "time":
+            check_time(column, problems)
+        elif name == "displacement":
+            check_displacement(column, problems)
+        else:
+            check_complete(column, problems)
+        if name == "voltage" and need_excitation:
+            check_excitation(column, problems)
+
+
+def _record(samples: Samples) -> Record:
+    columns = {
+        name: to_si(samples.values[:, k], unit)
+        for k, (name, unit) in enumerate(samples.units.items())
+    }
+    in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
+    return Record(
+        name=Path(samples.path).stem,
+        time=columns["time"],
+        voltage=columns["voltage"],
+        displacement=columns.get("displacement"),
+        load_force=columns.get("load_force"),
+        current=columns.get("current"),
+        temperature=columns.get("temperature"),
+        sha256=samples.sha256,
+        source=samples.path,
+        displacement_unit="counts" if in_counts else "m",
+    )

@@ -1,0 +1,132 @@
+"""Training and held-out samples of a record: a quarter is held out, whole segments together."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.records.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Number of blocks a record is cut into, and of how many one is held out when no record is named.
+BLOCKS, HELD_OUT_EVERY = 16, 4
+#: Blocks that come this close to the record's highest or lowest value, over its range, reach it.
+_REACHED = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A record with the samples that count for a fit (`used`) and those held out for judging it."""
+
+    record: Record
+    used: BoolArray
+    held_out: BoolArray
+
+    @property
+    def stop(self) -> int:
+        """One past the last used sample: a fit need not simulate further."""
+        return int(np.flatnonzero(self.used)[-1]) + 1
+
+
+def whole(record: Record) -> Experiment:
+    """Return the experiment that uses every valid sample of a record and holds out none."""
+    return Experiment(record, record.mask, np.zeros(record.n, dtype=bool))
+
+
+def split(record: Record) -> Experiment:
+    """Hold out one of every four of a record's sixteen blocks: a quarter of the record.
+
+    It is the last one of each four, unless the voltage or its rate would then be highest or lowest
+    in held-out samples alone: what only shows there (a limited current, a clipped voltage) has to
+    be learnt before it can be judged. What the displacement is has no say in it.
+
+    Blocks begin at voltage reversals, so that a segment between two reversals is never cut unless
+    it is longer than a block. Taking the held-out quarter from all over the record, rather than
+    from its end alone, keeps a class of voltage that occurs once (minor loops at the end of a
+    record of full loops) from being judged without ever having been learnt.
+    """
+    turns = reversals(record.voltage)
+    edges = []
+    for k in range(BLOCKS + 1):
+        point = round(k * record.n / BLOCKS)
+        near = turns[np.abs(turns - point) <= 0.5 * record.n / BLOCKS]
+        inner = 0 < k < BLOCKS and len(near) > 0
+        edges.append(int(near[np.argmin(np.abs(near - point))]) if inner else point)
+    index = np.searchsorted(np.array(edges[1:-1]), np.arange(record.n), side="right")
+    held = np.isin(index, _held_out(record, index))
+    return Experiment(record, record.mask & ~held, record.mask & held)
+
+
+def _held_out(record: Record, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
+    """Return the blocks to hold out, one of every four; `index` (n,) is the block of each sample.
+
+    Of all choices, the one that holds the fewest extremes of voltage and rate out, among the
+    samples that have a reading; of these the one nearest to the last of each four. The first block
+    is always fitted: the record's start is found there.
+    """
+    voltage = record.voltage
+    rate = np.r_[0.0, np.diff(voltage) / np.diff(record.time)]
+    extremes = [_reaching(s, record.mask, index) for v in (voltage, rate) for s in (v, -v)]
+    groups = [range(g, g + HELD_OUT_EVERY) for g in range(0, BLOCKS, HELD_OUT_EVERY)]
+
+    def missed(choice: tuple[int, ...]) -> int:
+        return sum(found <= set(choice) for found in extremes if found)
+
+    choices = (c for c in product(*groups) if 0 not in c)
+    return min(choices, key=lambda c: (missed(c), -sum(c), c))
+
+
+def _reaching(values: FloatArray, valid: BoolArray, index: npt.NDArray[np.int64]) -> set[int]:
+    """Return the blocks in which the valid values come up to the largest of them."""
+    if not valid.any():
+        return set()
+    top, span = float(np.max(values[valid])), float(np.ptp(values[valid]))
+    return set(index[valid & (values >= top - _REACHED * span)].tolist())
+
+
+def in_one_order(records: Iterable[Record]) -> list[Record]:
+    """Return the records by sampling interval, length and content, however they are given."""
+    return sorted(records, key=lambda r: (r.sample_time, r.n, r.sha256, r.name))
+
+
+def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Experiment, ...]:
+    """Return the experiments of records and held-out ones; without these every record is `split`.
+
+    The first tenth of a held-out record only serves to find its offset and memory.
+    """
+    if not holdout:
+        return tuple(split(r) for r in records)
+    held = []
+    for record in holdout:
+        lead = np.arange(record.n) < max(8, record.n // 10)
+        held.append(Experiment(record, record.mask & lead, record.mask & ~lead))
+    return (*(whole(r) for r in records), *held)
+
+
+def reversals(voltage: FloatArray, threshold: float | None = None) -> npt.NDArray[np.int64]:
+    """Return the samples at which the voltage turns and comes back by more than `threshold` [V].
+
+    Without a threshold it is 1e-4 of the range, which is taken for noise.
+    """
+    threshold = 1e-4 * float(np.ptp(voltage)) if threshold is None else threshold
+    step = np.diff(voltage)
+    moving = np.flatnonzero(step)
+    up = step[moving] > 0
+    places = np.r_[0, moving[np.flatnonzero(up[1:] != up[:-1])] + 1, voltage.size - 1]
+    turns: list[int] = []
+    direction, extreme, level = 0, 0, float(voltage[0])
+    for k, v in zip(places.tolist(), voltage[places].tolist(), strict=True):
+        change = v - level
+        if direction == 0:
+            if abs(change) > threshold:
+                direction, extreme, level = (1 if change > 0 else -1), k, v
+        elif change * direction > 0:
+            extreme, level = k, v
+        elif -change * direction > threshold:
+            turns.append(extreme)
+            direction, extreme, level = -direction, k, v
+    return np.array(turns, dtype=np.int64)

@@ -1,0 +1,62 @@
+"""A design (an input, an experiment, a mechanism) as one HTML page that works offline."""
+
+import os
+from collections.abc import Sequence
+from typing import Protocol
+
+from psa_casadi.files import atomic_write
+from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.words.tables import Table
+
+
+class TitledTableLike(Protocol):
+    """A table of text under a title, with a note on how to read it (empty: none)."""
+
+    @property
+    def title(self) -> str:
+        """What the table shows."""
+        ...
+
+    @property
+    def table(self) -> Table:
+        """Head and rows."""
+        ...
+
+    @property
+    def note(self) -> str:
+        """How to read it."""
+        ...
+
+
+def write_design_page(
+    path: str | os.PathLike[str],
+    *,
+    title: str,
+    summary: Sequence[str],
+    tables: Sequence[TitledTableLike] = (),
+    figures: Sequence[Picture] = (),
+    badges: Sequence[str] = (),
+) -> None:
+    """Write the page of a design, whole or not at all.
+
+    The first sentence of `summary` is the result, the others follow as a list; then come the
+    figures (plots as `psa_casadi.report.plots.theme.styled` makes them) and the tables
+    with their notes. `badges` are short marks under the title, such as "2,000 samples".
+
+    Raises InputError when `path` cannot be written to.
+    """
+    page = Document(title, badges)
+    if summary:
+        page.paragraph(summary[0], "verdict")
+    if summary[1:]:
+        page.bullets(summary[1:])
+    if figures:
+        page.section("Figures")
+    for picture in figures:
+        page.picture(picture)
+    for titled in tables:
+        page.section(titled.title)
+        page.table(titled.table, {"FAIL": "bad", "pass": "good"})
+        if titled.note:
+            page.paragraph(titled.note, "note")
+    atomic_write(path, page.text())

@@ -1,0 +1,137 @@
+"""A diagnosis as one HTML page that works offline, on a phone and on paper."""
+
+import os
+from collections.abc import Sequence
+
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.files import atomic_write
+from psa_casadi.report.page.cause_part import add_causes, add_evidence
+from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
+from psa_casadi.report.page.record_part import add_records, points_each
+from psa_casadi.report.plots.residual_plots import time_plot
+from psa_casadi.report.words.phrases import (
+    OWN_VOLTAGES,
+    VERDICTS,
+    added,
+    gain_sentence,
+    length_scale,
+    listing,
+    micro,
+    number,
+    percent,
+    rest_sentence,
+    verdict_sentence,
+)
+from psa_casadi.report.words.residuals import residual_figures
+from psa_casadi.report.words.series import Series, most_telling, series_of
+from psa_casadi.report.words.tables import (
+    blind_table,
+    candidate_table,
+    error_table,
+    parameter_table,
+    record_table,
+)
+
+
+def write_report(
+    diagnosis: Diagnosis, path: str | os.PathLike[str], *, origin: str = "measured"
+) -> None:
+    """Write the page of a diagnosis, whole or not at all: the story first, then the details.
+
+    `origin`, "measured" or "synthetic", is what the page calls the records. Raises InputError when
+    `path` cannot be written to.
+    """
+    d, series = diagnosis, series_of(diagnosis)
+    page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin))
+    page.paragraph(verdict_sentence(d), "verdict")
+    _picture(page, series, origin)
+    page.tiles(_tiles(d))
+    add_misfit(page, d)
+    add_evidence(page, d)
+    add_causes(page, d)
+    _gain(page, d)
+    _rest(page, d)
+    _details(page, d, series, origin)
+    atomic_write(path, page.text())
+
+
+def _badges(d: Diagnosis, origin: str) -> list[str]:
+    count = len(d.experiments)
+    sure = d.causes[:1] if d.verdict != "ambiguous" else ()
+    badges = [f"confidence {percent(c.confidence)}" for c in sure]
+    return [*badges, f"{origin} data", f"{count} record{'s' if count > 1 else ''}"]
+
+
+def _picture(page: Document, series: Sequence[Series], origin: str) -> None:
+    """Add the record that the base model misses most: curves above, residual below."""
+    s = most_telling(series)
+    curves = listing([origin, *(c.label for c in s.curves)])
+    noise = "Below: the residual; dashed: two standard deviations of the noise."
+    shaded = " Shaded: held out." if s.held_out.any() else ""
+    plot = time_plot(s, origin, points_each(4))
+    page.picture(Picture(f"{s.name}: {curves}", plot, f"{noise}{shaded}"))
+
+
+def _tiles(d: Diagnosis) -> list[tuple[str, str, str]]:
+    """Return the main figures: held-out errors, noise, gain."""
+    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
+    scale = length_scale(d.base_errors.holdout_rms_m, counts=counts)
+    models = [("base model, held-out rms", d.base_errors)]
+    models += [("extended model, held-out rms", d.extended_errors)] if added(d) else []
+    tiles = [
+        (label, scale.text(e.holdout_rms_m), f"{number(e.holdout_nrmse_percent, 2)} % of the range")
+        for label, e in models
+    ]
+    sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
+    tiles.append(
+        ("noise, rms", scale.text(d.noise_floor_rms_m), f"from {sources}" if sources else "")
+    )
+    if added(d):
+        low, high = d.gain.interval
+        gain = f"{d.gain.holdout_rms_reduction_percent:.0f} %"
+        interval = f"95 % interval {low:.0f} to {high:.0f} %"
+        tiles.append(("held-out error falls by", gain, interval))
+    return tiles
+
+
+def _gain(page: Document, d: Diagnosis) -> None:
+    page.section("What is gained")
+    sentence = gain_sentence(d) if added(d) else "nothing was added to the base model"
+    page.paragraph(f"{sentence[0].upper()}{sentence[1:]}.")
+    if added(d) and not d.gain.held_out_records:
+        page.paragraph(OWN_VOLTAGES)
+    scale = series_of(d)[0].residual_scale
+    page.table(error_table(d, scale.unit, scale.factor))
+
+
+def _rest(page: Document, d: Diagnosis) -> None:
+    page.section("What remains")
+    page.paragraph(rest_sentence(d))
+    add_remainder(page, d)
+    page.section("What these records could not have shown")
+    if d.blind_to:
+        page.table(blind_table(d))
+    else:
+        page.paragraph("No effect of the table that is of ordinary size.")
+    page.section("Next experiment")
+    page.paragraph(d.next_experiment.why)
+    if d.next_experiment.voltage_csv:
+        page.paragraph(f"Voltage to play: {d.next_experiment.voltage_csv}")
+
+
+def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str) -> None:
+    page.section("Details: record by record")
+    add_records(page, series, [residual_figures(s, s.curves[-1]) for s in series], origin)
+    page.section("Every effect that was tried: figures")
+    page.table(candidate_table(d))
+    which = "extended" if added(d) else "base"
+    page.section(f"Parameters of the {which} model")
+    page.table(parameter_table(d.model))
+    for note in d.notes:
+        page.paragraph(note, "note")
+    if d.noise:
+        page.section("Noise")
+        page.bullets(micro(n.sentence) for n in d.noise)
+    page.section("Records")
+    page.table(record_table(d.experiments, origin))

@@ -1,0 +1,163 @@
+"""One self-contained HTML page: style, script, sections, tables and plots, nothing from the net."""
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+from plotly.offline import get_plotlyjs
+
+from psa_casadi.report.plots.theme import DARK
+from psa_casadi.report.words.tables import Table
+
+_FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
+_HASH = re.compile(r"[0-9a-f]{64}")
+_WIDE = 28
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A plotly figure with its caption and, below it, what the reader must know to read it."""
+
+    caption: str
+    plot: Any
+    note: str = ""
+
+
+class Document:
+    """Collects the parts of a page in their order and returns its text."""
+
+    def __init__(self, title: str, badges: Sequence[str]) -> None:
+        self._title = title
+        marks = "".join(
+            f'<span class="badge {_text(b.split()[0])}">{_text(b)}</span>' for b in badges
+        )
+        self._head = f"<h1>{_text(title)}</h1><p>{marks}</p>"
+        self._top: list[str] = []
+        self._parts = self._top
+        self._sections: list[tuple[str, str]] = []
+
+    def section(self, title: str) -> None:
+        """Begin a section that the list of contents at the top names."""
+        if not self._sections:
+            self._parts = []
+        name = f"s{len(self._sections) + 1}"
+        self._sections.append((name, title))
+        self._parts.append(f'<h2 id="{name}">{_text(title)}</h2>')
+
+    def heading(self, text: str) -> None:
+        """Begin a part of a section."""
+        self._parts.append(f"<h3>{_text(text)}</h3>")
+
+    def paragraph(self, text: str, kind: str = "") -> None:
+        """Add a paragraph; `kind` is the name of a style."""
+        marked = f' class="{kind}"' if kind else ""
+        self._parts.append(f"<p{marked}>{_text(text)}</p>")
+
+    def bullets(self, texts: Iterable[str]) -> None:
+        """Add a list."""
+        self._parts.append(_list(texts))
+
+    def warnings(self, texts: Sequence[str]) -> None:
+        """Add a box that nobody overlooks; nothing if there is nothing to warn of."""
+        if texts:
+            word = "Warning" if len(texts) == 1 else "Warnings"
+            self._parts.append(
+                f'<div class="warnings" role="alert"><p>{word}</p>{_list(texts)}</div>'
+            )
+
+    def tiles(self, figures: Iterable[tuple[str, str, str]]) -> None:
+        """Add the main figures in a row: label, figure, and a remark that may be empty."""
+        cells = "".join(
+            f"<div><dt>{_text(label)}</dt><dd>{_text(figure)}"
+            f"{f'<small>{_text(remark)}</small>' if remark else ''}</dd></div>"
+            for label, figure, remark in figures
+        )
+        self._parts.append(f'<dl class="tiles">{cells}</dl>')
+
+    def table(self, table: Table, marks: Mapping[str, str] | None = None) -> None:
+        """Add a table that scrolls on its own where the page is too narrow for it.
+
+        Columns of figures are set flush right; a cell whose text is in `marks` gets that style.
+        """
+        styles = [_column_style(column) for column in zip(*table.rows, strict=True)]
+        styles = styles or [""] * len(table.head)
+
+        def row(tag: str, cells: Sequence[str]) -> str:
+            texts = (
+                f"<{tag}{_class(style, (marks or {}).get(cell, ''))}>{_text(cell)}</{tag}>"
+                for cell, style in zip(cells, styles, strict=True)
+            )
+            return f"<tr>{''.join(texts)}</tr>"
+
+        body = "".join(row("td", cells) for cells in table.rows)
+        self._parts.append(
+            f'<div class="scroll" tabindex="0"><table><thead>{row("th", table.head)}</thead>'
+            f"<tbody>{body}</tbody></table></div>"
+        )
+
+    def picture(self, picture: Picture) -> None:
+        """Add a plot over the whole width."""
+        self._parts.append(_figure(picture))
+
+    def pictures(self, pictures: Iterable[Picture]) -> None:
+        """Add plots side by side, two in a row where there is room."""
+        self._parts.append(f'<div class="pair">{"".join(map(_figure, pictures))}</div>')
+
+    def text(self) -> str:
+        """Return the page."""
+        style, script = (
+            files("psa_casadi.report.page").joinpath(name).read_text(encoding="utf-8")
+            for name in ("page.css", "page.js")
+        )
+        contents = "".join(f'<a href="#{n}">{_text(title)}</a>' for n, title in self._sections)
+        body = [self._head, *self._top]
+        if self._sections:
+            body += [f'<nav aria-label="contents">{contents}</nav>', *self._parts]
+        return (
+            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<title>{_text(self._title)}</title><style>{style}</style>"
+            f"<script>{get_plotlyjs()}</script></head>\n<body>\n"
+            + "\n".join(body)
+            + f'\n<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
+            + f"\n<script>{script}</script>\n</body></html>\n"
+        )
+
+
+def _text(words: str) -> str:
+    """Return words as HTML; a percent sign stays with its number."""
+    return escape(words).replace(" %", "\u00a0%")
+
+
+def _list(texts: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{_text(t)}</li>' for t in texts)}</ul>"
+
+
+def _class(*names: str) -> str:
+    given = " ".join(n for n in names if n)
+    return f' class="{given}"' if given else ""
+
+
+def _column_style(cells: Sequence[str]) -> str:
+    filled = [c for c in cells if c]
+    if filled and all(_FIGURE.fullmatch(c) for c in filled):
+        return "figure"
+    if filled and all(_HASH.fullmatch(c) for c in filled):
+        return "hash"
+    return "wide" if any(len(c) > _WIDE for c in filled) else ""
+
+
+def _figure(picture: Picture) -> str:
+    # "<" is escaped so that no text in a figure can end the script that holds it
+    data = picture.plot.to_json().replace("<", "\\u003c")
+    note = f'<p class="note">{_text(picture.note)}</p>' if picture.note else ""
+    caption = _text(picture.caption)
+    return (
+        f"<figure><figcaption>{caption}</figcaption>"
+        f'<script type="application/json">{data}</script>'
+        f'<div class="drawing" role="img" aria-label="{caption}"></div>{note}</figure>'
+    )

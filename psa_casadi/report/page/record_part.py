@@ -1,0 +1,88 @@
+"""The part of a page that shows the records one by one, within the size a page may have."""
+
+from collections.abc import Sequence
+
+from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.plots.residual_plots import (
+    autocorrelation_plot,
+    distribution_plot,
+    error_loop_plot,
+    loop_plot,
+    spectrum_plot,
+    time_plot,
+    zoom_plot,
+)
+from psa_casadi.report.words.fit_words import residual_sentence
+from psa_casadi.report.words.residuals import ResidualFigures
+from psa_casadi.report.words.series import Series
+
+#: Samples of all records that may be drawn together: with all their curves about 2 MB of text.
+_MOST_POINTS = 22_000
+#: Samples of one record beyond which no screen shows more.
+_POINTS = 12_000
+#: Records that are drawn; of more, those that the model misses most.
+MOST_RECORDS = 16
+
+
+def add_records(
+    page: Document, series: Sequence[Series], figures: Sequence[ResidualFigures], origin: str
+) -> None:
+    """Add every record: time and residual, loop, window, and what the last curve leaves.
+
+    `figures` are those of the last curve's residual in each record.
+    """
+    shown = _worst(figures)
+    if len(shown) < len(series):
+        page.paragraph(
+            f"Of {len(series)} records these {len(shown)} are drawn, which the model misses by the"
+            " largest share of their range.",
+            "note",
+        )
+    for k in shown:
+        _add(page, series[k], figures[k], origin, points_each(len(shown)))
+
+
+def points_each(records: int) -> int:
+    """Return how many samples of one record may be drawn, so that the page stays below 8 MB."""
+    return min(_POINTS, _MOST_POINTS // max(1, records))
+
+
+def _worst(figures: Sequence[ResidualFigures]) -> list[int]:
+    order = sorted(range(len(figures)), key=lambda k: -figures[k].range_share)
+    return sorted(order[:MOST_RECORDS])
+
+
+def _add(page: Document, s: Series, figures: ResidualFigures, origin: str, limit: int) -> None:
+    page.heading(f"{s.name} ({origin})")
+    page.paragraph(residual_sentence(figures, s.curves[-1].label, s.time_scale))
+    shaded = " Shaded: held out." if s.held_out.any() else ""
+    noise = "Dashed: two standard deviations of the noise."
+    page.picture(
+        Picture(
+            f"Displacement, and residual: {origin} minus model",
+            time_plot(s, origin, limit),
+            f"{noise}{shaded}",
+        )
+    )
+    page.pictures(
+        [
+            Picture("Loop: displacement over voltage", loop_plot(s, origin, limit)),
+            Picture("Residual over voltage", error_loop_plot(s, limit), noise),
+            Picture("Where the difference is easiest to see", zoom_plot(s, origin, limit)),
+            Picture(
+                "Spectrum of the residual",
+                spectrum_plot(s, limit),
+                "Dashed: white noise of the record's noise level.",
+            ),
+            Picture(
+                "Autocorrelation of the residual",
+                autocorrelation_plot(s),
+                "Dashed: 95 % of the lags of white noise lie between these lines.",
+            ),
+            Picture(
+                "Distribution of the residual",
+                distribution_plot(s),
+                "Dashed: normal distribution of the same mean and standard deviation.",
+            ),
+        ]
+    )

@@ -1,0 +1,168 @@
+"""The picture of a diagnosis: measured, base and extended, loop, residual, evidence."""
+
+import math
+import os
+import textwrap
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.files import atomic_path
+from psa_casadi.report.words.phrases import plain, share_text, verdict_sentence
+from psa_casadi.report.words.series import (
+    HELD_OUT_COLOUR,
+    MEASURED_COLOUR,
+    NOISE_COLOUR,
+    Series,
+    bar_colour,
+    most_telling,
+    series_of,
+    spans,
+    telling_window,
+)
+
+_SIZE_INCHES, _DPI = (16.0, 10.0), 100
+_FONT = 13.0
+
+
+def save_figure(
+    diagnosis: Diagnosis, path: str | os.PathLike[str], *, origin: str = "measured"
+) -> None:
+    """Write the picture of a diagnosis as a PNG of 1600 x 1000 points, whole or not at all.
+
+    Of several records it shows the one that the base model misses most. `origin`, "measured" or
+    "synthetic", names the record's curve. Raises InputError when `path` cannot be written to.
+    """
+    series = series_of(diagnosis)
+    shown = most_telling(series)
+    figure = Figure(figsize=_SIZE_INCHES, dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), width_ratios=(1.0, 1.0, 0.95))
+    window = telling_window(shown)
+    _time(figure.add_subplot(grid[0, 0]), shown, slice(None), origin, window)
+    _time(figure.add_subplot(grid[0, 1]), shown, window, origin, None)
+    _loop(figure.add_subplot(grid[0, 2]), shown, origin)
+    _residual(figure.add_subplot(grid[1, :2]), shown)
+    _evidence(figure.add_subplot(grid[1, 2]), diagnosis)
+    figure.suptitle(_title(diagnosis, series, shown, origin), fontsize=_FONT + 3)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=_DPI)
+
+
+def _title(d: Diagnosis, series: tuple[Series, ...], shown: Series, origin: str) -> str:
+    which = f"{origin} record: {shown.name}"
+    if len(series) > 1:
+        which += f" (the one of {len(series)} that the base model misses most)"
+    return "\n".join([*textwrap.wrap(verdict_sentence(d), 125), which])
+
+
+def _style(axes: Axes, title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=_FONT + 1, loc="left")
+    axes.set_xlabel(x, fontsize=_FONT)
+    axes.set_ylabel(y, fontsize=_FONT)
+    axes.tick_params(labelsize=_FONT - 1)
+    axes.grid(visible=True, color="#dddddd", linewidth=0.8)
+    axes.set_axisbelow(True)
+
+
+def _shade_held_out(axes: Axes, s: Series) -> None:
+    for index, (first, last) in enumerate(spans(s.held_out)):
+        label = "held out" if index == 0 else None
+        axes.axvspan(s.time[first], s.time[last], color=HELD_OUT_COLOUR, label=label, zorder=0)
+
+
+def _time(axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None) -> None:
+    scale = s.scale
+    time, dense = s.time[part], len(s.time[part]) > 400
+    y = scale.factor * s.measured[part]
+    if zoom is not None:
+        axes.plot(time, y, color=MEASURED_COLOUR, linewidth=2.2, label=origin)
+    elif dense:
+        axes.plot(time, y, color=NOISE_COLOUR, linewidth=0.7, label=origin)
+    else:
+        axes.plot(time, y, color=MEASURED_COLOUR, linestyle="none", marker="o", label=origin)
+    for curve in s.curves:
+        width = 1.3 if zoom is not None else 2.6
+        values = scale.factor * curve.values[part]
+        axes.plot(time, values, color=curve.colour, linewidth=width, label=curve.label)
+    if zoom is not None:
+        _shade_held_out(axes, s)
+        low, high = s.time[zoom][0], s.time[zoom][-1]
+        axes.axvspan(low, high, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
+    title = "The part in the box"
+    if zoom is not None:
+        title = "Displacement (box: the part on the right)"
+    _style(axes, title, "time [s]", f"displacement [{scale.unit}]")
+    axes.margins(x=0.01)
+    if zoom is None:
+        axes.legend(fontsize=_FONT - 1, framealpha=0.85)
+
+
+def _loop(axes: Axes, s: Series, origin: str) -> None:
+    scale = s.scale
+    axes.plot(
+        s.voltage, scale.factor * s.measured, color=MEASURED_COLOUR, linewidth=2.2, label=origin
+    )
+    for curve in s.curves:
+        values = scale.factor * curve.values
+        axes.plot(s.voltage, values, color=curve.colour, linewidth=0.9, label=curve.label)
+    _style(axes, "Loop", "voltage [V]", f"displacement [{scale.unit}]")
+    axes.legend(fontsize=_FONT - 1, framealpha=0.85, loc="upper left")
+
+
+def _residual(axes: Axes, s: Series) -> None:
+    scale = s.residual_scale
+    _shade_held_out(axes, s)
+    for curve in s.curves:
+        values = scale.factor * s.residual(curve)
+        axes.plot(s.time, values, color=curve.colour, linewidth=0.9, label=f"of the {curve.label}")
+    band = 2.0 * scale.factor * s.noise
+    for edge in (-band, band):
+        label = "noise (2 sigma)" if edge > 0 else None
+        axes.axhline(edge, color="black", linewidth=1.3, linestyle="--", label=label)
+    _style(axes, "Residual: measured minus model", "time [s]", f"residual [{scale.unit}]")
+    axes.margins(x=0.005)
+    largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves) * scale.factor
+    axes.set_ylim(-1.1 * largest, 1.45 * largest)
+    axes.legend(
+        fontsize=_FONT - 1.5, ncols=4, loc="upper center", columnspacing=1.2, handlelength=1.4
+    )
+
+
+def _evidence(axes: Axes, d: Diagnosis) -> None:
+    causes = {c.effect for c in d.causes}
+    shown = [c for k, c in enumerate(d.candidates) if k < _MOST_BARS or c.effect in causes]
+    rows = shown[::-1]
+    values = [c.evidence for c in rows]
+    names = [textwrap.fill(plain(c.effect), 22) for c in rows]
+    axes.barh(names, values, color=[bar_colour(c, causes) for c in rows])
+    axes.set_xscale("symlog", linthresh=10.0)
+    largest = max([abs(v) for v in values], default=1.0)
+    axes.set_xlim(min([0.0, *values]) * 2.0, 100.0 * max(largest, 10.0))
+    axes.xaxis.set_major_locator(FixedLocator(_TICKS))
+    axes.xaxis.set_major_formatter(FuncFormatter(_power))
+    axes.xaxis.set_minor_locator(NullLocator())
+    for k, c in enumerate(rows):
+        text = f" {share_text(c)}"
+        axes.annotate(text, (max(c.evidence, 0.0), k), va="center", fontsize=_FONT - 1.5)
+    every = len(shown) == len(d.candidates)
+    count = "" if every else f" ({len(shown)} of {len(d.candidates)} effects)"
+    title = f"Evidence{count}"
+    _style(axes, title, "evidence over the base [ln units]", "")
+    axes.grid(visible=False, axis="y")
+
+
+#: Bars for which there is room.
+_MOST_BARS = 9
+#: Every second power of ten: the scale is linear up to 10, logarithmic beyond.
+_TICKS = [0.0] + [sign * 10.0**k for k in (1, 3, 5, 7, 9) for sign in (-1, 1)]
+
+
+def _power(value: float, _position: int) -> str:
+    if abs(value) < 1e4:
+        return f"{value:.0f}"
+    return rf"${'-' if value < 0 else ''}10^{{{math.log10(abs(value)):.0f}}}$"

@@ -1,0 +1,1 @@
+"""Numbers, phrases, tables and plain text."""

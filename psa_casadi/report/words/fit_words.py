@@ -1,0 +1,99 @@
+"""What a fit amounts to, in sentences."""
+
+from psa_casadi.report.words.grades import STRONG_CORRELATION, Degree, Grade, named
+from psa_casadi.report.words.phrases import Scale, listing, number, percent
+from psa_casadi.report.words.residuals import ResidualFigures
+
+#: Shares of the lags beyond the 95 % band up to which a residual passes for white, with the
+#: correlation of neighbours that no eye tells from none.
+_WHITE_SHARE, _WHITE_NEIGHBOURS = 0.12, 0.05
+_SHAPE = 0.5
+
+
+def error_sentence(rms: float, noise: float, span: float, scale: Scale, origin: str) -> str:
+    """Say how far the model is from the records; rms, noise and largest range in [m]."""
+    ratio = f" and {number(rms / noise, 2)} times the noise" if noise > 0 else ""
+    share = number(100.0 * rms / span, 2)
+    return (
+        f"The model misses the {origin} displacement by {scale.text(rms)} rms,"
+        f" {share} % of the largest range{ratio}."
+    )
+
+
+def determined_sentence(graded: tuple[Grade, ...]) -> str:
+    """Say how many parameters the records determine, and name those they do not."""
+    fitted = [g for g in graded if g.degree != "fixed"]
+    if not fitted:
+        return "No intervals were estimated, so nothing is said of what these records determine."
+    good = len(named(graded, "determined"))
+    count = "all" if good == len(fitted) else f"{good} of"
+    parts = [f"The records determine {count} {len(fitted)} fitted parameters to 10 % or better"]
+    words: tuple[tuple[Degree, str, str], ...] = (
+        ("weak", "weakly determined", "weakly determined"),
+        ("undetermined", "undetermined", "undetermined"),
+        ("on its bound", "on its bound", "on their bounds"),
+    )
+    for degree, one, several in words:
+        names = named(graded, degree)
+        if names:
+            parts.append(f"{listing(names)} {f'is {one}' if len(names) == 1 else f'are {several}'}")
+    return f"{'; '.join(parts)}."
+
+
+def error_bar_note(graded: tuple[Grade, ...]) -> str:
+    """Say what the bars of determinacy are relative to, and where their limits lie."""
+    by_change = [g.name for g in graded if g.by_change]
+    note = "Dotted: 10 %, beyond it weak; dashed: 50 %, beyond it undetermined."
+    if not by_change:
+        return note
+    verb = "is" if len(by_change) == 1 else "are"
+    return (
+        f"{note} {listing(by_change)} may be zero and {verb} taken relative to an ordinary change"
+        " instead of the value."
+    )
+
+
+def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
+    """Say which parameters are known only together."""
+    if not pairs:
+        return f"No two estimates correlate by more than {STRONG_CORRELATION}."
+    shown = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
+    more = f", and {len(pairs) - 6} pairs more" if len(pairs) > 6 else ""
+    return (
+        f"Known only together, a change of one being made good by the other: {', '.join(shown)}"
+        f"{more}."
+    )
+
+
+def residual_sentence(f: ResidualFigures, model: str, time: Scale) -> str:
+    """Say whether the residual of a model is white and normal, with the figures behind it."""
+    return f"{_whiteness(f, model, time)} {_normality(f)}"
+
+
+def _whiteness(f: ResidualFigures, model: str, time: Scale) -> str:
+    share = f"{percent(f.outside)} of the lags lie outside the 95 % band"
+    if f.outside <= _WHITE_SHARE and abs(f.neighbours) <= _WHITE_NEIGHBOURS:
+        return f"The residual of the {model} is as white as noise ({share}; 5 % are expected)."
+    return (
+        f"The residual of the {model} is not white: neighbouring samples correlate by"
+        f" {_signed(f.neighbours)}, the autocorrelation first falls to that of noise after"
+        f" {time.text(f.lasting, 2)}, and {share}."
+    )
+
+
+def _normality(f: ResidualFigures) -> str:
+    figures = f"skewness {_signed(f.skewness)}, excess kurtosis {_signed(f.kurtosis)}"
+    tail = f"{number(100.0 * f.beyond_three, 2)} % of the samples lie beyond three standard"
+    tail += " deviations, 0.27 % would if it were normal"
+    words = []
+    if abs(f.skewness) > _SHAPE:
+        words.append("longer upwards" if f.skewness > 0 else "longer downwards")
+    if abs(f.kurtosis) > _SHAPE:
+        words.append("heavier in its tails" if f.kurtosis > 0 else "lighter in its tails")
+    if not words:
+        return f"Its distribution is close to normal ({figures}; {tail})."
+    return f"Its distribution is {listing(words)} than a normal one ({figures}; {tail})."
+
+
+def _signed(value: float) -> str:
+    return f"{value:.2f}".replace("-", "−")

@@ -1,0 +1,197 @@
+"""Numbers and findings in words: the sentences that every report shares."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from psa_casadi.diagnosis.residual.misfit import Misfit
+from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
+from psa_casadi.model.compose import Model
+from psa_casadi.units import convert
+
+_MICRO = re.compile(r"(?<=\d) um\b")
+
+#: What a record may be: measured on a device, or computed.
+ORIGINS = ("measured", "synthetic")
+
+VERDICTS = {
+    "adequate": "adequate",
+    "cause_named": "cause named",
+    "partly_explained": "partly explained",
+    "ambiguous": "ambiguous",
+    "unexplained": "unexplained",
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A unit to show a length in: `shown = factor * metres` (counts are shown as they are)."""
+
+    unit: str
+    factor: float
+
+    def text(self, metres: float, digits: int = 3) -> str:
+        """Return a length with its unit, such as "12.3 nm"."""
+        return f"{number(self.factor * metres, digits)} {self.unit}"
+
+
+def length_scale(largest: float, *, counts: bool = False) -> Scale:
+    """Return the unit in which a length of size `largest` [m] is a handy number."""
+    if counts:
+        return Scale("counts", 1.0)
+    for unit, size in (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9)):
+        if largest >= 0.5 * size:
+            return Scale("µm" if unit == "um" else unit, 1.0 / size)
+    return Scale("nm", 1e9)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, with an exponent only where it helps."""
+    if not math.isfinite(value):
+        return "not finite"
+    if value == 0:
+        return "0"
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    power = int(exponent)
+    if -4 < power < 6:
+        return f"{float(f'{mantissa}e{power}'):.{max(0, digits - 1 - power)}f}"
+    return f"{mantissa}e{power}"
+
+
+def percent(share: float) -> str:
+    """Return a share as a percentage, such as "97 %"."""
+    return f"{100.0 * share:.0f} %"
+
+
+def micro(sentence: str) -> str:
+    """Return a sentence with "um" after a number written as "µm", as the pages write it."""
+    return _MICRO.sub(" µm", sentence)
+
+
+def strongest_sentence(misfits: Sequence[Misfit]) -> str:
+    """Return the sentence that says most of what is wrong, "" if nothing is above the noise."""
+    told = [m for m in misfits if len(m.sentences) > 1]
+    if told:
+        return micro(max(told, key=weight).sentences[1])
+    return ""
+
+
+def weight(m: Misfit) -> float:
+    """Return the excess over the noise, by which records are compared."""
+    return m.excess * (m.rms / m.floor.level if m.floor.level > 0 else 1.0)
+
+
+def probability_text(probability: float) -> str:
+    """Return a probability as a percentage that is neither 0 nor 100."""
+    if probability < 0.005:
+        return "< 1 %"
+    return percent(probability) if probability < 0.995 else "> 99 %"
+
+
+def share_text(candidate: Candidate) -> str:
+    """Return the share of the excess that an effect explains, and whether it was only screened."""
+    if candidate.explained_share < 0:
+        return "fits worse"
+    share = percent(candidate.explained_share)
+    return share if candidate.fitted else f"{share} (screened)"
+
+
+def rest_sentence(d: Diagnosis) -> str:
+    """Say what remains, with the p value of the test of the rest."""
+    p = d.remaining.p_value
+    return f"{d.remaining.where.rstrip('.')} ({f'p = {number(p, 2)}' if p > 1e-6 else 'p < 1e-6'})."
+
+
+def plain(name: str) -> str:
+    """Return the name of an effect as words: "slow_creep" is slow creep."""
+    return name.replace("_", " ")
+
+
+def listing(words: Sequence[str], joint: str = "and") -> str:
+    """Return "a, b and c"."""
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} {joint} {words[-1]}"
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Return a number's text with its unit; "1" is no unit to a reader."""
+    return text if unit == "1" else f"{text} {unit}"
+
+
+def shown_in(model: Model, name: str) -> tuple[str, str]:
+    """Return the SI unit of a parameter and the unit it is shown in."""
+    parameter = model.parameter(name)
+    return parameter.unit, parameter.display_unit or parameter.unit
+
+
+def interval_text(low: float, high: float) -> str:
+    """Return an interval; one over more than four decades says that nothing was determined."""
+    if not (math.isfinite(low) and math.isfinite(high)) or (low > 0 and high > 1e4 * low):
+        return "not determined"
+    return f"{number(low)} to {number(high)}"
+
+
+def added(d: Diagnosis) -> bool:
+    """Say whether the extended model differs from the base."""
+    return bool(d.causes)
+
+
+#: What an interval of the gain from blocks of few records says.
+OWN_VOLTAGES = (
+    "The interval is taken over blocks of the held-out samples and speaks for these voltages only;"
+    " for other voltages hold out four records or more (--holdout)."
+)
+
+
+def gain_sentence(d: Diagnosis) -> str:
+    """Say how far the held-out error falls."""
+    gain = d.gain.holdout_rms_reduction_percent
+    low, high = d.gain.interval
+    if gain <= 0:
+        return "the held-out error does not fall"
+    return f"the held-out error falls by {gain:.0f} % (95 % interval {low:.0f} to {high:.0f} %)"
+
+
+def verdict_sentence(d: Diagnosis) -> str:
+    """Say the verdict in one sentence, with confidence and gain."""
+    error = (
+        f"the base model's held-out error is {number(d.base_errors.holdout_nrmse_percent, 2)} %"
+        " of the range"
+    )
+    if d.verdict == "adequate":
+        return f"Nothing beyond the noise is missing from the base model; {error}."
+    if d.verdict == "unexplained" or not d.causes:
+        return (
+            "Something is missing that no effect in the table explains, so no cause is named; "
+            f"{error}."
+        )
+    causes = listing([_cause(c) for c in d.causes])
+    if d.verdict == "ambiguous":
+        first = d.causes[0]
+        rivals = [plain(n) for n in (first.effect, *first.cannot_be_told_from)]
+        together = listing([plain(c.effect) for c in d.causes])
+        return (
+            f"Something is missing, and these data cannot tell whether it is"
+            f" {listing(rivals, 'or')}; with {together}, {gain_sentence(d)}."
+        )
+    are = "cause is" if len(d.causes) == 1 else "causes are"
+    if d.verdict == "partly_explained":
+        return f"The closest known {are} {causes}: {gain_sentence(d)}, but more than noise remains."
+    return f"The {are} {causes}: {gain_sentence(d)}."
+
+
+def _cause(cause: Cause) -> str:
+    return f"{plain(cause.effect)} ({cause.belongs_to}, confidence {percent(cause.confidence)})"
+
+
+def cause_estimates(d: Diagnosis, cause: Cause) -> list[str]:
+    """Return "name = value unit (low to high)" for every parameter of a cause."""
+    texts = []
+    for name, e in cause.parameters.items():
+        unit, display = shown_in(d.model, name)
+        value, low, high = (convert(v, unit, display) for v in (e.value, *e.interval))
+        estimate = with_unit(number(value), display)
+        texts.append(f"{name} = {estimate} ({interval_text(low, high)})")
+    return texts

@@ -1,0 +1,232 @@
+"""Tables of text that the terminal and the HTML page both show."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
+from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.search.multistart import StartOutcome
+from psa_casadi.model.compose import Model
+from psa_casadi.model.stacks import Stack, stack_model
+from psa_casadi.records.split import Experiment
+from psa_casadi.report.words.grades import grade
+from psa_casadi.report.words.phrases import (
+    Scale,
+    added,
+    interval_text,
+    number,
+    plain,
+    probability_text,
+    share_text,
+    shown_in,
+    with_unit,
+)
+from psa_casadi.report.words.residuals import ResidualFigures
+from psa_casadi.units import convert
+
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.export.check.check import CheckReport, CheckRow
+
+
+@dataclass(frozen=True)
+class Table:
+    """A head and rows of text, every row as long as the head."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def __str__(self) -> str:
+        """Return the table in columns of plain text, without spaces at line ends."""
+        widths = [max(map(len, column)) for column in zip(self.head, *self.rows, strict=True)]
+        lines = (
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in (self.head, tuple("-" * w for w in widths), *self.rows)
+        )
+        return "\n".join(lines)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    return Table(tuple(head), tuple(tuple(row) for row in rows))
+
+
+def parameter_table(model: Model, found: Identification | None = None) -> Table:
+    """Return every parameter with value, 95 % interval, unit, how it was found, and meaning."""
+    rows = []
+    for p in model.structure.parameters:
+        unit, display = shown_in(model, p.name)
+        interval = model.provenance.intervals.get(p.name)
+        text = ""
+        if interval is not None:
+            low, high = (convert(v, unit, display) for v in (interval.low, interval.high))
+            text = interval_text(low, high)
+        value = number(convert(model.values[p.name], unit, display), 4)
+        rows.append((p.name, value, text, display, _status(model, p.name, found), p.description))
+    return _table(("parameter", "value", "95 % interval", "unit", "found by", "meaning"), rows)
+
+
+def _status(model: Model, name: str, found: Identification | None) -> str:
+    if found is not None and name in found.read_off:
+        return "read off"
+    if name not in model.provenance.free:
+        return "not fitted"
+    degree = grade(found, name).degree if found is not None else "determined"
+    return "fit" if degree in ("determined", "fixed") else f"fit, {degree}"
+
+
+def candidate_table(d: Diagnosis) -> Table:
+    """Return every effect tried: evidence, share of the excess, and probability if one is named."""
+    head = ["effect", "evidence over the base [ln]", "explains of the excess"]
+    rows = [[plain(c.effect), number(c.evidence), share_text(c)] for c in d.candidates]
+    if added(d):
+        head.append("probability")
+        for row, c in zip(rows, d.candidates, strict=True):
+            row.append(probability_text(c.probability))
+    return _table(head, rows)
+
+
+def error_table(d: Diagnosis, unit: str, factor: float) -> Table:
+    """Return the errors of base and extended model beside the noise, in a unit of length."""
+    rows = []
+    models = [("base", d.base_errors), ("extended", d.extended_errors)]
+    for name, e in models if added(d) else models[:1]:
+        lengths = (e.train_rms_m, e.holdout_rms_m, e.holdout_max_m)
+        rows.append((name, *(number(factor * v) for v in lengths), number(e.holdout_nrmse_percent)))
+    noise = number(factor * d.noise_floor_rms_m)
+    rows.append(("noise", noise, noise, "", ""))
+    head = (f"training rms [{unit}]", f"held-out rms [{unit}]", f"held-out largest [{unit}]")
+    return _table(("model", *head, "held-out rms [% of range]"), rows)
+
+
+def fit_error_table(rows: Sequence[tuple[str, ResidualFigures]], scale: Scale) -> Table:
+    """Return what the model leaves of every record, beside the record's noise level."""
+    lines = []
+    for name, f in rows:
+        lengths = (f.rms, f.largest, f.noise)
+        ratio = number(f.rms / f.noise, 2) if f.noise > 0 else ""
+        share = number(100.0 * f.range_share, 2)
+        shown = (number(scale.factor * v) for v in lengths)
+        lines.append((name, *shown, ratio, share, number(f.neighbours, 2)))
+    unit = scale.unit
+    return _table(
+        (
+            "record",
+            f"rms [{unit}]",
+            f"largest [{unit}]",
+            f"noise [{unit}]",
+            "rms / noise",
+            "rms [% of range]",
+            "correlation of neighbours",
+        ),
+        lines,
+    )
+
+
+def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:
+    """Return where the fits from several starts ended."""
+    ends = {True: "the best fit", False: "another minimum", None: "not followed to its end"}
+    rows = [
+        (s.name, number(s.cost, 5), number(scale.factor * s.rms, 4), ends[s.agrees]) for s in starts
+    ]
+    return _table(("start", "cost", f"rms [{scale.unit}]", "led to"), rows)
+
+
+def record_table(experiments: Sequence[Experiment], origin: str) -> Table:
+    """Return the records with their size, how they were used, and their SHA-256."""
+    rows = [
+        (
+            e.record.name,
+            origin,
+            number(e.record.duration),
+            str(int(e.used.sum())),
+            str(int(e.held_out.sum())),
+            e.record.sha256,
+        )
+        for e in experiments
+    ]
+    return _table(
+        ("record", "origin", "duration [s]", "samples fitted", "samples held out", "SHA-256"), rows
+    )
+
+
+def blindest(d: Diagnosis) -> tuple[BlindSpot, ...]:
+    """Return the blind spots, the largest detectable gain over its ordinary size first."""
+
+    def excess(spot: BlindSpot) -> float:
+        effect = EFFECTS.get(spot.effect)
+        if effect is None or effect.gain is None:
+            return 0.0
+        extended = d.model.with_effect(effect)
+        ordinary = extended.parameter(effect.gain).typical({**extended.values, effect.gain: 0.0})
+        return spot.smallest_detectable_gain / ordinary
+
+    return tuple(sorted(d.blind_to, key=excess, reverse=True))
+
+
+def blind_table(d: Diagnosis) -> Table:
+    """Return the effects of practical size that the records could not have shown."""
+    rows = []
+    for b in blindest(d):
+        # a screening without any direction for the effect reports the largest number there is
+        seen = b.smallest_detectable_gain < 1e100
+        size = with_unit(number(b.smallest_detectable_gain), b.unit) if seen else "at no size"
+        rows.append((plain(b.effect), size, b.why))
+    return _table(("effect", "shows from", "why"), rows)
+
+
+def effects_table(effects: Iterable[Component]) -> Table:
+    """Return the effects with where they belong and what an engineer sees."""
+    rows = [(e.name, e.belongs_to, e.description, e.looks_like) for e in effects]
+    return _table(("effect", "belongs to", "what it is", "what it looks like"), rows)
+
+
+def effect_parameter_table(effect: Component) -> Table:
+    """Return the parameters of one effect with unit, bounds and meaning; the gain is marked."""
+    rows = []
+    for p in effect.parameters:
+        bounds = f"{number(p.bounds[0])} to {number(p.bounds[1])}"
+        note = " (0 removes the effect)" if p.name == effect.gain else ""
+        rows.append((p.name, p.unit, number(p.value), bounds, p.description + note))
+    return _table(("parameter", "unit", "default", "bounds", "meaning"), rows)
+
+
+def stacks_table(stacks: Iterable[Stack]) -> Table:
+    """Return the named stacks with rated voltage and how many of their figures are assumed."""
+    rows = [
+        (
+            s.name,
+            number(s.values["u_rated"].value),
+            f"{len(s.assumed)} of {len(s.values)}",
+            s.description,
+        )
+        for s in stacks
+    ]
+    return _table(("stack", "rated voltage [V]", "assumed figures", "what it is"), rows)
+
+
+def stack_table(stack: Stack) -> Table:
+    """Return every figure of a stack with its unit, whether it is assumed, and its source."""
+    model = stack_model(stack.name)
+    rows = []
+    for name in model.parameter_names:
+        unit, display = shown_in(model, name)
+        figure = stack.values[name]
+        value = number(convert(figure.value, unit, display), 6)
+        rows.append((name, value, display, "assumed" if figure.assumed else "", figure.source))
+    return _table(("parameter", "value", "unit", "", "source"), rows)
+
+
+def check_table(report: "CheckReport") -> Table:
+    """Return the checks of an FMU with figure, limit and result."""
+    rows = [
+        (r.name, _found(r), number(r.limit), "pass" if r.passed else "FAIL", r.remark)
+        for r in report.rows
+    ]
+    return _table(("check", "found", "allowed", "result", "remark"), rows)
+
+
+def _found(row: "CheckRow") -> str:
+    """Return the figure of a check; where none is allowed it counts problems."""
+    return str(int(row.figure)) if row.limit == 0 and row.figure >= 0 else number(row.figure)

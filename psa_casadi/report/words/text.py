@@ -1,0 +1,173 @@
+"""The results as plain text for a terminal."""
+
+import re
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.result import Cause, Diagnosis, Errors
+from psa_casadi.identification.identify import Identification
+from psa_casadi.records.split import Experiment
+from psa_casadi.report.words.phrases import (
+    VERDICTS,
+    Scale,
+    added,
+    cause_estimates,
+    length_scale,
+    listing,
+    number,
+    percent,
+    plain,
+    probability_text,
+    rest_sentence,
+    strongest_sentence,
+    verdict_sentence,
+)
+from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
+
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.export.check.check import CheckReport
+
+_LABEL = 10
+#: Blind spots that a terminal names.
+_NAMES = 5
+#: Where the first sentence of a note ends; how a sentence on a view ends.
+_FIRST = re.compile(r"(?<=\.) ")
+_EXPLAINS = re.compile(r"; this(?: view)? explains (\d+ %) of the excess(?=\.)")
+
+
+def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
+    """Return a diagnosis in ten to fifteen lines: verdict with gain, errors, cause, rest."""
+    scale = _scale(d.experiments, d.base_errors.holdout_rms_m)
+    lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
+    wrong = _EXPLAINS.sub(r" (\1 of the excess)", strongest_sentence(d.misfit))
+    lines += [("wrong", wrong)] if wrong else []
+    sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
+    lines += [
+        ("records", _records(d.experiments, origin)),
+        ("noise", f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"),
+        ("base", _errors(d.base_errors, scale)),
+    ]
+    if added(d):
+        lines.append(("extended", _errors(d.extended_errors, scale)))
+    for cause in d.causes:
+        lines.append(("cause", _cause(d, cause)))
+        lines.append(("rivals", _rivals(d, cause)))
+    lines.append(("remains", rest_sentence(d)))
+    lines.append(("blind to", _blind(d)))
+    lines.append(("next", d.next_experiment.why))
+    lines.extend(("note", _FIRST.split(note, maxsplit=1)[0]) for note in d.notes)
+    return "\n".join(_line(label, text, width) for label, text in lines)
+
+
+def _cause(d: Diagnosis, cause: Cause) -> str:
+    """Return a cause with place, confidence and parameters."""
+    sure = f"{cause.belongs_to}, {percent(cause.confidence)}"
+    return f"{plain(cause.effect)} ({sure}): {', '.join(cause_estimates(d, cause))}"
+
+
+def _rivals(d: Diagnosis, cause: Cause) -> str:
+    """Return what a cause cannot be told from, else the next most probable effect of the first."""
+    known = {c.effect: c.probability for c in d.candidates}
+    if cause.cannot_be_told_from:
+        rivals = [
+            f"{plain(n)} ({probability_text(known[n])})" if known.get(n) else plain(n)
+            for n in cause.cannot_be_told_from
+        ]
+        return f"these data cannot tell it from {listing(rivals, 'or')}"
+    named = {c.effect for c in d.causes}
+    others = [(p, n) for n, p in known.items() if n not in named]
+    if not others or cause is not d.causes[0]:  # the candidates are those of the first step
+        return "none left open"
+    probability, name = max(others)
+    return f"none left open; the next is {plain(name)} ({probability_text(probability)})"
+
+
+def _blind(d: Diagnosis) -> str:
+    """Name the effects that the records could not have shown, those furthest out of sight first."""
+    names = [plain(b.effect) for b in blindest(d)]
+    if not names:
+        return "no effect of ordinary size in the table"
+    more = f" and {len(names) - _NAMES} more" if len(names) > _NAMES else ""
+    return f"{', '.join(names[:_NAMES])}{more}" if more else listing(names)
+
+
+def identification_text(
+    found: Identification, *, origin: str = "measured", width: int = 100
+) -> str:
+    """Return an identification: error, parameters with intervals, warnings, what is left open."""
+    scale = _scale(found.experiments, found.fit.rms)
+    span = max(e.record.range_m for e in found.experiments)
+    share = number(100.0 * found.fit.rms / span, 2)
+    head = [
+        ("records", _records(found.experiments, origin)),
+        ("error", f"{scale.text(found.fit.rms)} rms, {share} % of the largest range"),
+    ]
+    tail = [("warning", w) for w in found.warnings]
+    tail += [("open", c.sentence) for c in found.combinations]
+    tail += [("next", a.sentence) for a in found.advice]
+    tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
+    blocks = ["\n".join(_line(label, text, width) for label, text in head)]
+    blocks.append(str(parameter_table(found.model, found)))
+    blocks += ["\n".join(_line(label, text, width) for label, text in tail)] if tail else []
+    return "\n\n".join(blocks)
+
+
+def effect_page(effect: Component, width: int = 100) -> str:
+    """Return one effect: what it is, equation, signature, source, parameters."""
+    lines = [
+        ("what", effect.description),
+        ("belongs to", effect.belongs_to),
+        ("equation", effect.equation_text),
+        ("signature", effect.looks_like),
+        ("source", effect.source),
+    ]
+    body = "\n".join(_line(label, text, width) for label, text in lines)
+    return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect)}"
+
+
+def check_sentence(report: "CheckReport") -> str:
+    """Say how the check of an FMU ended."""
+    against = "" if report.compared else " There was no model to compare it with."
+    if report.passed:
+        return f"{Path(report.path).name} passed all {len(report.rows)} checks.{against}"
+    failed = listing([r.name for r in report.failures])
+    return f"{Path(report.path).name} did not pass: {failed}.{against}"
+
+
+def _line(label: str, text: str, width: int) -> str:
+    # a percent sign stays with its number
+    return textwrap.fill(
+        text.replace(" %", "\u00a0%"),
+        max(width, 40),
+        initial_indent=f"{label:<{_LABEL}} ",
+        subsequent_indent=" " * (_LABEL + 1),
+        break_long_words=False,
+        break_on_hyphens=False,
+    ).replace("\u00a0", " ")
+
+
+def _scale(experiments: Iterable[Experiment], size: float) -> Scale:
+    counts = any(e.record.displacement_unit == "counts" for e in experiments)
+    return length_scale(size, counts=counts)
+
+
+def _records(experiments: Iterable[Experiment], origin: str) -> str:
+    parts = []
+    for e in experiments:
+        held = int(e.held_out.sum())
+        rest = f", {held} of them held out" if held else ""
+        size = f"{e.record.n} samples in {number(e.record.duration)} s{rest}"
+        parts.append(f"{e.record.name} ({origin}: {size})")
+    return "; ".join(parts)
+
+
+def _errors(e: Errors, scale: Scale) -> str:
+    return (
+        f"held-out error {scale.text(e.holdout_rms_m)} rms"
+        f" ({number(e.holdout_nrmse_percent, 2)} % of range),"
+        f" at most {scale.text(e.holdout_max_m)};"
+        f" training {scale.text(e.train_rms_m)} rms"
+    )

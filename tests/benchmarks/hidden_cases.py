@@ -1,0 +1,170 @@
+"""Records with hidden causes, and what a diagnosis makes of one of them.
+
+The plants that make the records (`tests/plants`) share no code with the package and have other
+equations than its effects. The strength of an effect is rho: rms of what
+the base's parameters cannot absorb, over the rms of the noise.
+"""
+
+import itertools
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis, Verdict
+from psa_casadi.diagnosis.task import Method
+from psa_casadi.effects import EFFECTS
+from psa_casadi.records.read.reading import read_record
+from tests.plants.designs import DesignKind
+from tests.plants.excitations import ExcitationKind, PoorKind
+from tests.plants.make import Truth, make_record
+from tests.plants.noise import NoiseKind
+
+Kind = Literal["known", "weak", "clean", "left out", "foreign", "two", "poor", "design", "ringing"]
+
+#: Ranges of rho, from which a case's is drawn evenly in its logarithm.
+ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
+#: A hidden effect counts from this share of the smallest rho that was asked for.
+REACHED = 0.9
+#: Classes of voltages that show less than a rich one.
+POOR: tuple[PoorKind, ...] = ("sine", "triangle", "steps", "slow", "loops")
+#: Other designs of record; and those with resonances in their band or near it, all clean: there
+#: the static effects of the plants are no physics.
+DESIGNS: tuple[DesignKind, ...] = ("bipolar", "short", "long", "sines", "staircase", "small")
+RINGING: tuple[DesignKind, ...] = ("fast", "sweep", "short")
+#: Noises of the cases of one effect, in turn: most sensors' is white, many have a filter.
+NOISES: tuple[NoiseKind, ...] = ("white", "ar", "white", "quantised", "drop-outs")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One record: what is hidden in it, with which noise and voltage, from which seed."""
+
+    kind: Kind
+    effect: str | None
+    seed: int
+    rho: tuple[float, float] = ORDINARY
+    second: str | None = None
+    noise: NoiseKind = "white"
+    excitation: ExcitationKind = "rich"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a diagnosis said of a case.
+
+    `rho` was reached, of two causes the smaller, 0 where nothing is hidden; `named` are the causes,
+    `within` the named ones with what they cannot be told from; `blind` the effects that the record
+    is said not to show. `confidence` is that of the first cause; `probability` and
+    `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
+    the noise; `seconds` the processor time.
+    """
+
+    case: Case
+    rho: float
+    verdict: Verdict
+    named: tuple[str, ...]
+    within: tuple[str, ...]
+    blind: tuple[str, ...]
+    confidence: float
+    probability: Mapping[str, float]
+    evidence: Mapping[str, float]
+    ratio: float
+    seconds: float
+
+    @property
+    def reached(self) -> bool:
+        """Whether what is hidden is as visible as was asked for; true where nothing is hidden."""
+        return self.case.effect is None or self.rho >= REACHED * self.case.rho[0]
+
+    @property
+    def alone(self) -> str | None:
+        """The cause that was named alone and without a remainder, if there is one."""
+        one = self.verdict == "cause_named" and len(self.named) == 1
+        return self.named[0] if one else None
+
+    @property
+    def right_alone(self) -> bool:
+        """Whether the hidden effect is the one name, with no other as likely."""
+        return self.named == (self.case.effect,) == self.within
+
+
+def run_case(case: Case, method: Method | None = None) -> Found:
+    """Make the record of a case, diagnose the file, and compare."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "record.csv"
+        truth = make_record(
+            case.effect,
+            case.seed,
+            path,
+            noise=case.noise,
+            excitation=case.excitation,
+            visible=case.rho if case.effect else None,
+            second=case.second,
+            second_visible=case.rho if case.second else None,
+        )
+        record = read_record(path)
+    table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.effect]
+    begin = time.process_time()
+    d = diagnose([record], effects=table, method=method)
+    return _found(case, d, truth, time.process_time() - begin)
+
+
+def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
+    named = tuple(c.effect for c in d.causes)
+    alike = tuple(n for c in d.causes for n in c.cannot_be_told_from)
+    held = d.experiments[0].held_out
+    noise = np.asarray(d.experiments[0].record.displacement) - truth.displacement
+    level = float(np.sqrt(np.mean(noise[held] ** 2)))
+    return Found(
+        case=case,
+        rho=min(float(h.visible) for h in (truth, truth.second) if h is not None),
+        verdict=d.verdict,
+        named=named,
+        within=tuple(dict.fromkeys((*named, *alike))),
+        blind=tuple(b.effect for b in d.blind_to),
+        confidence=d.causes[0].confidence if d.causes else 0.0,
+        probability={c.effect: c.probability for c in d.candidates},
+        evidence={c.effect: c.evidence for c in d.candidates},
+        ratio=d.extended_errors.holdout_rms_m / level,
+        seconds=seconds,
+    )
+
+
+def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: int) -> list[Case]:
+    """Return the cases of a study: every effect with `seeds` seeds, and others to match.
+
+    No two cases have a seed, and so stack, voltage and noise, in common.
+    """
+    seed, rng = itertools.count(first), np.random.default_rng(first)
+    few, half = range(max(1, seeds // 4)), range(max(1, seeds // 2))
+    cases = [
+        Case("known", e, next(seed), noise=NOISES[k % len(NOISES)])
+        for e in known
+        for k in range(seeds)
+    ]
+    cases += [
+        Case("weak", e, next(seed), WEAK, noise=NOISES[k % len(NOISES)])
+        for k, e in enumerate(e for e in known for _ in few)
+    ]
+    for noise in NOISES[:2]:
+        cases += [Case("clean", None, next(seed), noise=noise) for _ in range(10 * seeds)]
+    cases += [Case("left out", e, next(seed)) for e in known for _ in few]
+    cases += [Case("foreign", e, next(seed)) for e in foreign for _ in half]
+    for _ in range(3 * seeds):
+        one, other = rng.choice(known, 2, replace=False)
+        cases.append(Case("two", str(one), next(seed), STRONG, str(other)))
+    for k in range(4 * seeds):
+        poor = POOR[k % len(POOR)]
+        cases.append(Case("poor", str(rng.choice(known)), next(seed), excitation=poor))
+    for k in range(6 * seeds):
+        design = DESIGNS[k % len(DESIGNS)]
+        cases.append(Case("design", str(rng.choice(known)), next(seed), excitation=design))
+    for k in range(3 * seeds):
+        cases.append(Case("ringing", None, next(seed), excitation=RINGING[k % len(RINGING)]))
+    return cases

@@ -1,0 +1,75 @@
+"""The table of benchmarks: each is loaded when it is run."""
+
+from importlib import import_module
+
+from tests.benchmarks.outcome import Bench, Outcome, Progress
+
+
+def _later(module: str, name: str, description: str) -> Bench:
+    def run(progress: Progress, quick: bool) -> Outcome:
+        found: Outcome = import_module(f"tests.benchmarks.{module}").run(progress, quick)
+        return found
+
+    return Bench(name, description, run)
+
+
+BENCHES: dict[str, Bench] = {
+    bench.name: bench
+    for bench in (
+        _later(
+            "speed",
+            "identify",
+            "identification against scipy's least_squares with solve_ivp, and how it grows",
+        ),
+        _later(
+            "fits",
+            "fits",
+            "exact steps against the stepper: error against time, lanes, effects, whole diagnoses",
+        ),
+        _later(
+            "coverage",
+            "coverage",
+            "identified parameters and their intervals against the truth, over seeds and stacks",
+        ),
+        _later(
+            "paper_method",
+            "paper",
+            "the paper's identification beside the prediction-error fit, against noise and window",
+        ),
+        _later(
+            "measured",
+            "measured",
+            "the measured micromanipulator: held-out error of the paper's model and of two effects",
+        ),
+        _later(
+            "hidden",
+            "diagnose",
+            "hidden causes on independent plants: what is named, how surely, and how often rightly",
+        ),
+        _later(
+            "verification",
+            "verification",
+            "the paper's figures 6 to 10 (loops, steps, other voltages), and three mechanics",
+        ),
+        _later(
+            "work_precision",
+            "fmu",
+            "error against work: the FMU's own solver beside CVode, Radau and LSODA",
+        ),
+        _later(
+            "coupling",
+            "coupling",
+            "a positioner of FMUs against one model: error over communication step, stability",
+        ),
+        _later(
+            "nonlinearity",
+            "nonlinearity",
+            "a positioner's nonlinearity: open and closed loop, with and without the compensator",
+        ),
+        _later(
+            "design",
+            "design",
+            "designed inputs: causes told apart, paths followed, hysteresis compensated",
+        ),
+    )
+}
