@@ -23,6 +23,7 @@ from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
     from psa_casadi import datasets
+    from psa_casadi.component import Component, Equations, Symbols
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
     from psa_casadi.design.mechanism.mechanism import (
         design_mechanism,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from psa_casadi.model.compose import Model, compose
     from psa_casadi.model.from_casadi.ode_model import ode_model
     from psa_casadi.model.model_file import load_model, save_model
+    from psa_casadi.model.own_effects import own_effects
     from psa_casadi.model.parts import PARTS, compensator_for, part_model
     from psa_casadi.model.stacks import STACKS, stack_model
     from psa_casadi.model.system.nanopositioner import nanopositioner
@@ -77,6 +79,12 @@ _HOMES = {
         "COMPONENTS",
     ),
     "psa_casadi.effects": ("EFFECTS",),
+    "psa_casadi.component": (
+        "Component",
+        "Equations",
+        "Symbols",
+    ),
+    "psa_casadi.model.own_effects": ("own_effects",),
     "psa_casadi.model.stacks": (
         "STACKS",
         "stack_model",
@@ -169,6 +177,10 @@ __all__ = [
     "SIMPLIFIED",
     "COMPONENTS",
     "EFFECTS",
+    "Component",
+    "Equations",
+    "Symbols",
+    "own_effects",
     "STACKS",
     "stack_model",
     "Model",

@@ -102,6 +102,8 @@ class Component:
     the parameter `sample_period` [s], whoever declares it, each takes the value in
     `Equations.next` and keeps it up to the next instant. All components of a model share one
     period.
+
+    `home` is the module of a component that is not of this package (`own_effects`).
     """
 
     name: str
@@ -124,3 +126,9 @@ class Component:
     curve: str | None = None
     sampled: tuple[State, ...] = ()
     sample_period: str | None = None
+    home: str = ""
+
+    @property
+    def fitted(self) -> tuple[str, ...]:
+        """Names of the parameters that records can tell."""
+        return tuple(p.name for p in self.parameters if p.fitted)

@@ -14,6 +14,7 @@ class Parameter:
     `value` is the default in SI units, `bounds` the closed interval that is physically meaningful,
     `log` says that the parameter spans decades and is searched on a logarithmic scale.
     `scale` is the size of an ordinary change in SI units, where the value itself may be zero.
+    What is not `fitted` only sets a scale, or chooses between two forms; records never tell it.
     """
 
     name: str
@@ -24,6 +25,7 @@ class Parameter:
     display_unit: str | None = None
     log: bool = False
     scale: Nominal | None = None
+    fitted: bool = True
 
     def typical(self, values: Values) -> float:
         """Return the size of an ordinary change: `scale`, else the magnitude of the value."""

@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, show, show_table, working
+from psa_casadi.cli.screen import (
+    EffectsOption,
+    Quiet,
+    show,
+    show_table,
+    working,
+)
 
 
 def check(
@@ -14,6 +20,7 @@ def check(
         Path | None,
         typer.Option(help="MODEL.json to compare with; by default the one that the FMU carries."),
     ] = None,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails."""
@@ -23,14 +30,14 @@ def check(
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
 
-    given = Given()
+    given = Given(effects)
     if not fmu.is_file():
         what = "is a directory" if fmu.is_dir() else "there is no such file"
         given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
-    chosen = None if model is None else given.attempt(lambda: load_model(model))
+    chosen = None if model is None else given.attempt(lambda: load_model(model, given.effects))
     given.check()
     with working("checking", quiet):
-        report = check_fmu(fmu, chosen)
+        report = check_fmu(fmu, chosen, effects=given.effects)
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)
     if not report.passed:

@@ -8,6 +8,7 @@ import typer
 
 from psa_casadi.cli.screen import (
     ColumnsOption,
+    EffectsOption,
     Quiet,
     StackOption,
     show,
@@ -95,6 +96,7 @@ def experiment(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     columns: ColumnsOption = None,
+    own: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Design the record to measure next: best for parameters, or to tell effects apart.
@@ -105,7 +107,7 @@ def experiment(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.design.experiment.search import Effort
 
-    given = Given()
+    given = Given(own)
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
     effects = design_given.effects(given, [*(separate or []), *(more or [])], parameter or [])
     chosen = given.model_or_stack(model, stack)

@@ -42,16 +42,17 @@ def effects(
     given: "Given", names: "Sequence[str]", parameters: "Sequence[str]"
 ) -> "list[Component]":
     """Return the effects to separate; all mistakes are noted."""
-    from psa_casadi.effects import EFFECTS
+    from psa_casadi.model.own_effects import known_effects
 
+    table = known_effects(given.effects)
     for name in dict.fromkeys(names):
-        if name not in EFFECTS:
+        if name not in table:
             given.add(f"There is no effect '{name}'; `psa effects` lists them.")
     if len(set(names)) == 1:
         given.add(f"{names[0]} alone cannot be told from anything; name two effects or more.")
     if names and parameters:
         given.add("--separate and --parameter are both given; design one record for each.")
-    return [EFFECTS[n] for n in dict.fromkeys(names) if n in EFFECTS]
+    return [table[n] for n in dict.fromkeys(names) if n in table]
 
 
 def check_noise(given: "Given", noise: float | None, correlation: float, starts: int) -> None:
@@ -161,9 +162,9 @@ def rivals(
 def whole(model: "Model", wanted: "Sequence[str]") -> "Rival":
     """Return the model with what records of loops determine as its unknowns, and what is wanted."""
     from psa_casadi.design.experiment.rivals import rival_of_model
-    from psa_casadi.identification.search.multistart import CORE, FIXED
+    from psa_casadi.identification.search.multistart import CORE
 
-    own = [p.name for e in model.effects for p in e.parameters if p.name not in FIXED]
+    own = [n for e in model.effects for n in e.fitted]
     free = [n for n in CORE if n in model.parameter_names]
     names = dict.fromkeys([*free, *own, *(n for n in wanted if n in model.parameter_names)])
     return rival_of_model(model.name, model, tuple(names))

@@ -5,7 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, StackOption
+from psa_casadi.cli.screen import (
+    EffectsOption,
+    Quiet,
+    StackOption,
+)
 
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
@@ -39,6 +43,7 @@ def input_(
     check_fmu: Annotated[
         bool, typer.Option("--check-fmu/--no-check-fmu", help="Play it on the exported FMU too.")
     ] = True,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Design the voltage for a path or for a quickest move; judge it by simulator and FMU."""
@@ -47,7 +52,7 @@ def input_(
     from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
     from psa_casadi.design.tracking.targets import read_target
 
-    given = Given()
+    given = Given(effects)
     given.outputs({"--output": output, "--report": report}, [model, target, measured])
     _one_task(given, target, move, {"--fast": fast, "--minimax": minimax}, measured)
     numbers = {

@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, StackOption, show, show_table, tell_written, working
+from psa_casadi.cli.screen import (
+    EffectsOption,
+    Quiet,
+    StackOption,
+    show,
+    show_table,
+    tell_written,
+    working,
+)
 
 if TYPE_CHECKING:
     from psa_casadi.design.mechanism.mechanism import MechanismDesign
@@ -53,6 +61,7 @@ def mechanism(
         typer.Option(help="Also write the stack with the port that the mechanism couples to."),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Design a prestress mechanism for a wanted damping, bandwidth or poles, within limits.
@@ -70,7 +79,7 @@ def mechanism(
     from psa_casadi.model.model_file import save_model
     from psa_casadi.report.page.mechanism_page import write_mechanism_page
 
-    given = Given()
+    given = Given(effects)
     given.outputs({"--output": output, "--port": port, "--report": report}, [model])
     chosen = given.model_or_stack(model, stack)
     wanted = given.attempt(lambda: _poles(poles))

@@ -9,6 +9,7 @@ import typer
 
 from psa_casadi.cli.screen import (
     ColumnsOption,
+    EffectsOption,
     Origin,
     OriginOption,
     Quiet,
@@ -33,8 +34,8 @@ def diagnose(
     holdout: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Record kept for judging only (repeat the option for several); without it, the"
-            " a quarter of every record, in blocks."
+            help="Record kept for judging only (repeat the option for several); without it, a"
+            " quarter of every record, in blocks."
         ),
     ] = None,
     model: Annotated[
@@ -65,6 +66,7 @@ def diagnose(
     ] = False,
     columns: ColumnsOption = None,
     origin: OriginOption = Origin.MEASURED,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
@@ -78,10 +80,11 @@ def diagnose(
         with stage("loading"):
             from psa_casadi.cli.inputs import Given
             from psa_casadi.diagnosis.diagnose import diagnose as run
+            from psa_casadi.model.own_effects import known_effects
             from psa_casadi.report.words.text import story
             from psa_casadi.report.words.timings import timings_table
         with stage("reading"):
-            given, held = Given(), holdout or []
+            given, held = Given(effects), holdout or []
             given.stiffness(stiffness)
             given.outputs({**outputs, "--next": following}, [*records, *held, model])
             found = given.records(records, held_out=held, columns=columns)
@@ -94,6 +97,7 @@ def diagnose(
                 holdout=found[count:],
                 model=start,
                 stiffness=stiffness,
+                effects=tuple(known_effects(given.effects).values()),
                 progress=progress,
             )
             with stage("next experiment"):

@@ -6,7 +6,15 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import PartOption, Quiet, StackOption, show, tell_written, working
+from psa_casadi.cli.screen import (
+    EffectsOption,
+    PartOption,
+    Quiet,
+    StackOption,
+    show,
+    tell_written,
+    working,
+)
 
 
 class FmiVersion(StrEnum):
@@ -31,6 +39,7 @@ def fmu(
     include_sensor: Annotated[
         bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
     ] = False,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
@@ -38,7 +47,7 @@ def fmu(
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.fmu.platforms import chosen_platforms
 
-    given = Given()
+    given = Given(effects)
     given.outputs({"--output": output}, [model])
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))

@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import PartOption, Quiet, StackOption, show, tell_written
+from psa_casadi.cli.screen import (
+    EffectsOption,
+    PartOption,
+    Quiet,
+    StackOption,
+    show,
+    tell_written,
+)
 
 
 def modelica(
@@ -17,13 +24,14 @@ def modelica(
     include_sensor: Annotated[
         bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
     ] = False,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a model as a Modelica package: signals, connectors, examples in one file."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.modelica.package import class_names, export_modelica
 
-    given = Given()
+    given = Given(effects)
     given.outputs({"--output": output}, [model])
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     given.check()

@@ -5,7 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import Quiet, show, tell_written, working
+from psa_casadi.cli.screen import (
+    EffectsOption,
+    Quiet,
+    show,
+    tell_written,
+    working,
+)
 
 if TYPE_CHECKING:
     from psa_casadi.export.ssp.structure import WiredParts
@@ -34,6 +40,7 @@ def ssp(
     platforms: Annotated[
         str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
     ] = "host",
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a nanopositioner as SSP: controller, compensator, amplifier, stack, flexure, wired."""
@@ -42,7 +49,7 @@ def ssp(
     from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
     from psa_casadi.model.system.nanopositioner import nanopositioner
 
-    given = Given()
+    given = Given(effects)
     given.outputs({"--output": output, "--picture": picture}, [model])
     if picture is not None and picture.suffix.lower() not in (".svg", ".png"):
         given.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")

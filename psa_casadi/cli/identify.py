@@ -8,6 +8,7 @@ import typer
 
 from psa_casadi.cli.screen import (
     ColumnsOption,
+    EffectsOption,
     Origin,
     OriginOption,
     Quiet,
@@ -49,6 +50,7 @@ def identify(
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
     columns: ColumnsOption = None,
     origin: OriginOption = Origin.MEASURED,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine."""
@@ -61,7 +63,7 @@ def identify(
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.report.words.text import identification_text
 
-    given = Given()
+    given = Given(effects)
     if method is Method.PAPER and profile:
         given.add("--method paper has no likelihood; leave --profile or --method out.")
     if method is Method.PAPER and model is not None:

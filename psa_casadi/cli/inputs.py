@@ -2,12 +2,14 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
+from psa_casadi.model.own_effects import own_effects
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, read_record
@@ -20,8 +22,11 @@ T = TypeVar("T")
 class Given:
     """Collects the problems of everything that a command is given, to tell them all at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, modules: Sequence[str] | None = None) -> None:
+        """Begin with the effects of the `modules` that --effects names."""
         self._problems: list[str] = []
+        read = [self.attempt(partial(own_effects, module)) for module in modules or ()]
+        self.effects = [c for found in read for c in (found or {}).values()]
 
     def add(self, sentence: str) -> None:
         """Note one problem."""
@@ -90,7 +95,7 @@ class Given:
         """Read a model that turns a voltage into a displacement; None where no file is named."""
         if path is None:
             return None
-        model = self.attempt(lambda: load_model(path))
+        model = self.attempt(lambda: load_model(path, self.effects))
         if model is None:
             return None
         if "voltage" not in model.input_names or "displacement" not in model.output_names:
@@ -126,7 +131,9 @@ class Given:
         if path is None:
             self.add("No model is given; add --model MODEL.json, or --stack NAME (`psa stacks`).")
             return None
-        return self.attempt(lambda: load_model(path)) if any_model else self.model(path)
+        if any_model:
+            return self.attempt(lambda: load_model(path, self.effects))
+        return self.model(path)
 
     def stiffness(self, value: float | None) -> None:
         """Demand a positive stiffness, if one is given."""

@@ -32,6 +32,15 @@ PartOption = Annotated[
     ),
 ]
 
+EffectsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--effects",
+        help="Module that holds effects of your own, as in mypackage.effects; repeat the option for"
+        " several.",
+    ),
+]
+
 ColumnsOption = Annotated[
     str | None,
     typer.Option(

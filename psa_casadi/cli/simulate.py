@@ -5,7 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import ColumnsOption, Quiet, StackOption, show, tell_written, working
+from psa_casadi.cli.screen import (
+    ColumnsOption,
+    EffectsOption,
+    Quiet,
+    StackOption,
+    show,
+    tell_written,
+    working,
+)
 
 if TYPE_CHECKING:
     from psa_casadi.model.compose import Model
@@ -21,6 +29,7 @@ def simulate(
     model: Annotated[Path | None, typer.Option(help="MODEL.json to simulate.")] = None,
     stack: StackOption = None,
     columns: ColumnsOption = None,
+    effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a model on a measured or planned voltage; write every output with its unit."""
@@ -28,7 +37,7 @@ def simulate(
     from psa_casadi.records import write_record
     from psa_casadi.simulation.simulate import simulate_record
 
-    given = Given()
+    given = Given(effects)
     given.outputs({"--output": output}, [model, record])
     chosen = given.model_or_stack(model, stack)
     voltage = given.voltage(record, columns=columns)

@@ -22,13 +22,13 @@ from psa_casadi.diagnosis.search.rounds import AFRESH, Round, decide, examine, s
 from psa_casadi.diagnosis.standing import is_open, left, missed, worth_searching
 from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.diagnosis.verdict import conclude
-from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress, refit
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
+from psa_casadi.model.own_effects import known_effects
 from psa_casadi.records.quality.suspects import cleaned
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, in_one_order
@@ -64,7 +64,7 @@ def diagnose(
     leave parts of the method out (for its negative controls). Raises InputError.
     """
     with stage("preparing"):
-        table = list(effects if effects is not None else EFFECTS.values())
+        table = list(effects if effects is not None else known_effects().values())
         records, holdout = in_one_order(records), in_one_order(holdout)
         experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
         start, scale_given = chosen_start(records, model, stiffness)

@@ -43,7 +43,9 @@ AGEING = Component(
         Parameter(
             "ageing_time", 1.0, "s", (1e-3, 1e7), "age at time 0 of the record's clock", log=True
         ),
-        Parameter("ageing_by_travel", 0.0, "1", (0.0, 1.0), "0: time ages, 1: cycles do"),
+        Parameter(
+            "ageing_by_travel", 0.0, "1", (0.0, 1.0), "0: time ages, 1: cycles do", fitted=False
+        ),
     ),
     states=(
         State("travel", "s", "cycles at rated voltage, 1 s each", 1.0, memory=True, settles=False),

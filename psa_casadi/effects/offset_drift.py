@@ -28,7 +28,9 @@ OFFSET_DRIFT = Component(
         Parameter(
             "drift_bend", 0.0, "1", (-3.0, 3.0), "change of the rate over drift_span", scale=0.3
         ),
-        Parameter("drift_span", 10.0, "s", (1e-6, 1e9), "time over which drift_bend counts"),
+        Parameter(
+            "drift_span", 10.0, "s", (1e-6, 1e9), "time over which drift_bend counts", fitted=False
+        ),
     ),
     equations=_equations,
     probe={"drift_span": RECORD_DURATION, "drift_bend": (-0.5, 0.0)},

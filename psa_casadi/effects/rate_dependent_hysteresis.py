@@ -82,7 +82,14 @@ RATE_DEPENDENT_HYSTERESIS = Component(
             "threshold of the elements over rated voltage",
             log=True,
         ),
-        Parameter("rate_by_threshold", 0.0, "1", (0.0, 1.0), "0: the loop grows, 1: thresholds do"),
+        Parameter(
+            "rate_by_threshold",
+            0.0,
+            "1",
+            (0.0, 1.0),
+            "0: the loop grows, 1: thresholds do",
+            fitted=False,
+        ),
     ),
     states=(
         State(

@@ -64,6 +64,7 @@ TEMPERATURE = Component(
             (0.0, 1000.0),
             "temperature at which nothing changes",
             scale=1.0,
+            fitted=False,
         ),
     ),
     inputs=(Input("temperature", "K", "temperature of the stack", start=_ROOM, nominal=300.0),),

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.variables import Interval, Provenance
 
 FORMAT = "psa_casadi.model/1"
@@ -19,9 +21,17 @@ FORMAT = "psa_casadi.model/1"
 def dumps(model: Model) -> str:
     """Return the text of MODEL.json; reading it back gives the same model exactly.
 
-    Raises InputError for a model with a component that is in no table of this package.
+    An effect that is not of this package is named with its module and the hash of what it declares.
+    Raises InputError for a model with a component that is in no table and of no module.
     """
-    _refuse_foreign(model)
+    foreign = foreign_components(model)
+    if foreign:
+        raise InputError(
+            f"The model '{model.name}' cannot be saved as MODEL.json: the file names components of"
+            f" this package and of modules with own effects, and {', '.join(foreign)} is neither"
+            " (made by ode_model or connect?). Keep the script that makes the model, or export the"
+            " model as an FMU."
+        )
     origin = model.provenance
     parameters = {}
     for p in model.structure.parameters:
@@ -37,7 +47,7 @@ def dumps(model: Model) -> str:
         "name": model.name,
         "description": model.description,
         "components": [c.name for c in model.components if c.gain is None],
-        "effects": [c.name for c in model.effects],
+        "effects": [_reference(c) for c in model.effects],
         "parameters": parameters,
         "force_scale": origin.force_scale,
         "notes": list(origin.notes),
@@ -47,20 +57,23 @@ def dumps(model: Model) -> str:
     return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _refuse_foreign(model: Model) -> None:
-    """The file names components; one that is in neither table could not be found again."""
+def foreign_components(model: Model) -> tuple[str, ...]:
+    """Return the names of a model's components that MODEL.json cannot name."""
     known = (*COMPONENTS.values(), *EFFECTS.values())
-    foreign = [c.name for c in model.components if c not in known]
-    if foreign:
-        raise InputError(
-            f"The model '{model.name}' cannot be saved as MODEL.json: the file names components of"
-            f" this package, and {', '.join(foreign)} is not one (made by ode_model or connect?)."
-            " Keep the script that makes the model, or export the model as an FMU."
-        )
+    return tuple(c.name for c in model.components if c not in known and not c.home)
 
 
-def loads(text: str, source: str = "MODEL.json") -> Model:
-    """Read a model; raises InputError that names every unknown name, missing or bad value."""
+def _reference(effect: Component) -> str | dict[str, str]:
+    if not effect.home:
+        return effect.name
+    return {"name": effect.name, "module": effect.home, "sha256": declaration_hash(effect)}
+
+
+def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = ()) -> Model:
+    """Read a model; `effects` are own ones that it may have (`own_effects`).
+
+    Raises InputError that names every unknown name, missing or bad value.
+    """
     try:
         content = json.loads(text)
     except ValueError as error:
@@ -68,11 +81,12 @@ def loads(text: str, source: str = "MODEL.json") -> Model:
             f"{source} is not JSON ({error}); give a file that `psa identify` or `psa diagnose`"
             " wrote."
         ) from error
-    problems = _problems(content, source)
+    table = known_effects(effects)
+    problems = _problems(content, source, table)
     if problems:
         raise InputError(problems)
     components = [COMPONENTS[n] for n in content["components"]]
-    components += [EFFECTS[n] for n in content["effects"]]
+    components += [table[_name_of(n)] for n in content["effects"]]
     given = content["parameters"]
     try:
         model = compose(
@@ -91,8 +105,8 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     atomic_write(path, dumps(model))
 
 
-def load_model(path: str | os.PathLike[str]) -> Model:
-    """Read MODEL.json; raises InputError."""
+def load_model(path: str | os.PathLike[str], effects: Iterable[Component] = ()) -> Model:
+    """Read MODEL.json; `effects` are own ones that it may have. Raises InputError."""
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -100,7 +114,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
             f"The model file {path} cannot be read ({error}); give a file that `psa identify`"
             " wrote."
         ) from error
-    return loads(text, str(path))
+    return loads(text, str(path), effects)
 
 
 def _provenance(content: dict[str, Any], given: dict[str, Any]) -> Provenance:
@@ -116,7 +130,11 @@ def _provenance(content: dict[str, Any], given: dict[str, Any]) -> Provenance:
     )
 
 
-def _problems(content: Any, source: str) -> list[str]:
+def _name_of(effect: Any) -> Any:
+    return effect.get("name") if isinstance(effect, dict) else effect
+
+
+def _problems(content: Any, source: str, effects: Mapping[str, Component]) -> list[str]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
         return [
@@ -125,21 +143,42 @@ def _problems(content: Any, source: str) -> list[str]:
         ]
     problems: list[str] = []
     known: list[Component] = []
-    for key, table in (("components", COMPONENTS), ("effects", EFFECTS)):
+    for key, table in (("components", COMPONENTS), ("effects", effects)):
         names = content.get(key)
         if not isinstance(names, list):
             problems.append(f"{source}: '{key}' is missing; it must list names.")
             continue
-        for name in names:
+        for reference in names:
+            name = _name_of(reference)
             if isinstance(name, str) and name in table:
                 known.append(table[name])
+                problems += _changed(reference, table[name], source)
             else:
-                problems.append(
-                    f"{source}: unknown name '{name}' in {key}; the known ones are {sorted(table)}."
-                )
+                problems.append(_unknown(reference, key, table, source))
     given = content.get("parameters")
     problems += _parameter_problems(given, known, source)
     return problems + _origin_problems(content, given, source)
+
+
+def _unknown(reference: Any, key: str, table: Mapping[str, Component], source: str) -> str:
+    if isinstance(reference, dict) and isinstance(reference.get("module"), str):
+        module = reference["module"]
+        return (
+            f"{source}: has the effect '{reference.get('name')}' of the module {module}, which was"
+            f" not named; give --effects {module} (in Python:"
+            f" effects=psa.own_effects({module!r}).values())."
+        )
+    return f"{source}: unknown name '{reference}' in {key}; the known ones are {sorted(table)}."
+
+
+def _changed(reference: Any, component: Component, source: str) -> list[str]:
+    """Say where an own effect is not declared as it was when the file was written."""
+    if not isinstance(reference, dict) or reference.get("sha256") == declaration_hash(component):
+        return []
+    return [
+        f"{source}: the effect '{component.name}' of {component.home or 'this package'} is declared"
+        " in another way than when the file was written; restore that, or identify again."
+    ]
 
 
 def _origin_problems(content: dict[str, Any], given: Any, source: str) -> list[str]:

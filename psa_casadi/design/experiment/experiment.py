@@ -24,7 +24,6 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.search.contenders import one_of_each, same_curve_note
 from psa_casadi.diagnosis.task import FAST
 from psa_casadi.errors import InputError
-from psa_casadi.identification.search.multistart import FIXED
 from psa_casadi.model.compose import Model
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
@@ -188,8 +187,8 @@ def rival_of_effect(model: Model, effect: Component, free: Sequence[str]) -> Riv
     if extended.values[gain.name] == 0.0:
         size = ORDINARY * gain.typical(extended.values)
         extended = extended.with_values({gain.name: float(np.clip(size, *gain.bounds))})
-    own = [p.name for p in effect.parameters if p.name not in FIXED]
-    return rival_of_model(effect.name, extended, [*free, *(n for n in own if n not in free)])
+    own = [n for n in effect.fitted if n not in free]
+    return rival_of_model(effect.name, extended, [*free, *own])
 
 
 def _slow(limits: Limits) -> bool:

@@ -14,7 +14,6 @@ from psa_casadi.diagnosis.screening.screen import Copy, Score
 from psa_casadi.diagnosis.search.quick_fits import QUICK, continued, fit_from, quick_fit
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
-from psa_casadi.identification.search.multistart import FIXED
 from psa_casadi.identification.search.refitting import quick_rtol
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.records.split import Experiment
@@ -153,7 +152,7 @@ def _from_ordinary(
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
     values = {
-        n: known[n] if isinstance(grid, str) or n in FIXED else _declared(effect, n)
+        n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
         for n, grid in effect.probe.items()
     }
     ordinary = ordinary_values(before.model, [e.record for e in experiments])

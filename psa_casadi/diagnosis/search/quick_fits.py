@@ -7,7 +7,6 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.search.multistart import FIXED
 from psa_casadi.identification.search.refitting import quick_rtol
 from psa_casadi.records.split import Experiment
 
@@ -52,7 +51,7 @@ def fit_from(
     """Fit with one more effect from a start, the other values `reset`; None if that fails."""
     values, gain, memory = start
     names = list(before.unknowns.names)
-    names += [p.name for p in effect.parameters if p.name not in FIXED and p.name not in names]
+    names += [n for n in effect.fitted if n not in names]
     low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
     for share in (1.0, 0.3):
         value = float(np.clip(share * gain, 0.9 * low, 0.9 * high))

@@ -13,7 +13,6 @@ from psa_casadi.diagnosis.screening.screen import Score, Screening
 from psa_casadi.diagnosis.search.extension import Extension
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.search.multistart import FIXED
 from psa_casadi.records.drive import among_harmonics
 from psa_casadi.records.split import Experiment
 
@@ -78,7 +77,8 @@ def starts_of(screening: Screening, name: str) -> list[Score]:
 
 
 def _form(score: Score) -> dict[str, float]:
-    return {n: v for n, v in score.direction.values.items() if n in FIXED}
+    direction = score.direction
+    return {n: v for n, v in direction.values.items() if n not in direction.effect.fitted}
 
 
 def choose(
@@ -188,7 +188,7 @@ def out_of_character(extension: Extension, experiments: Sequence[Experiment]) ->
     if tone is not None and any(among_harmonics(values[tone], e.record) for e in experiments):
         return True
     for p in extension.effect.parameters:
-        if p.name in FIXED or p.name == extension.effect.gain:
+        if not p.fitted or p.name == extension.effect.gain:
             continue
         low, high = p.bounds
         margin = 1e-3 * (high - low) if not p.log else 0.0

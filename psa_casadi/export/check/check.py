@@ -8,6 +8,7 @@ from typing import ParamSpec
 
 from fmpy.validation import validate_fmu
 
+from psa_casadi.component import Component
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check.agreement import agreements
 from psa_casadi.export.check.calls import CALLS
@@ -83,13 +84,17 @@ class CheckReport:
         return tuple(row for row in self.rows if not row.passed)
 
 
-def check_fmu(path: str | os.PathLike[str], model: Model | None = None) -> CheckReport:
+def check_fmu(
+    path: str | os.PathLike[str],
+    model: Model | None = None,
+    effects: Iterable[Component] = (),
+) -> CheckReport:
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
     It is compared with `model`, else with the model it carries (resources/model.json), else with
-    none. Sensor and environment of the model are left out if the FMU leaves them out. A check that
-    breaks down is a row that did not pass; the others still run, except those that need an instance
-    if there is none.
+    none. `effects` are own ones that the model inside may have. Sensor and environment of the model
+    are left out if the FMU leaves them out. A check that breaks down is a row that did not pass;
+    the others still run, except those that need an instance if there is none.
 
     Raises InputError if the file is no FMU.
     """
@@ -99,7 +104,7 @@ def check_fmu(path: str | os.PathLike[str], model: Model | None = None) -> Check
         rows += [_count(name, check, archive) for name, check in _DESCRIBED.items()]
         chosen: list[Model] = [model] if model else []
         if model is None and (archive.directory / MODEL_ENTRY).is_file():
-            rows.append(_count("model inside", _read_model, archive, chosen))
+            rows.append(_count("model inside", _read_model, archive, chosen, effects))
         if chosen:
             chosen = [_as_exported(archive, chosen[0])]
             rows += [_count(name, check, archive, chosen[0]) for name, check in _ORIGIN.items()]
@@ -174,11 +179,13 @@ def _load(path: Path, loaded: list[Fmu]) -> Iterator[str]:
         yield str(error)
 
 
-def _read_model(archive: Archive, found: list[Model]) -> Iterator[str]:
+def _read_model(
+    archive: Archive, found: list[Model], effects: Iterable[Component]
+) -> Iterator[str]:
     """Append the model that the FMU carries; what prevents that is the problem."""
     try:
         text = (archive.directory / MODEL_ENTRY).read_text(encoding="utf-8")
-        found.append(loads(text, MODEL_ENTRY))
+        found.append(loads(text, MODEL_ENTRY, effects))
     except PsaError as error:
         yield str(error)
 

@@ -6,8 +6,6 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from psa_casadi.components import COMPONENTS
-from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
@@ -20,7 +18,7 @@ from psa_casadi.export.fmu.sources import compiled_files, export_token, source_f
 from psa_casadi.export.fmu.terminals import terminal_entries
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import dumps
+from psa_casadi.model.model_file import dumps, foreign_components
 from psa_casadi.simulation.stepper import SimulationError
 
 #: Where an FMU carries the model it was made from.
@@ -86,7 +84,7 @@ def _companions(model: Model, fmi: int) -> dict[str, bytes]:
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])
     entries |= {"model.png": drawing} if fmi == 2 else terminal_entries(model)
-    if all(c in (*COMPONENTS.values(), *EFFECTS.values()) for c in model.components):
+    if not foreign_components(model):
         entries[MODEL_ENTRY] = dumps(model).encode("utf-8")
     return entries
 

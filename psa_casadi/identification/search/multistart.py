@@ -26,8 +26,6 @@ from psa_casadi.simulation.timings import stage
 
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "c")
-#: Parameters of effects that only set a scale, or choose between two forms, and are never fitted.
-FIXED = frozenset({"drift_span", "temperature_reference", "ageing_by_travel", "rate_by_threshold"})
 
 #: Where there are more starts than finalists, all get the first evaluations, those the rest.
 _QUICK, _FINALISTS, _FIRST = 12, 3, 5
@@ -64,8 +62,8 @@ class Search:
 
 
 def free_parameters(model: Model) -> list[str]:
-    """Return the core parameters and those of the model's effects (units of time excepted)."""
-    effects = [p.name for c in model.effects for p in c.parameters if p.name not in FIXED]
+    """Return the core parameters and those of the model's effects that records can tell."""
+    effects = [n for c in model.effects for n in c.fitted]
     return [n for n in CORE if n in model.values] + effects
 
 

@@ -1,0 +1,117 @@
+"""Effects that are not of this package: of an installed one, or of a module that a user names.
+
+    dry_friction.py:  DRY_FRICTION = psa.Component("dry_friction", ..., gain="friction_force")
+    psa diagnose record.csv --effects dry_friction
+
+An installed package announces a module with the entry point `psa_casadi.effects`; its effects are
+then in every search. A file never names code to run: MODEL.json tells which module an effect came
+from, and whoever reads it must have named or installed that module.
+"""
+
+import hashlib
+import os
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from types import ModuleType
+
+import casadi as ca
+
+from psa_casadi.component import Component, Expression, Symbols
+from psa_casadi.components import BASE, COMPONENTS
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.model.compose import compose
+
+#: Group of the entry points that announce modules with effects.
+GROUP = "psa_casadi.effects"
+
+
+@cache
+def own_effects(module: str) -> Mapping[str, Component]:
+    """Return the effects that a module holds, by name; the current folder is searched first.
+
+    They are its variables that are a `Component` with a gain, or those of its mapping or sequence
+    `EFFECTS` where it has one. Raises InputError where the module cannot be imported, holds none,
+    or holds one that does not fit beside the base model.
+    """
+    found = _held_by(_imported(module), module)
+    problems = Problems()
+    for component in found:
+        if component.name in {**COMPONENTS, **EFFECTS}:
+            problems.add(f"{module}: an effect of this package is named '{component.name}' too.")
+            continue
+        try:
+            compose((*BASE, component))
+        except InputError as error:
+            for sentence in error.problems:
+                problems.add(f"{module}: {sentence}")
+    problems.raise_if_any()
+    return {c.name: replace(c, home=module) for c in found}
+
+
+@cache
+def installed_effects() -> Mapping[str, Component]:
+    """Return the effects of installed packages that have the entry point; raises InputError."""
+    modules = sorted({e.value.partition(":")[0] for e in entry_points(group=GROUP)})
+    return {name: c for module in modules for name, c in own_effects(module).items()}
+
+
+def known_effects(own: Iterable[Component] = ()) -> dict[str, Component]:
+    """Return the effects of this package, of installed ones, and the user's `own`, by name."""
+    return {**EFFECTS, **installed_effects(), **{c.name: c for c in own}}
+
+
+def declaration_hash(component: Component) -> str:
+    """Return the SHA-256 of what a component declares: names, values, bounds and equations."""
+    table: dict[str, Expression] = {}
+    symbols = _OnDemand(table)
+    written = component.equations(symbols)
+    sums = (written.der, written.add, written.out, written.switches, written.next)
+    equations = [sorted((name, str(ca.SX(e))) for name, e in part.items()) for part in sums]
+    parameters = [
+        (p.name, p.value, p.unit, p.bounds, p.log, p.fitted) for p in component.parameters
+    ]
+    states = [(s.name, s.unit, s.start, s.memory, s.settles) for s in component.states]
+    inputs = [(i.name, i.unit, i.start) for i in component.inputs]
+    text = repr((component.name, component.gain, parameters, states, inputs, equations))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class _OnDemand(Symbols):
+    """Symbols of any name, made when they are asked for."""
+
+    def __getattr__(self, name: str) -> Expression:
+        return self._table.setdefault(name, ca.SX.sym(name))
+
+
+def _imported(module: str) -> ModuleType:
+    here = os.getcwd()
+    sys.path.insert(0, here)
+    try:
+        return import_module(module)
+    except Exception as error:  # the user's own code may raise anything
+        raise InputError(
+            f"The module '{module}' with own effects cannot be imported"
+            f" ({type(error).__name__}: {error}); name it as in `import {module or 'effects'}`,"
+            " from the folder that holds it."
+        ) from error
+    finally:
+        if here in sys.path:
+            sys.path.remove(here)
+
+
+def _held_by(module: ModuleType, name: str) -> list[Component]:
+    listed = getattr(module, "EFFECTS", None)
+    values = listed.values() if isinstance(listed, Mapping) else listed
+    candidates = vars(module).values() if values is None else values
+    found = [c for c in candidates if isinstance(c, Component) and c.gain is not None]
+    if not found:
+        raise InputError(
+            f"The module '{name}' holds no effect: a variable that is a `Component` with a gain,"
+            " or a mapping EFFECTS of them."
+        )
+    return list(dict.fromkeys(found))

@@ -1,0 +1,166 @@
+"""Effects of a user's own module: found, named, saved by reference, exported, refused."""
+
+import importlib
+import sys
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.model import own_effects as place
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.model.own_effects import declaration_hash, known_effects, own_effects
+from psa_casadi.records.record import Record
+
+RIPPLE = """
+import casadi as ca
+import psa_casadi as psa
+
+
+def _equations(s):
+    return psa.Equations(
+        add={"measured_displacement": s.ripple * ca.sin(2.0 * ca.pi * s.x / s.ripple_period)}
+    )
+
+
+SENSOR_RIPPLE = psa.Component(
+    "encoder_ripple",
+    "an error that repeats with the grating's period",
+    "Heydemann 1981",
+    _equations,
+    (
+        psa.Parameter("ripple", 0.0, "m", (-1e-6, 1e-6), "its amplitude", scale=2e-8),
+        psa.Parameter(
+            "ripple_period", 4e-6, "m", (1e-7, 1e-4), "its period", log=True, fitted=False
+        ),
+    ),
+    gain="ripple",
+    belongs_to="sensor",
+    needs=("sensor",),
+)
+"""
+
+
+@pytest.fixture
+def ripple(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Component]:
+    """The effect of a module in the current folder."""
+    (tmp_path / "gratings.py").write_text(RIPPLE)
+    monkeypatch.chdir(tmp_path)
+    _forget()
+    yield own_effects("gratings")["encoder_ripple"]
+    _forget()
+
+
+def _forget() -> None:
+    own_effects.cache_clear()
+    place.installed_effects.cache_clear()
+    sys.modules.pop("gratings", None)
+    importlib.invalidate_caches()
+
+
+def extended(ripple: Component) -> psa.Model:
+    return psa.stack_model("P-885.51").with_effect(ripple, {"ripple": 5e-8})
+
+
+def recorded(model: psa.Model) -> Record:
+    """Loops of several amplitudes on the model, with 3 nm of noise."""
+    t = np.linspace(0.0, 2.999, 3000, dtype=np.float64)
+    v = (
+        50.0
+        * (1.0 - np.cos(2.0 * np.pi * t))
+        * np.interp(t, [0.0, 1.0, 2.0, 3.0], [1, 0.6, 0.9, 0.3])
+    )
+    x = psa.simulate(model, t, v).displacement
+    noise = 3e-9 * np.random.default_rng(3).standard_normal(len(t))
+    return Record(name="loops", time=t, voltage=v, displacement=x + noise)
+
+
+def test_a_search_names_it_beside_those_of_the_package(ripple: Component) -> None:
+    table = [ripple, EFFECTS["sensor_lag"], EFFECTS["slow_creep"], EFFECTS["sensor_nonlinearity"]]
+    d = diagnose([recorded(extended(ripple))], effects=table)
+    assert [c.effect for c in d.causes] == ["encoder_ripple"]
+    assert d.model.values["ripple"] == pytest.approx(5e-8, rel=0.1)
+
+
+def test_the_file_names_the_module_and_reading_it_needs_that(ripple: Component) -> None:
+    text = dumps(extended(ripple))
+    assert '"module": "gratings"' in text
+    again = loads(text, effects=[ripple])
+    assert again.values == extended(ripple).values
+    assert again.effects == (ripple,)
+    with pytest.raises(psa.InputError, match=r"encoder_ripple.*gratings.*--effects gratings"):
+        loads(text)
+
+
+def test_a_declaration_that_has_changed_is_refused(ripple: Component, tmp_path: Path) -> None:
+    text = dumps(extended(ripple))
+    source = tmp_path / "gratings.py"
+    source.write_text("# a comment changes nothing\n" + RIPPLE)
+    _forget()
+    commented = own_effects("gratings")["encoder_ripple"]
+    assert declaration_hash(commented) == declaration_hash(ripple)
+    source.write_text(RIPPLE.replace("ca.sin", "ca.cos"))
+    _forget()
+    other = own_effects("gratings")["encoder_ripple"]
+    with pytest.raises(psa.InputError, match="declared in another way"):
+        loads(text, effects=[other])
+
+
+def test_the_command_line_takes_a_module(ripple: Component, tmp_path: Path) -> None:
+    psa.save_model(extended(ripple), "model.json")
+    t = 1e-3 * np.arange(50.0)
+    psa.write_record("volts.csv", {"time [s]": t, "voltage [V]": 1e3 * t})
+    arguments = ["simulate", "--model", "model.json", "--input", "volts.csv", "-o", "out.csv"]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 2
+    assert "--effects gratings" in refused.output
+    done = CliRunner().invoke(app, [*arguments, "--effects", "gratings"])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "out.csv").is_file()
+
+
+@pytest.mark.slow
+def test_its_fmu_carries_it_and_passes_the_check(ripple: Component, tmp_path: Path) -> None:
+    path = tmp_path / "stack.fmu"
+    psa.export_fmu(extended(ripple), path, include_sensor=True)
+    assert not psa.check_fmu(path).passed  # the model inside cannot be read without the module
+    report = psa.check_fmu(path, effects=[ripple])
+    assert report.passed, report.rows
+
+
+def test_installed_packages_announce_theirs(
+    ripple: Component, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = EntryPoint("gratings", "gratings", place.GROUP)
+    monkeypatch.setattr(place, "entry_points", lambda group: [entry])
+    place.installed_effects.cache_clear()
+    assert known_effects()["encoder_ripple"] is ripple
+    assert len(known_effects()) == len(EFFECTS) + 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("import nothing_of_that_name", "cannot be imported"),
+        ("X = 1", "holds no effect"),
+        (RIPPLE.replace('"encoder_ripple"', '"slow_creep"'), "named 'slow_creep' too"),
+        (RIPPLE.replace("s.x /", "s.no_such_symbol /"), "no_such_symbol"),
+    ],
+)
+def test_a_module_that_does_not_do_is_told_in_a_sentence(
+    text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "gratings.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    _forget()
+    with pytest.raises(psa.InputError, match=message):
+        own_effects("gratings")
+    _forget()
