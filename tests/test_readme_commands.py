@@ -1,8 +1,11 @@
+import re
 from pathlib import Path
 
 import pytest
 
+from build_scripts.measured_data import ROOT
 from build_scripts.readme_commands import Block, find_blocks, run_text
+from psa_casadi.effects import EFFECTS
 
 TEXT = """
 # Title
@@ -85,3 +88,11 @@ def test_a_mark_that_does_not_exist_and_a_block_without_end_are_refused() -> Non
         find_blocks("<!-- run: never -->\n")
     with pytest.raises(ValueError, match="line 2: this block has no end"):
         find_blocks("text\n```console\n$ true\n")
+
+
+@pytest.mark.parametrize("place", ["plant", "drive", "sensor", "environment"])
+def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    row = next(line for line in lines if line.startswith(f"| {place} | `"))
+    own = [e.name for e in EFFECTS.values() if e.belongs_to == place]
+    assert re.findall(r"`(\w+)`", row) == own
