@@ -163,7 +163,7 @@ def test_each_form_of_an_effect_gets_a_start_and_near_ones_stay_rivals(tmp_path:
         other = replace(best.effect, name="another")
         rival = replace(best, effect=other, removed=share * best.removed)
         given = (task.experiments, current.fit, current.predicted, colour, None)
-        return [e.effect.name for e in choose([best, rival], *given, alarm=True)]
+        return [e.effect.name for e in choose([best, rival], *given, alarm=True, knowable=0.0)]
 
     assert set(chosen(0.98)) == {name, "another"}
     assert chosen(0.5) == [name]

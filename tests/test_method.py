@@ -77,7 +77,7 @@ def test_an_effect_with_hardly_any_evidence_is_not_worth_a_name(
         (brisk, 15.0, False, 1),
     ):
         told = replace(one, evidence=evidence)
-        assert len(choose([told], *given, alarm=alarm)) == count
+        assert len(choose([told], *given, alarm=alarm, knowable=0.0)) == count
 
 
 def test_imitators_are_asked_for_where_the_best_effect_has_led_the_base() -> None:

@@ -33,15 +33,17 @@ def is_open(rounds: Sequence[Round]) -> bool:
 
 
 def worth_searching(rounds: Sequence[Round]) -> bool:
-    """Whether a direction is above the threshold.
+    """Whether a direction is above the threshold and removes what can be told of a stack.
 
     For a further cause the test must alarm too, and much of the residual's power be above the noise
     or the direction promise a share of what the first one removed.
     """
     current, first = rounds[-1], rounds[0].chosen
     best = max((s.decrease for s in current.screening.scores), default=0.0)
+    promised = best * current.screening.colour.level**2 / len(current.fit.residuals)
+    if promised <= current.test.knowable**2:
+        return False
     if best < current.screening.threshold or first is None:
         return best >= current.screening.threshold
-    promised = best * current.screening.colour.level**2 / len(current.fit.residuals)
     enough = current.test.excess > REMAINDER or promised > PROMISE * OF_FIRST * first.removed
     return current.test.alarm and enough

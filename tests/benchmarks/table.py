@@ -47,6 +47,11 @@ BENCHES: dict[str, Bench] = {
             "hidden causes on independent plants: what is named, how surely, and how often rightly",
         ),
         _later(
+            "simulated",
+            "simulated",
+            "the package's own simulations, where nothing is missing: whether that is what is said",
+        ),
+        _later(
             "verification",
             "verification",
             "the paper's figures 6 to 10 (loops, steps, other voltages), and three mechanics",

@@ -9,7 +9,7 @@ from scipy import special
 
 from psa_casadi.diagnosis.held_out.errors import held_out_residuals, rms
 from psa_casadi.diagnosis.noise.colour import Colour
-from psa_casadi.diagnosis.noise.floor import NoiseFloor
+from psa_casadi.diagnosis.noise.floor import NoiseFloor, knowable_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment
 
@@ -48,20 +48,22 @@ def held_out_excess(
     about normal under noise of kurtosis K, with mean (n + k)/(n - k) for k fitted parameters and n
     samples of the fit, and variance (K - 1)(1/m + 1/n) for m held-out samples. Whole records that
     are held out are compared with their own `noise`: parameters that the fitted ones leave open
-    make an error there too, so that only a clear excess counts.
+    make an error there too, so that only a clear excess counts. One below what can be told of a
+    stack does not.
     """
     own = [2 * int(e.used.sum()) > int(e.held_out.sum()) for e in experiments]
     parts = held_out_residuals(experiments, predicted)
-    within = _within(fit, experiments, parts, colour, own)
     beyond = [
         rms(part) / floor.level
         for part, floor, mine in zip(parts, noise, own, strict=True)
         if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
     ]
+    found = _within(fit, experiments, parts, colour, own)
     worst = max(beyond, default=0.0)
-    if worst > max(RATIO_OF_RECORDS, within.factor):
-        return Excess(worst, ALARM)
-    return within
+    if worst > max(RATIO_OF_RECORDS, found.factor):
+        found = Excess(worst, ALARM)
+    size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / found.factor**2))
+    return found if size > knowable_of(fit, experiments) else Excess()
 
 
 def _within(

@@ -9,10 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.colour import Colour, noise_rms
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.quality.noise import first_order_noise
-from psa_casadi.records.quality.quantum import quantum_of
+from psa_casadi.records.quality.quantum import last_place_of, quantum_of
 from psa_casadi.records.quality.repeats import MeasuredNoise, holds, repeats
 from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
 Source = Literal["repeats", "holds", "fast part"]
@@ -78,14 +80,48 @@ def pooled_level(
 _COLOUR = 500
 
 
-def known_colour(record: Record) -> FloatArray | None:
+#: A share of its range below which no difference between a stack and a model is of practical use.
+FORM = 2e-5
+
+
+def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     """Return the autoregression of a record's noise where repeats tell it, else None.
 
-    Holds do not: what rings or hums during a hold would count as the noise's colour.
+    Holds do not: what rings or hums during a hold would count as the noise's colour. Where a
+    `residual` (n,) is smaller than what differs between repeats, the repeats hold more than noise:
+    what a first loop leaves behind, and creep.
     """
     source, found, _ = _source(record)
-    known = found is not None and source == "repeats" and found.samples >= _COLOUR
-    return found.autoregression if known and found is not None else None
+    if found is None or source != "repeats" or found.samples < _COLOUR:
+        return None
+    return found.autoregression if found.level <= _rms(residual) else None
+
+
+def knowable(record: Record, error: float) -> float:
+    """Return the rms [m] below which a residual tells nothing of a stack.
+
+    It is that of rounding in the sensor or the file, of the simulation's own largest `error` [m],
+    and of the form that no model has exactly (`FORM` of the range).
+    """
+    y = record.displacement
+    if y is None:
+        return error
+    valid = y[np.isfinite(y)]
+    rounding = _rounding(max(quantum_of(valid) or 0.0, last_place_of(valid)))
+    return float(np.sqrt(rounding**2 + error**2 + (FORM * float(np.ptp(valid))) ** 2))
+
+
+def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:
+    """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
+    error = max((s.error for s in fit.simulated), default=0.0)
+    counts = [int(e.used.sum()) for e in experiments]
+    squares = [knowable(e.record, error) ** 2 for e in experiments]
+    return float(np.sqrt(np.average(squares, weights=counts)))
+
+
+def _rms(residual: FloatArray) -> float:
+    valid = residual[np.isfinite(residual)]
+    return float(np.sqrt(np.mean(valid**2))) if valid.size else 0.0
 
 
 def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
@@ -93,6 +129,8 @@ def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
     y = record.displacement
     quantum = quantum_of(y[np.isfinite(y)]) if y is not None else None
     source, found, how = _source(record)
+    if found is not None and found.level > _rms(valid):
+        source, found, how = _FAST_PART
     if found is None:
         level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
         covariance = np.asarray(level**2 * r ** np.arange(_LAGS if r > 0 else 1), np.float64)
@@ -123,6 +161,13 @@ def _rounding(quantum: float | None) -> float:
     return (quantum or 0.0) / float(np.sqrt(12.0))
 
 
+_FAST_PART: tuple[Source, None, str] = (
+    "fast part",
+    None,
+    "from the fast part of what the model leaves",
+)
+
+
 @lru_cache(maxsize=64)
 def _source(record: Record) -> tuple[Source, MeasuredNoise | None, str]:
     """Return the best source that needs no model, what it says, and how it does so in words."""
@@ -134,7 +179,7 @@ def _source(record: Record) -> tuple[Source, MeasuredNoise | None, str]:
     if still is not None and still.samples >= ENOUGH:
         spans = "a held voltage" if still.count == 1 else f"{still.count} held voltages"
         return "holds", still, f"from {spans} after smooth creep is taken off"
-    return "fast part", None, "from the fast part of what the model leaves"
+    return _FAST_PART
 
 
 def figure(value: float) -> str:

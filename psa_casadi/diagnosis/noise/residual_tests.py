@@ -19,16 +19,22 @@ _MOST = 9.0
 
 @dataclass(frozen=True)
 class Omnibus:
-    """Probability of the residual under noise alone, the test that says so, and where it shows."""
+    """Probability of the residual under noise alone, the test that says so, and where it shows.
+
+    `excess` is the share of the residual's power above the noise; `size` [m] the rms of what the
+    test sees, `knowable` [m] that below which nothing can be told of a stack.
+    """
 
     p_value: float
     excess: float
     where: str
+    size: float
+    knowable: float
 
     @property
     def alarm(self) -> bool:
-        """Whether something besides noise is in the residual."""
-        return self.p_value < ALARM
+        """Whether something besides noise is in the residual, large enough to be told."""
+        return self.p_value < ALARM and self.size > self.knowable
 
 
 def omnibus(
@@ -38,6 +44,7 @@ def omnibus(
     colour: Colour,
     floor: float,
     *,
+    knowable: float,
     even: bool,
 ) -> Omnibus:
     """Test a residual (samples,) [m] for structure that noise of the given colour does not have.
@@ -46,44 +53,54 @@ def omnibus(
     line in its spectrum; and an F test on general features of the voltage and time. With `even` a
     fourth one asks whether its size is the same everywhere: a sensor's noise is, what a colour may
     have swallowed of a misfit is not. `excess` is the share of the residual's power above the noise
-    `floor` [m].
+    `floor` [m]; what is seen must be larger than what is `knowable` [m].
     """
     white = colour.whiten(residual)
     tests = {
-        "neighbouring samples are correlated": whiteness(white),
+        "neighbouring samples are correlated": _neighbours(white),
         "its spectrum has a line": _fisher_line(white),
         "it depends on voltage, rate or time": _features(white, voltage, time, colour),
     }
     if even:
         tests["the size depends on voltage, rate or time"] = _sizes(white, voltage, time, colour)
-    where, p = min(tests.items(), key=lambda item: item[1])
+    where, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))
+    size = float(np.sqrt(share * power))
     excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
-    return Omnibus(min(1.0, len(tests) * p), excess, f"In the residual {where}.")
+    p = min(1.0, len(tests) * p)
+    return Omnibus(p, excess, f"In the residual {where}.", size, knowable)
 
 
 def whiteness(white: FloatArray) -> float:
     """Return the p-value of Ljung and Box's test (1978) that neighbours are not correlated."""
+    return _neighbours(white)[0]
+
+
+def _neighbours(white: FloatArray) -> tuple[float, float]:
+    """Return the p-value, and the largest correlation: what is correlated has that share."""
     n = len(white)
     centred = white - np.mean(white)
     power = float(centred @ centred)
     if power <= 0 or n <= 2 * _LAGS:
-        return 1.0
+        return 1.0, 0.0
     r = np.array([centred[k:] @ centred[:-k] / power for k in range(1, _LAGS + 1)])
     statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, _LAGS + 1)))
-    return float(special.chdtrc(_LAGS, statistic))
+    return float(special.chdtrc(_LAGS, statistic)), float(np.max(np.abs(r)))
 
 
-def _fisher_line(white: FloatArray) -> float:
+def _fisher_line(white: FloatArray) -> tuple[float, float]:
+    """Return the p-value of the strongest line, and its share of the power."""
     power = np.abs(np.fft.rfft(white - np.mean(white))[1:-1]) ** 2
     count = len(power)
     if count < 8 or not np.sum(power) > 0:
-        return 1.0
+        return 1.0, 0.0
     share = float(np.max(power) / np.sum(power))
-    return float(min(1.0, count * (1.0 - share) ** (count - 1)))
+    return float(min(1.0, count * (1.0 - share) ** (count - 1))), share
 
 
-def _features(white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour) -> float:
+def _features(
+    white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour
+) -> tuple[float, float]:
     """F test of the residual on u, u^2, u^3, sgn(u'), |u'|, u sgn(u'), a trend and slow waves."""
     u, rate, turn, t = _drive(voltage, time)
     columns = [np.ones_like(u), u, u**2, u**3, turn, np.abs(rate), u * turn, u**2 * turn, t, t**2]
@@ -92,7 +109,9 @@ def _features(white: FloatArray, voltage: FloatArray, time: FloatArray, colour: 
     return _f_test(x, white)
 
 
-def _sizes(white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour) -> float:
+def _sizes(
+    white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour
+) -> tuple[float, float]:
     """F test of the squares on voltage, rate, time and way since the last reversal.
 
     Breusch and Pagan, Econometrica 47 (1979) 1287, with Koenker's correction; squares are over
@@ -101,7 +120,7 @@ def _sizes(white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Col
     ends = np.cumsum(colour.lengths)[:-1]
     powers = np.array([np.mean(part**2) for part in np.split(white, ends)])
     if not np.all(powers > 0):
-        return 1.0
+        return 1.0, 0.0
     u, rate, turn, t = _drive(voltage, time)
     speed = np.abs(rate) / (float(np.max(np.abs(rate))) or 1.0)
     way, age = _since_reversal(u, turn)
@@ -132,12 +151,13 @@ def _since_reversal(u: FloatArray, turn: FloatArray) -> tuple[FloatArray, FloatA
     return np.abs(u - u[last]), (index - last).astype(np.float64)
 
 
-def _f_test(x: FloatArray, y: FloatArray) -> float:
-    """Return the p-value that columns x (n, k) tell nothing of y (n,)."""
+def _f_test(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return the p-value that columns x (n, k) tell nothing of y (n,), and their share of it."""
     coefficients, _, rank, _ = np.linalg.lstsq(x, y, rcond=None)
     explained = float(np.sum((x @ coefficients) ** 2))
     rest = float(y @ y) - explained
     freedom = len(y) - rank
     if rest <= 0 or freedom <= 0:
-        return 1.0
-    return float(special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
+        return 1.0, 0.0
+    p = float(special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
+    return p, explained / (explained + rest)

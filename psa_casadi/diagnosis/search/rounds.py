@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms, residual_colour
-from psa_casadi.diagnosis.noise.floor import known_colour
+from psa_casadi.diagnosis.noise.floor import knowable_of, known_colour
 from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
 from psa_casadi.diagnosis.screening.evidence import (
     bic_probabilities,
@@ -84,7 +84,10 @@ def examine(
     voltage = np.concatenate([e.record.voltage[e.used] for e in task.experiments])
     time = np.concatenate([e.record.time[e.used] for e in task.experiments])
     floor = noise_rms(fit.residuals, screening.colour)
-    test = omnibus(fit.residuals, voltage, time, screening.colour, floor, even=bool(known))
+    limit = knowable_of(fit, task.experiments)
+    test = omnibus(
+        fit.residuals, voltage, time, screening.colour, floor, knowable=limit, even=bool(known)
+    )
     guess = levelled(estimated(fit, screening), task.alike(fit))
     return Round(
         fit,
@@ -103,7 +106,8 @@ def _directions(fit: Fit, task: Task, effects: Sequence[Component]) -> list[Dire
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
     lengths = [int(e.used.sum()) for e in task.experiments]
-    known = [known_colour(e.record) for e in task.experiments]
+    residuals = fit.residuals_of(task.experiments)
+    known = [known_colour(e.record, r) for e, r in zip(task.experiments, residuals, strict=True)]
     if task.method.whiten_from == "residual":
         return screen(fit, trials, lengths, colour=residual_colour(fit.residuals, lengths))
     return screen(fit, trials, lengths, known)
@@ -181,7 +185,10 @@ def settle_on(
 def _ranked(current: Round, task: Task, first: Extension | None) -> list[Extension]:
     fit, predicted, colour = current.fit, current.predicted, current.screening.colour
     extensions, alarm = current.extensions, current.test.alarm
-    return choose(extensions, task.experiments, fit, predicted, colour, first, alarm=alarm)
+    least = current.test.knowable
+    return choose(
+        extensions, task.experiments, fit, predicted, colour, first, alarm=alarm, knowable=least
+    )
 
 
 def _weigh(current: Round, worth: Sequence[Extension], task: Task) -> None:

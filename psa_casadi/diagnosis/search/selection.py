@@ -90,15 +90,17 @@ def choose(
     first: Extension | None,
     *,
     alarm: bool,
+    knowable: float,
 ) -> list[Extension]:
     """Return the extensions that are worth having, best first.
 
     Worth having: evidence above `LEAST`, or without the omnibus test's `alarm` above `UNSEEN`, of
     slow effects above `UNSEEN_SLOW` unless a faster one has about as much; the effect in character;
     a share of the training residual's power above the noise removed, or nearly what another one
-    removes that does; and held-out data predicted better than by the model `before`, whose
-    predictions are given. A further cause, beside the `first`, must also remove a share of what
-    that one did. The order is that of the evidence; within the margin the better prediction leads.
+    removes that does, and more than what is `knowable` [m]; and held-out data predicted better than
+    by the model `before`, whose predictions are given. A further cause, beside the `first`, must
+    also remove a share of what that one did. The order is that of the evidence; within the margin
+    the better prediction leads.
     """
     least = WORTHWHILE * max(0.0, excess_power(before.residuals, colour))
     held = _HeldOut(experiments, predicted, colour)
@@ -117,6 +119,7 @@ def choose(
         for e in extensions
         if e.evidence > least_evidence(e)
         and not out_of_character(e, experiments)
+        and e.removed > knowable**2
         and (first is None or e.removed > OF_FIRST * first.removed)
         and held.gained(e) > (held.promised(e) if sure(e) else HELD_OUT_FURTHER)
     ]
