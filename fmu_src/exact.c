@@ -128,7 +128,6 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
     const int step = run->which_step[sample], finest = run->finest;
     const double h = run->length[step];
     const long end = 1L << finest;
-    long left = run->steps_limit;
     psa_trial *const trial = &state->trial;
     for (int lane = 0; lane < PSA_LANES; ++lane) pace->at[lane] = pace->dead[lane] ? end : 0;
     for (;;) {
@@ -137,7 +136,6 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
         for (int lane = PSA_LANES - 1; lane >= 0; --lane)
             if (pace->at[lane] < end) first = lane;
         if (first < 0) break;
-        if (--left < 0) return 3;
         for (int lane = 0; lane < PSA_LANES; ++lane) {
             level[lane] = pace->level[pace->at[lane] < end ? lane : first];
             same &= level[lane] == level[first];
@@ -155,12 +153,14 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
         for (int lane = 0; lane < PSA_LANES; ++lane) {
             if (pace->at[lane] >= end) continue;
             const double error = LANE(trial->error, lane);
-            if (error > 1.0 && level[lane] < finest) {
+            const int spent = ++pace->tried[lane] > run->steps_limit;
+            if (spent && PSA_LANES == 1) return 3;
+            if (error > 1.0 && level[lane] < finest && !spent) {
                 pace->level[lane]++;
                 run->rejected++;
                 continue;
             }
-            if (!(error < LOST)) {
+            if (!(error < LOST) || spent) {
                 if (PSA_LANES == 1) return 1;
                 pace->dead[lane] = 1;
                 pace->at[lane] = end;

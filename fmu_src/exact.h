@@ -22,7 +22,7 @@ typedef struct {
     const double *nominal; /* [nx][sets] */
     double tolerance;      /* of one step, over the nominal sizes */
     int coarsest, finest;  /* levels: a sample is divided by at least 2^coarsest, at most 2^finest */
-    long steps_limit;      /* between two samples */
+    long steps_limit;      /* tried steps of one set */
     double *x;             /* [samples][nx][sets] or NULL */
     double *y;             /* [samples][ny][sets] or NULL */
     double *shown;         /* [samples][sets] or NULL: the output whose sensitivity the model has; nan from where

@@ -79,7 +79,7 @@ typedef struct {
 
 /* Where the lanes stand within a sample, the levels of their next steps, and which have come to an end */
 typedef struct {
-    long at[PSA_LANES];
+    long at[PSA_LANES], tried[PSA_LANES];
     int level[PSA_LANES], dead[PSA_LANES];
 } psa_pace;
 

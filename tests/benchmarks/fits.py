@@ -36,8 +36,8 @@ FloatArray = npt.NDArray[np.float64]
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P", "m_B")
 #: Tolerances of a step. Looser ones run exact steps at 1e-5 (`ways.LOOSEST`), so none is below.
-EXACT_TOLERANCES = tuple(10.0**-k for k in range(5, 9))
-STEPPER_TOLERANCES = tuple(10.0**-k for k in range(4, 10))
+EXACT_TOLERANCES = tuple(10.0 ** (-k / 2) for k in range(10, 17))
+STEPPER_TOLERANCES = tuple(10.0 ** (-k / 2) for k in range(8, 19))
 #: Error over the range at which the two ways are compared.
 WANTED = 1e-5
 _TRUTH = 1e-11

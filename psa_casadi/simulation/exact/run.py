@@ -28,6 +28,9 @@ FloatArray = npt.NDArray[np.float64]
 FINEST = 12
 #: Sets of parameters that run side by side in the vectors of one core.
 LANES = 4
+#: Tried steps over the samples, times 2^coarsest, beyond which a run is left to the stepper, which
+#: takes the time of some ten of them for a sample; a set in lanes has no other way.
+_MOST, _MOST_IN_LANES = 30, 100_000
 #: Time steps that differ by less than this share count as one, and so many may differ by more.
 _ALIKE, _LENGTHS = 1e-6, 8
 #: Vectors of four numbers whatever the processor; strict C99 has no vectors.
@@ -145,7 +148,6 @@ def run_exact(
     tolerance: float,
     coarsest: int = 0,
     hold: str = "linear",
-    steps_limit: int = 100_000,
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
     output: str = "measured_displacement",
@@ -157,7 +159,7 @@ def run_exact(
     `tolerance` bounds the estimated error of a step, over the states' nominal sizes; every sample
     is divided by 2^coarsest at least. `unknowns` and `s0` are those of the stepper's `run`;
     `everything` asks for all states and outputs. Raises NotExact where this way is not possible,
-    or where it fails.
+    where it fails, or where it needs so many steps that the stepper is no slower.
     """
     reason = why_not(model.structure, output)
     if reason:
@@ -175,7 +177,7 @@ def run_exact(
     if everything:
         arrays |= {"x": np.empty((n, nx)), "y": np.empty((n, len(model.output_names)))}
     library = _library(model.structure, output, 1)
-    how = {"tolerance": tolerance, "coarsest": coarsest, "steps_limit": steps_limit}
+    how = {"tolerance": tolerance, "coarsest": coarsest, "steps_limit": _MOST * n << coarsest}
     cost = _run(library, (t, u, hold), arrays, sets=1, count=count, **how)
     return ExactSteps(
         arrays["shown"], arrays["dy"] if count else None, arrays.get("x"), arrays.get("y"), *cost
@@ -192,7 +194,6 @@ def run_sets(
     nominal: FloatArray,
     tolerance: float,
     hold: str = "linear",
-    steps_limit: int = 100_000,
     output: str = "measured_displacement",
 ) -> FloatArray:
     """Return the output (n, m) of at most `LANES` sets of parameters p (np, m), run side by side.
@@ -208,7 +209,8 @@ def run_sets(
         "p": _doubles(p), "x0": _doubles(x0), "nominal": _doubles(nominal),
         "shown": np.empty((len(t), sets)),
     }  # fmt: skip
-    how = {"tolerance": tolerance, "coarsest": 0, "steps_limit": steps_limit}
+    limit = _MOST_IN_LANES * len(t)
+    how = {"tolerance": tolerance, "coarsest": 0, "steps_limit": limit}
     _run(_library(structure, output, LANES), (t, u, hold), arrays, sets=sets, count=0, **how)
     return arrays["shown"]
 
