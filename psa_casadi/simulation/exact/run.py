@@ -29,8 +29,9 @@ FINEST = 12
 #: Sets of parameters that run side by side in the vectors of one core.
 LANES = 4
 #: Tried steps over the samples, times 2^coarsest, beyond which a run is left to the stepper, which
-#: takes the time of some ten of them for a sample; a set in lanes has no other way.
-_MOST, _MOST_IN_LANES = 30, 100_000
+#: takes the time of 10 to 60 of them for a sample: at this tolerance of a step, and as its root
+#: below. A set in lanes has no other way.
+_MOST, _AT, _MOST_IN_LANES = 60, 1e-6, 100_000
 #: Time steps that differ by less than this share count as one, and so many may differ by more.
 _ALIKE, _LENGTHS = 1e-6, 8
 #: Vectors of four numbers whatever the processor; strict C99 has no vectors.
@@ -177,7 +178,8 @@ def run_exact(
     if everything:
         arrays |= {"x": np.empty((n, nx)), "y": np.empty((n, len(model.output_names)))}
     library = _library(model.structure, output, 1)
-    how = {"tolerance": tolerance, "coarsest": coarsest, "steps_limit": _MOST * n << coarsest}
+    most = int(_MOST * max(1.0, _AT / tolerance) ** 0.5 * n) << coarsest
+    how = {"tolerance": tolerance, "coarsest": coarsest, "steps_limit": most}
     cost = _run(library, (t, u, hold), arrays, sets=1, count=count, **how)
     return ExactSteps(
         arrays["shown"], arrays["dy"] if count else None, arrays.get("x"), arrays.get("y"), *cost
