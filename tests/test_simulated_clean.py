@@ -36,8 +36,12 @@ def test_the_last_place_of_a_file_is_seen(step: float) -> None:
 def test_what_can_be_known_holds_rounding_error_and_form() -> None:
     record = record_of(Case("P-885.51", "sine", "1 nm"))
     whole = float(np.ptp(record.displacement)) if record.displacement is not None else np.nan
-    parts = 1e-9 / np.sqrt(12.0), 2e-10, FORM * whole
-    assert knowable(record, 2e-10) == pytest.approx(float(np.sqrt(np.sum(np.square(parts)))))
+    rounding, error = 1e-9 / np.sqrt(12.0), 2e-10
+    rest = float(np.hypot(error, FORM * whole))
+    signs = np.where(np.arange(record.n) % 2, 1.0, -1.0)
+    small, large = rounding * signs, 2.0 * rounding * signs
+    assert knowable(record, error, small) == pytest.approx(float(np.hypot(rest, rounding)))
+    assert knowable(record, error, large) == pytest.approx(rest)  # noise has made it white
 
 
 def test_what_a_first_loop_leaves_behind_is_no_noise() -> None:

@@ -82,6 +82,9 @@ _COLOUR = 500
 
 #: A share of its range below which no difference between a stack and a model is of practical use.
 FORM = 2e-5
+#: A residual above this multiple of the rounding's rms holds noise of a fifth of the step or more,
+#: which makes rounding as good as white: it hides nothing then.
+DITHERED = 1.2
 
 
 def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
@@ -97,17 +100,20 @@ def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     return found.autoregression if found.level <= _rms(residual) else None
 
 
-def knowable(record: Record, error: float) -> float:
-    """Return the rms [m] below which a residual tells nothing of a stack.
+def knowable(record: Record, error: float, residual: FloatArray) -> float:
+    """Return the rms [m] below which a `residual` (n,) tells nothing of a stack.
 
-    It is that of rounding in the sensor or the file, of the simulation's own largest `error` [m],
-    and of the form that no model has exactly (`FORM` of the range).
+    It is that of the simulation's own largest `error` [m], of the form that no model has exactly
+    (`FORM` of the range), and of rounding in the sensor or the file where the residual is hardly
+    more than that.
     """
     y = record.displacement
     if y is None:
         return error
     valid = y[np.isfinite(y)]
     rounding = _rounding(max(quantum_of(valid) or 0.0, last_place_of(valid)))
+    if _rms(residual) > DITHERED * rounding:
+        rounding = 0.0
     return float(np.sqrt(rounding**2 + error**2 + (FORM * float(np.ptp(valid))) ** 2))
 
 
@@ -115,7 +121,10 @@ def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:
     """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
     error = max((s.error for s in fit.simulated), default=0.0)
     counts = [int(e.used.sum()) for e in experiments]
-    squares = [knowable(e.record, error) ** 2 for e in experiments]
+    parts = fit.residuals_of(experiments)
+    squares = [
+        knowable(e.record, error, part) ** 2 for e, part in zip(experiments, parts, strict=True)
+    ]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 
