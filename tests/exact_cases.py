@@ -12,7 +12,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Parameter, State
-from tests.stack_models import stack
+from tests.stack_models import at_ordinary_size, stack
 
 FloatArray = NDArray[np.float64]
 
@@ -76,15 +76,7 @@ BEAT = Component(
 def with_effect(name: str, stack_name: str = "P-885.51") -> Model:
     """Return a stack with one effect at an ordinary size; "base" is the stack alone."""
     model = stack(stack_name)
-    if name == "base":
-        return model
-    effect = EFFECTS[name]
-    model = model.with_effect(effect)
-    gain = model.parameter(str(effect.gain))
-    size = gain.typical({**model.values, gain.name: 0.0})
-    if effect.finite_step:
-        size *= effect.finite_step[len(effect.finite_step) // 2]
-    return model.with_values({gain.name: float(np.clip(size, *gain.bounds))})
+    return model if name == "base" else at_ordinary_size(model, EFFECTS[name])
 
 
 def times(samples: int, step: float) -> FloatArray:

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
@@ -18,6 +19,16 @@ LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
 def stack(name: str, **changes: float) -> Model:
     figures = {key: figure.value for key, figure in STACKS[name].values.items()}
     return compose(BASE, figures | changes)
+
+
+def at_ordinary_size(model: Model, effect: Component) -> Model:
+    """Return a model with one more effect, its gain at an ordinary size or step."""
+    model = model.with_effect(effect)
+    gain = model.parameter(str(effect.gain))
+    size = gain.typical({**model.values, gain.name: 0.0})
+    if effect.finite_step:
+        size *= effect.finite_step[len(effect.finite_step) // 2]
+    return model.with_values({gain.name: float(np.clip(size, *gain.bounds))})
 
 
 def sine(t: FloatArray, frequency: float) -> FloatArray:

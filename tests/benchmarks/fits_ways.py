@@ -26,6 +26,7 @@ from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
 from psa_casadi.simulation.ways import EXACT, STEP_SHARE, STEPPER, Way, trace
 from tests.benchmarks.outcome import Progress, TitledTable, share
+from tests.stack_models import at_ordinary_size
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -116,15 +117,7 @@ def voltage(record: str, top: float, sample_time: float) -> tuple[FloatArray, Fl
 def with_one_effect(stack: str, effect: str) -> Model:
     """Return a stack with an effect at its ordinary size."""
     model = stack_model(stack)
-    if effect == BASE_NAME:
-        return model
-    component = EFFECTS[effect]
-    model = model.with_effect(component)
-    gain = model.parameter(str(component.gain))
-    size = gain.typical({**model.values, gain.name: 0.0})
-    if component.finite_step:
-        size *= component.finite_step[len(component.finite_step) // 2]
-    return model.with_values({gain.name: float(np.clip(size, *gain.bounds))})
+    return model if effect == BASE_NAME else at_ordinary_size(model, EFFECTS[effect])
 
 
 def tried(rtols: Sequence[float], repeats: int, trial: Trial) -> list[Reached]:

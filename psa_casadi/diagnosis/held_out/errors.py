@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from psa_casadi.diagnosis.noise.colour import uncertain
+from psa_casadi.diagnosis.noise.colour import rms, uncertain
 from psa_casadi.diagnosis.result import Errors, Gain
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import Experiment
@@ -121,8 +121,3 @@ def _log_ratio(sums: FloatArray) -> float:
     """Logarithm of the errors' ratio [-], from their sums of squares before and after [m^2]."""
     before, after = (max(float(s), 1e-300) for s in sums)
     return 0.5 * float(np.log(after / before))
-
-
-def rms(values: FloatArray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

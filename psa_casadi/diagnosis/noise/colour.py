@@ -174,6 +174,12 @@ def excess_power(residual: FloatArray, colour: Colour, floor: float | None = Non
     return float(np.mean(residual**2)) - level**2 * (1.0 + uncertain(residual))
 
 
+def rms(values: FloatArray) -> float:
+    """Root mean square of the values that exist; 0 without any."""
+    valid = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(valid**2))) if valid.size else 0.0
+
+
 def uncertain(residual: FloatArray) -> float:
     """Return the relative standard error of the noise's power from a residual's fast part.
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.colour import Colour, noise_rms
+from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, rms
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.quality.noise import first_order_noise
 from psa_casadi.records.quality.quantum import last_place_of, quantum_of
@@ -23,6 +23,13 @@ Source = Literal["repeats", "holds", "fast part"]
 ENOUGH = 200
 #: Noise is called white where no autocorrelation exceeds this.
 VISIBLE = 0.1
+#: Samples from which the colour of the noise is known without a model.
+_COLOUR = 500
+#: A share of its range below which no difference between a stack and a model is of practical use.
+FORM = 2e-5
+#: A residual above this multiple of the rounding's rms holds noise of a fifth of the step or more,
+#: which makes rounding as good as white: it hides nothing then.
+DITHERED = 1.2
 #: Lags of the autocovariance that a first-order autoregression is given with.
 _LAGS = 30
 
@@ -76,17 +83,6 @@ def pooled_level(
     return float(np.sqrt(np.average(powers, weights=counts)))
 
 
-#: Samples from which the colour of the noise is known without a model.
-_COLOUR = 500
-
-
-#: A share of its range below which no difference between a stack and a model is of practical use.
-FORM = 2e-5
-#: A residual above this multiple of the rounding's rms holds noise of a fifth of the step or more,
-#: which makes rounding as good as white: it hides nothing then.
-DITHERED = 1.2
-
-
 def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     """Return the autoregression of a record's noise where repeats tell it, else None.
 
@@ -97,7 +93,7 @@ def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     source, found, _ = _source(record)
     if found is None or source != "repeats" or found.samples < _COLOUR:
         return None
-    return found.autoregression if found.level <= _rms(residual) else None
+    return found.autoregression if found.level <= rms(residual) else None
 
 
 def knowable(record: Record, error: float, residual: FloatArray) -> float:
@@ -107,14 +103,11 @@ def knowable(record: Record, error: float, residual: FloatArray) -> float:
     (`FORM` of the range), and of rounding in the sensor or the file where the residual is hardly
     more than that.
     """
-    y = record.displacement
-    if y is None:
-        return error
-    valid = y[np.isfinite(y)]
-    rounding = _rounding(max(quantum_of(valid) or 0.0, last_place_of(valid)))
-    if _rms(residual) > DITHERED * rounding:
+    quantum, last_place, size = _resolution(record)
+    rounding = _rounding(max(quantum or 0.0, last_place))
+    if rms(residual) > DITHERED * rounding:
         rounding = 0.0
-    return float(np.sqrt(rounding**2 + error**2 + (FORM * float(np.ptp(valid))) ** 2))
+    return float(np.sqrt(rounding**2 + error**2 + (FORM * size) ** 2))
 
 
 def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:
@@ -128,17 +121,11 @@ def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 
-def _rms(residual: FloatArray) -> float:
-    valid = residual[np.isfinite(residual)]
-    return float(np.sqrt(np.mean(valid**2))) if valid.size else 0.0
-
-
 def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
     valid = residual[np.isfinite(residual)]
-    y = record.displacement
-    quantum = quantum_of(y[np.isfinite(y)]) if y is not None else None
+    quantum, _, _ = _resolution(record)
     source, found, how = _source(record)
-    if found is not None and found.level > _rms(valid):
+    if found is not None and found.level > rms(valid):
         source, found, how = _FAST_PART
     if found is None:
         level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
@@ -175,6 +162,16 @@ _FAST_PART: tuple[Source, None, str] = (
     None,
     "from the fast part of what the model leaves",
 )
+
+
+@lru_cache(maxsize=64)
+def _resolution(record: Record) -> tuple[float | None, float, float]:
+    """Return a record's quantum, its last decimal place, and its range [m]; None, 0 without any."""
+    y = record.displacement
+    valid = np.zeros(0) if y is None else y[np.isfinite(y)]
+    if not valid.size:
+        return None, 0.0, 0.0
+    return quantum_of(valid), last_place_of(valid), float(np.ptp(valid))
 
 
 @lru_cache(maxsize=64)
