@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from psa_casadi.diagnosis.diagnose import diagnose
     from psa_casadi.diagnosis.result import Diagnosis
+    from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
     from psa_casadi.errors import InputError, PsaError
     from psa_casadi.export.check.check import CheckReport, check_fmu
@@ -149,6 +150,7 @@ _HOMES = {
         "identify",
     ),
     "psa_casadi.diagnosis.diagnose": ("diagnose",),
+    "psa_casadi.diagnosis.verdict": ("patched_model",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),
     "psa_casadi.report.words.text": ("story",),
     "psa_casadi.report.plots.figure": ("save_figure",),
@@ -181,6 +183,7 @@ __all__ = [
     "Equations",
     "Symbols",
     "own_effects",
+    "patched_model",
     "STACKS",
     "stack_model",
     "Model",

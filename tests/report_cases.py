@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 
 from psa_casadi.components import BASE
+from psa_casadi.diagnosis.held_out.errors import Errors, Gain
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.residual.misfit import Misfit, misfit
 from psa_casadi.diagnosis.result import (
@@ -13,9 +14,7 @@ from psa_casadi.diagnosis.result import (
     Candidate,
     Cause,
     Diagnosis,
-    Errors,
     Estimate,
-    Gain,
     NextExperiment,
     Remaining,
     Verdict,

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.base_fit.retries import from_band, from_resonances, instead_of
 from psa_casadi.diagnosis.base_fit.ringing import ringing
+from psa_casadi.diagnosis.base_fit.variants import from_band, from_resonances, instead_of
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.search.extension import Extension, extend, polish
-from psa_casadi.diagnosis.search.rounds import examine
-from psa_casadi.diagnosis.search.selection import starts_of
+from psa_casadi.diagnosis.search.fits import to_end, with_cause
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
+from psa_casadi.diagnosis.search.view import examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit
@@ -38,14 +38,17 @@ def _fitted(
     return truth, experiments, fit_base(starting_model([record], None), experiments)
 
 
-def _extended(base: Fit, experiments: tuple[Experiment, ...], name: str) -> Extension:
-    """Fit one effect beside a base, to the end."""
-    task = Task(experiments, (EFFECTS[name],))
-    seen = examine(base, tuple(base.predicted(experiments)), task)
-    colour = seen.screening.colour
-    quick = extend(base, experiments, starts_of(seen.screening, name), colour)
+def _extended(
+    base: Fit, experiments: tuple[Experiment, ...], name: str
+) -> tuple[Hypothesis, float]:
+    """Fit one effect beside a base, to the end; and its evidence."""
+    plain = hypothesis((), base, experiments)
+    assert plain is not None
+    seen = examine(plain, Task(experiments, (EFFECTS[name],)))
+    quick = with_cause(plain, experiments, seen.starts_of(name))
     assert quick is not None
-    return polish(base, quick, experiments, colour)
+    found = to_end(quick, experiments)
+    return found, Scale(base, seen.screening.colour, 0.0).evidence(found)
 
 
 def _quietly(_: str) -> None:
@@ -89,10 +92,10 @@ def test_mechanics_is_sought_again_where_another_model_is_nearer(tmp_path: Path)
     assert found is not None
     assert found.rms < 1.017 * truth.sigma
     assert retuned(found, experiments, _quietly) is found
-    mode = _extended(found, experiments, "structural_mode")
-    assert mode.evidence < 0.0
+    mode, evidence = _extended(found, experiments, "structural_mode")
+    assert evidence < 0.0
     # nothing is better than what is found, so that nothing stands for the mode beside it
-    assert instead_of(found, mode, experiments, _quietly) is None
+    assert instead_of(found, mode.fit, experiments, _quietly) is None
 
 
 @slow
@@ -118,9 +121,9 @@ def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     record = read_record(tmp_path / "a.csv")
     experiments = (split(record),)
     base = fit_base(starting_model([record], None), experiments)
-    lag = _extended(base, experiments, like)
-    assert lag.evidence > 10.0
-    found = instead_of(base, lag, experiments, _quietly)
+    lag, evidence = _extended(base, experiments, like)
+    assert evidence > 10.0
+    found = instead_of(base, lag.fit, experiments, _quietly)
     assert (found is not None) == own
     assert found is None or found.rms < 1.001 * lag.fit.rms
 
@@ -143,7 +146,7 @@ def test_ringing_above_the_band_shows_which_resonance_was_missed(
     image = abs(own - rate * round(own / rate))
     assert seen.tone == pytest.approx(image, abs=0.03 * rate)
     assert min(abs(f - own) for f, _ in seen.resonances) < 0.03 * rate
-    found = from_band(base, base, experiments, _quietly)
+    found = from_band(base, experiments, _quietly)
     assert found is not None
     assert _lowest(found.model.values, "m_P", "m_B") == pytest.approx(own, rel=0.02)
     left = ringing(found, experiments)

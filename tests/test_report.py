@@ -29,6 +29,7 @@ SENTENCES = {
     "partly_explained": "The closest known cause is slow creep",
     "ambiguous": "cannot tell whether it is slow creep or offset drift",
     "unexplained": "no effect in the table explains",
+    "not_driven": "The displacement does not follow the voltage",
 }
 
 

@@ -47,6 +47,12 @@ def diagnose(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="MODEL.json of the extended model.")
     ] = None,
+    patch: Annotated[
+        Path | None,
+        typer.Option(
+            help="MODEL.json of the extended model with the unnamed correction, where one helps."
+        ),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="DIAGNOSIS.json to write.")] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     figure: Annotated[Path | None, typer.Option(help="PNG picture to write.")] = None,
@@ -75,7 +81,13 @@ def diagnose(
     """
     from psa_casadi.simulation.timings import stage, timed
 
-    outputs = {"--output": output, "--json": json, "--report": report, "--figure": figure}
+    outputs = {
+        "--output": output,
+        "--patch": patch,
+        "--json": json,
+        "--report": report,
+        "--figure": figure,
+    }
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli.inputs import Given
@@ -104,13 +116,18 @@ def diagnose(
                 d = _with_next(d, following or _beside(json or report), progress)
             progress("writing")
             with stage("writing"):
-                _write(d, outputs, origin.value)
+                _write(d, {**outputs, "--patch": None}, origin.value)
+            with stage("unnamed correction"):
+                unpatched = _write_patch(d, patch, progress)
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
-    tell_written(*outputs.values(), d.next_experiment.voltage_csv, quiet=quiet)
+    written = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
+    tell_written(*written, d.next_experiment.voltage_csv, quiet=quiet)
     if output is not None and not d.causes:
         show(f"nothing was added: {output} holds the base model", quiet)
+    if unpatched:
+        show(unpatched, quiet)
     if timings:
         show("", quiet)
         show_table(timings_table(spent.stages), quiet)
@@ -147,6 +164,21 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
     why = f"Play {path} and diagnose all records together. {said} {same}".rstrip()
     following = NextExperiment(str(path), design.names, why, dict(design.chance))
     return replace(d, next_experiment=following)
+
+
+def _write_patch(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> str:
+    """Write the model with the unnamed correction; say why where there is none to write."""
+    if path is None:
+        return ""
+    import psa_casadi as psa
+    from psa_casadi.errors import PsaError
+
+    progress("fitting the unnamed correction")
+    try:
+        psa.save_model(psa.patched_model(d), path)
+    except PsaError as error:
+        return f"{path} was not written: {error}"
+    return ""
 
 
 def _write(d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str) -> None:

@@ -8,6 +8,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.diagnosis.budget import Budget
+from psa_casadi.diagnosis.corrections.patch import Patch
+from psa_casadi.diagnosis.held_out.errors import Errors, Gain
 from psa_casadi.diagnosis.noise.floor import NoiseFloor
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.identification.fitting.fit import Fit
@@ -15,7 +18,9 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
-Verdict = Literal["adequate", "cause_named", "partly_explained", "ambiguous", "unexplained"]
+Verdict = Literal[
+    "adequate", "cause_named", "partly_explained", "ambiguous", "unexplained", "not_driven"
+]
 
 FORMAT = "psa_casadi.diagnosis/1"
 
@@ -55,29 +60,6 @@ class Candidate:
     evidence: float
     fitted: bool
     probability: float = 0.0
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Errors of one model [m], in training and held-out samples; percent of the measured range."""
-
-    train_rms_m: float
-    holdout_rms_m: float
-    holdout_max_m: float
-    holdout_nrmse_percent: float
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Reduction of the held-out rms by the extended model [%], with a 95 % interval.
-
-    `held_out_records` is the number of records that the interval is taken over, 0 where it is
-    blocks of fewer ones: then it speaks for their voltages only.
-    """
-
-    holdout_rms_reduction_percent: float
-    interval: tuple[float, float]
-    held_out_records: int = 0
 
 
 @dataclass(frozen=True)
@@ -130,6 +112,8 @@ class Diagnosis:
     predictions [m] of every record in full, in the order of `experiments`. `noise` is the floor of
     every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
     records with enough samples. `contenders` are the fitted rivals of an ambiguous verdict.
+    `budget` says where the base's held-out error goes, `patch` the unnamed correction that would
+    remove most of what the named causes leave.
     """
 
     verdict: Verdict
@@ -153,6 +137,8 @@ class Diagnosis:
     misfit: tuple[Misfit, ...] = ()
     remainder: tuple[Misfit, ...] = ()
     contenders: tuple[Contender, ...] = ()
+    budget: Budget | None = None
+    patch: Patch | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of DIAGNOSIS.json."""
@@ -167,6 +153,8 @@ class Diagnosis:
                 "extended": asdict(self.extended_errors),
             },
             "gain": asdict(self.gain),
+            "budget": None if self.budget is None else asdict(self.budget),
+            "patch": None if self.patch is None else self.patch.to_dict(),
             "blind_to": [asdict(b) for b in self.blind_to],
             "remaining": asdict(self.remaining),
             "next_experiment": asdict(self.next_experiment),

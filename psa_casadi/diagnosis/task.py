@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.thresholds import Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment
 
@@ -12,22 +12,28 @@ from psa_casadi.records.split import Experiment
 FAST = 7e-4
 _MASSES = ("m_P", "m_B", "m")
 
+#: The steps of the method that a diagnosis can go without, to show what each is good for, and what
+#: is done in their place.
+STEPS = {
+    "remainder": "the noise's colour is that of the residual, not of what nothing explains",
+    "finite steps": "effects whose derivative vanishes at their null are not looked for by a step",
+    "fits afresh": "no fits from an ordinary base beside those from the fitted one",
+    "base again": "the base is not fitted again from where a cause has led",
+    "resonances": "no resonances that the base has missed are tried",
+    "going back": "only the best hypothesis is followed",
+    "exchange": "causes are not exchanged beside the later ones",
+    "all afresh": "effects far behind in the screening are never fitted",
+    "held out": "held-out data are not asked",
+    "form": "a further cause may be smaller than the first one's form is known",
+}
+
 
 @dataclass(frozen=True)
 class Method:
-    """The parts of the method that a diagnosis can go without, to show what each is good for.
+    """The method, `without` some of its `STEPS`, with its deciding constants."""
 
-    `whiten_from`: the noise's colour is that of what neither the base nor any candidate explains
-    ("remainder"), or an autoregression of the residual itself. `finite_steps`: effects whose
-    derivative vanishes at their null are screened by a step. `imitators`: effects that could look
-    like the best one are fitted too. `weights`: probabilities come from the evidence, tempered as
-    measured, or from the Bayesian information criterion.
-    """
-
-    whiten_from: Literal["remainder", "residual"] = "remainder"
-    finite_steps: bool = True
-    imitators: bool = True
-    weights: Literal["evidence", "bic"] = "evidence"
+    without: frozenset[str] = frozenset()
+    thresholds: Thresholds = field(default_factory=Thresholds)
 
 
 @dataclass(frozen=True)

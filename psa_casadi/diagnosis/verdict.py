@@ -1,4 +1,4 @@
-"""From the rounds of the search to verdict, confidence, blind spots and what to do next."""
+"""From the steps of the search to verdict, confidence, blind spots and what to do next."""
 
 from collections.abc import Sequence
 
@@ -6,13 +6,17 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.budget import Budget, Removed, budget
+from psa_casadi.diagnosis.corrections.correct import corrections
+from psa_casadi.diagnosis.corrections.export import with_patch
+from psa_casadi.diagnosis.corrections.patch import patch_of
 from psa_casadi.diagnosis.held_out.errors import (
     errors_of,
-    explained_share,
     gain_of,
     whole_residuals,
 )
 from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
+from psa_casadi.diagnosis.judgement import Weighed, told_from, verdict_of
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
@@ -25,21 +29,23 @@ from psa_casadi.diagnosis.result import (
     Remaining,
     Verdict,
 )
-from psa_casadi.diagnosis.screening.evidence import CREDIBLE, credible_set
 from psa_casadi.diagnosis.search.contenders import contenders, same_curve_note
-from psa_casadi.diagnosis.search.extension import Extension
-from psa_casadi.diagnosis.search.rounds import Round
+from psa_casadi.diagnosis.search.hypothesis import Scale
+from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import same_curves
+from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
+from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Share of the held-out excess error that a closest known cause must remove.
-PARTLY = 0.8
+#: Verdicts that name causes.
+NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
 _HELD_OUT = (
     "The held-out samples' error is {:.2f} times what the fitted ones let expect: something matters"
     " there that these do not show."
@@ -48,49 +54,62 @@ _HELD_OUT = (
 
 @stage("judging")
 def conclude(
-    rounds: Sequence[Round],
+    steps: Sequence[Step],
     experiments: Sequence[Experiment],
     table: Sequence[Component],
     stiffness_given: bool,
+    *,
+    driven: bool = True,
 ) -> Diagnosis:
-    """Judge the rounds of a search and return the diagnosis."""
-    first, last = rounds[0], rounds[-1]
-    chosen = [r for r in rounds if r.chosen is not None]
+    """Judge the steps of a search and return the diagnosis.
+
+    Of records whose displacement is not `driven` by the voltage nothing more is said.
+    """
+    first, last = steps[0], steps[-1]
+    colour = last.screening.colour
     errors = whole_residuals(experiments, last.predicted)
     base_errors = whole_residuals(experiments, first.predicted)
     noise = noise_floor([e.record for e in experiments], errors)
-    floor = pooled_level(noise, errors, last.screening.colour)
-    share = explained_share(experiments, first.predicted, last.predicted, floor)
-    colour = first.screening.colour
-    beyond = held_out_excess(first.fit, experiments, first.predicted, colour, noise)
+    floor = pooled_level(noise, errors, colour)
+    beyond = held_out_excess(first.fit, experiments, first.predicted, first.screening.colour, noise)
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
-    verdict: Verdict
-    if not missing:
-        verdict = "adequate"
-    elif not chosen:
-        verdict = "unexplained"
-    elif not last.test.alarm:
-        verdict = "cause_named"
-    else:
-        verdict = "partly_explained" if share >= PARTLY else "unexplained"
-    if verdict in ("cause_named", "partly_explained") and _told_from(chosen[0]):
-        verdict = "ambiguous"
-    named = chosen if verdict in ("cause_named", "partly_explained", "ambiguous") else []
+    beside_base = (
+        corrections(first.fit, experiments, colour, last.predicted) if missing and driven else ()
+    )
+    removed = Removed(experiments, first.predicted, floor)
+    share = removed.share("", first.predicted, last.predicted).share
+    weighed = Weighed(
+        evidence=Scale(first.fit, colour, thresholds().price).evidence(last.view.of),
+        causes=len(steps) - 1,
+        share=share,
+        corrections=beside_base,
+        shares=[removed.share("", first.predicted, c.predicted).share for c in beside_base],
+    )
+    gain = gain_of(experiments, first.predicted, last.predicted)
+    verdict: Verdict = (
+        "not_driven"
+        if not driven
+        else verdict_of(steps, missing=missing, beaten=weighed.beaten_by() is not None, share=share)
+    )
+    named = [s for s in steps if s.chosen] if verdict in NAMING else []
     final = last if named else first
+    patch = patch_of(
+        corrections(last.fit, experiments, colour) if named else beside_base,
+        experiments,
+        final.view.of.holdout_rms,
+        colour,
+    )
     found = determinacy(final.fit, experiments)
     missed = _misfits(experiments, base_errors, noise)
-    causes = tuple(
-        _cause(
-            r,
-            r.chosen,
-            last.fit,
-            found,
-            explained_share(experiments, r.predicted, after.predicted, floor),
-            partly=verdict == "partly_explained",
-        )
-        for r, after in zip(named, rounds[1:], strict=False)
-        if r.chosen is not None
+    spent = budget(
+        experiments,
+        first.predicted,
+        final.predicted,
+        [(s.cause.name, s.without.predicted) for s in named if s.without is not None],
+        None if patch is None else (patch.name, patch.predicted),
+        floor,
     )
+    causes = tuple(_cause(s, last.fit, found, spent) for s in named)
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -98,7 +117,7 @@ def conclude(
         noise_floor_rms_m=floor,
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
-        gain=gain_of(experiments, first.predicted, final.predicted),
+        gain=gain if named else gain_of(experiments, first.predicted, first.predicted),
         blind_to=_blind_spots(final, table),
         remaining=_remaining(final, Excess() if named else beyond),
         next_experiment=_next_experiment(
@@ -119,8 +138,24 @@ def conclude(
         noise=noise,
         misfit=missed,
         remainder=_misfits(experiments, errors, noise) if named else missed,
-        contenders=contenders(chosen[0], experiments) if verdict == "ambiguous" else (),
+        contenders=contenders(first, experiments) if verdict == "ambiguous" else (),
+        budget=spent,
+        patch=patch,
     )
+
+
+def patched_model(d: Diagnosis) -> Model:
+    """Return the extended model with the unnamed correction fitted beside it, all values free.
+
+    Raises InputError where a diagnosis has none, or one that no component stands for;
+    SimulationError where it cannot be simulated.
+    """
+    if d.patch is None:
+        raise InputError("No unnamed correction removes more than the extended model does.")
+    found = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
+    given = d.model.provenance.force_scale == "given"
+    told = determinacy(found, d.experiments)
+    return with_provenance(found.model, told, [e.record for e in d.experiments], given)
 
 
 def _misfits(
@@ -135,54 +170,40 @@ def _misfits(
     )
 
 
-def _told_from(r: Round) -> tuple[str, ...]:
-    """Effects that may as well be the cause: with the chosen one, the credible set."""
-    if r.chosen is None:
-        return ()
-    within = credible_set(r.probability, CREDIBLE)
-    return tuple(name for name in within if name != r.chosen.effect.name)
-
-
-def _cause(
-    r: Round, chosen: Extension, final: Fit, found: Determinacy, own: float, *, partly: bool
-) -> Cause:
-    """State a cause; `own` is the share that it explains of what was left before it.
-
-    The confidence is the probability of the effect, times that share where structure remains.
-    """
+def _cause(s: Step, final: Fit, found: Determinacy, spent: Budget) -> Cause:
+    """State a cause: its probability, and the share of the error that it removes."""
     estimates = {
         p.name: Estimate(
             final.model.values[p.name],
             p.unit,
             (found.intervals[p.name].low, found.intervals[p.name].high),
         )
-        for p in chosen.effect.parameters
+        for p in s.cause.parameters
         if p.name in found.intervals
     }
-    probability = r.probability[chosen.effect.name] * (own if partly else 1.0)
+    own = next((c for c in spent.causes if c.what == s.cause.name), None)
     return Cause(
-        effect=chosen.effect.name,
-        belongs_to=chosen.effect.belongs_to,
-        confidence=float(min(0.99, probability)),
+        effect=s.cause.name,
+        belongs_to=s.cause.belongs_to,
+        confidence=float(min(0.99, s.probability[s.cause.name])),
         parameters=estimates,
-        cannot_be_told_from=_told_from(r),
-        explained_share=own,
+        cannot_be_told_from=told_from(s),
+        explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
     )
 
 
-def _candidates(first: Round, floor: float, *, named: bool) -> tuple[Candidate, ...]:
+def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, ...]:
     """Every effect tried, with its share of the training excess; estimated if not fitted.
 
     Where nothing is named no effect of the table has a probability.
     """
     base = float(np.mean(first.fit.residuals**2))
     excess = max(base - floor**2, 1e-300)
-    fitted = {e.effect.name: e for e in first.extensions}
     rows = []
     for name, score in first.screening.best_by_effect().items():
-        known = fitted.get(name)
+        known = first.fitted.get(name)
         gone = score.decrease * first.screening.colour.level**2 / len(first.fit.residuals)
-        gone = gone if known is None else known.removed
+        gone = gone if known is None else known.removes(first.view.of)
         rows.append(
             Candidate(
                 effect=name,
@@ -195,7 +216,7 @@ def _candidates(first: Round, floor: float, *, named: bool) -> tuple[Candidate, 
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 
 
-def _blind_spots(final: Round, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
+def _blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
     """Effects whose smallest detectable gain on these records exceeds their ordinary size."""
     spots = []
     present = {c.name for c in final.fit.model.components}
@@ -223,7 +244,7 @@ def _blind_spots(final: Round, table: Sequence[Component]) -> tuple[BlindSpot, .
     return tuple(spots)
 
 
-def _remaining(r: Round, beyond: Excess) -> Remaining:
+def _remaining(r: Step, beyond: Excess) -> Remaining:
     """Describe what is left; `beyond` the fit where that leaves nothing to be seen."""
     where = "What remains cannot be told from noise."
     if r.test.alarm:

@@ -9,6 +9,7 @@ from typing import Any
 from psa_casadi.component import Component
 from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
+from psa_casadi.effects.patches import PATCHES
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
@@ -59,7 +60,7 @@ def dumps(model: Model) -> str:
 
 def foreign_components(model: Model) -> tuple[str, ...]:
     """Return the names of a model's components that MODEL.json cannot name."""
-    known = (*COMPONENTS.values(), *EFFECTS.values())
+    known = (*COMPONENTS.values(), *EFFECTS.values(), *PATCHES.values())
     return tuple(c.name for c in model.components if c not in known and not c.home)
 
 
@@ -81,7 +82,7 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
             f"{source} is not JSON ({error}); give a file that `psa identify` or `psa diagnose`"
             " wrote."
         ) from error
-    table = known_effects(effects)
+    table = {**known_effects(effects), **{c.name: c for c in PATCHES.values()}}
     problems = _problems(content, source, table)
     if problems:
         raise InputError(problems)

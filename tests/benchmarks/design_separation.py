@@ -24,8 +24,10 @@ from psa_casadi.design.experiment.rivals import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.search import GRID
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.screening.evidence import levelled
 from psa_casadi.diagnosis.search.contenders import one_of_each
-from psa_casadi.diagnosis.search.rounds import examine
+from psa_casadi.diagnosis.search.hypothesis import hypothesis
+from psa_casadi.diagnosis.search.view import examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
@@ -148,9 +150,11 @@ def likely_rival(record: Record, effect: str) -> str:
     experiments = (split(record),)
     base = fit_base(starting_model([record], None), experiments)
     table = [e for e in EFFECTS.values() if not e.inputs and set(e.needs) <= _names(base.model)]
-    predicted = tuple(base.predicted(experiments))
-    seen = examine(base, predicted, Task(experiments, tuple(table)))
-    others = {n: p for n, p in seen.evidence.items() if n != effect}
+    plain = hypothesis((), base, experiments)
+    assert plain is not None
+    task = Task(experiments, tuple(table))
+    evidence = levelled(examine(plain, task).estimated(), task.alike(base))
+    others = {n: p for n, p in evidence.items() if n != effect}
     return max(others, key=lambda n: others[n])
 
 

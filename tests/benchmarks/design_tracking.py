@@ -7,7 +7,6 @@ import numpy.typing as npt
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.inversion import correct, invert
-from psa_casadi.design.tracking.linear_part import linear_part
 from psa_casadi.design.tracking.minimum_time import INTERVALS, QuickMove, quickest_move
 from psa_casadi.design.tracking.targets import Target, raster_scan
 from psa_casadi.design.tracking.tracking import track
@@ -17,6 +16,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
+from psa_casadi.simulation.linear_part import linear_part
 from tests.benchmarks.creeping_reference import creeping_displacement
 from tests.benchmarks.linear_bound import bang_bang_bound
 from tests.benchmarks.outcome import Progress, TitledTable

@@ -11,7 +11,6 @@ import numpy as np
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden_cases import Case, Found, run_case, study
-from tests.benchmarks.hidden_controls import control_table
 from tests.benchmarks.hidden_figure import BINS, RELIABILITY, in_class, picture
 from tests.benchmarks.hidden_gain import gain_table
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
@@ -29,9 +28,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     found = diagnose_all(study(KNOWN, FOREIGN, QUICK_SEEDS if quick else SEEDS, FIRST), progress)
     tables = result_tables(found)
     if not quick:
-        counted = [f for kind in ("known", "foreign") for f in of_kind(found, kind)]
         tables.append(gain_table(KNOWN, FIRST, progress))
-        tables.append(control_table(counted, lambda c, m: diagnose_all(c, progress, m)))
     return Outcome(tuple(tables), lambda: picture(found, KNOWN, FOREIGN))
 
 

@@ -62,7 +62,8 @@ class Found:
     `within` the named ones with what they cannot be told from; `blind` the effects that the record
     is said not to show. `confidence` is that of the first cause; `probability` and
     `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
-    the noise; `seconds` the processor time.
+    the noise; `seconds` the processor time; `patch` the unnamed correction that is offered, which
+    would remove the share `patched` of the base's held-out excess.
     """
 
     case: Case
@@ -76,6 +77,8 @@ class Found:
     evidence: Mapping[str, float]
     ratio: float
     seconds: float
+    patch: str = ""
+    patched: float = 0.0
 
     @property
     def reached(self) -> bool:
@@ -121,6 +124,7 @@ def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
     held = d.experiments[0].held_out
     noise = np.asarray(d.experiments[0].record.displacement) - truth.displacement
     level = float(np.sqrt(np.mean(noise[held] ** 2)))
+    patched = None if d.budget is None else d.budget.unnamed
     return Found(
         case=case,
         rho=min(float(h.visible) for h in (truth, truth.second) if h is not None),
@@ -133,6 +137,8 @@ def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
         evidence={c.effect: c.evidence for c in d.candidates},
         ratio=d.extended_errors.holdout_rms_m / level,
         seconds=seconds,
+        patch="" if d.patch is None else d.patch.name,
+        patched=0.0 if not patched else patched.share,
     )
 
 

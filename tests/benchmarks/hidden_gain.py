@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.errors import gain_of
-from psa_casadi.diagnosis.result import Gain
+from psa_casadi.diagnosis.held_out.errors import Gain, gain_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.split import Experiment

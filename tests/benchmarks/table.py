@@ -47,6 +47,16 @@ BENCHES: dict[str, Bench] = {
             "hidden causes on independent plants: what is named, how surely, and how often rightly",
         ),
         _later(
+            "ablation",
+            "ablation",
+            "the diagnosis without each of its steps, and with each deciding constant moved",
+        ),
+        _later(
+            "method_pictures",
+            "method",
+            "the picture of docs/method.md: the hypotheses of one search, and its error budget",
+        ),
+        _later(
             "simulated",
             "simulated",
             "the package's own simulations, where nothing is missing: whether that is what is said",

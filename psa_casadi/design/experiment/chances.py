@@ -9,7 +9,8 @@ from scipy.special import ndtr
 from psa_casadi.design.experiment.designs import ASKED, PLAYS
 from psa_casadi.design.experiment.rivals import Rival
 from psa_casadi.design.experiment.separation import LEAST, Separation
-from psa_casadi.diagnosis.screening.evidence import CREDIBLE, FORM, TEMPERATURE
+from psa_casadi.diagnosis.screening.evidence import temperature
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.records.record import Record
 
@@ -27,8 +28,8 @@ def naming_probability(
     variance T; to be named alone it must exceed temperature * ln(c/(1 - c)), c = 0.95, where the
     temperature grows with the evidence over the base, of which the new record adds `over`/2.
     """
-    temperature = max(TEMPERATURE, FORM * (truth.evidence + 0.5 * over))
-    needed = temperature * float(np.log(CREDIBLE / (1.0 - CREDIBLE)))
+    credible = thresholds().credible
+    needed = temperature(truth.evidence + 0.5 * over) * float(np.log(credible / (1.0 - credible)))
     chances = []
     for other in others:
         t = distances[truth.name, other.name]

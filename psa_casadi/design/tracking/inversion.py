@@ -21,12 +21,13 @@ from scipy.signal import lfilter
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.dynamics import demand_stack, rest_at
-from psa_casadi.design.tracking.linear_part import LinearPart, linear_part, zero_phase_inverse
 from psa_casadi.design.tracking.saturation import held
 from psa_casadi.design.tracking.targets import Target
 from psa_casadi.design.tracking.verification import Response, TrackingError, error_of, respond
+from psa_casadi.design.tracking.zero_phase import zero_phase_inverse
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.linear_part import LinearPart, linear_part
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -1,13 +1,13 @@
 """Errors of base and extended model in training and held-out samples, and the gain between them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
 from psa_casadi.diagnosis.noise.colour import rms, uncertain
-from psa_casadi.diagnosis.result import Errors, Gain
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import Experiment
 
@@ -15,6 +15,29 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Held-out records from which on they give the gain's interval; else so many blocks of them do.
 _FEWEST, _BLOCKS = 4, 8
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one model [m], in training and held-out samples; percent of the measured range."""
+
+    train_rms_m: float
+    holdout_rms_m: float
+    holdout_max_m: float
+    holdout_nrmse_percent: float
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Reduction of the held-out rms by the extended model [%], with a 95 % interval.
+
+    `held_out_records` is the number of records that the interval is taken over, 0 where it is
+    blocks of fewer ones: then it speaks for their voltages only.
+    """
+
+    holdout_rms_reduction_percent: float
+    interval: tuple[float, float]
+    held_out_records: int = 0
 
 
 def held_out_residuals(
@@ -81,6 +104,42 @@ def explained_share(
     return float(np.clip(1.0 - left / excess, 0.0, 1.0)) if excess > 0 else float(left <= 0)
 
 
+def held_out_parts(
+    experiments: Sequence[Experiment], *predicted: Sequence[FloatArray]
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return sums of squares (parts, models) [m^2] and sample counts (parts,) of held-out parts.
+
+    The parts are the held-out records where there are at least four, else eight blocks of each.
+    """
+    residuals = [held_out_residuals(experiments, p) for p in predicted]
+    rows = [own for own in zip(*residuals, strict=True) if len(own[0])]
+    if len(rows) < _FEWEST:
+        rows = [
+            block
+            for own in rows
+            for block in zip(*(np.array_split(r, _BLOCKS) for r in own), strict=True)
+            if len(block[0])
+        ]
+    sums = np.array([[float(r @ r) for r in row] for row in rows]).reshape(-1, len(predicted))
+    return sums, np.array([len(row[0]) for row in rows], dtype=np.int64)
+
+
+def jackknife(
+    of: Callable[[npt.NDArray[np.bool_]], float], every: npt.NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Return a figure over all parts, and the half width of its 95 % interval.
+
+    With L the figure over all of k parts and L_i that without part i it is
+    L +- t_(k-1) sqrt((k-1)/k sum (L_i - mean)^2) (Efron and Tibshirani 1993, chapter 11).
+    """
+    k = len(every)
+    if k < 2:
+        return of(every), 0.0
+    without = [of(every & (np.arange(k) != i)) for i in range(k)]
+    spread = float(np.sqrt((k - 1) * np.var(without)))
+    return of(every), float(special.stdtrit(k - 1, 0.975)) * spread
+
+
 def gain_of(
     experiments: Sequence[Experiment],
     base: Sequence[FloatArray],
@@ -88,33 +147,18 @@ def gain_of(
 ) -> Gain:
     """Return the reduction of the held-out rms, with a jackknife interval of the errors' ratio.
 
-    With L the logarithm of the ratio over all parts and L_i that without part i of k, the interval
-    is L +- t_(k-1) sqrt((k-1)/k sum (L_i - mean)^2) (Efron and Tibshirani 1993, chapter 11). The
-    parts are the held-out experiments where there are at least four, else eight blocks of the
-    held-out samples.
+    The interval is that of the ratio's logarithm over the parts of `held_out_parts`.
     """
-    before = held_out_residuals(experiments, base)
-    after = held_out_residuals(experiments, extended)
-    pairs = [(b, a) for b, a in zip(before, after, strict=True) if len(b)]
-    records = len(pairs) if len(pairs) >= _FEWEST else 0
-    if not records:
-        pairs = [
-            (b, a)
-            for whole_b, whole_a in pairs
-            for b, a in zip(
-                np.array_split(whole_b, _BLOCKS), np.array_split(whole_a, _BLOCKS), strict=True
-            )
-            if len(b)
-        ]
-    sums = np.array([[float(b @ b), float(a @ a)] for b, a in pairs]).reshape(-1, 2)
-    centre = _log_ratio(np.sum(sums, axis=0))
-    half, k = 0.0, len(sums)
-    if k > 1:
-        without = np.array([_log_ratio(np.sum(np.delete(sums, i, 0), axis=0)) for i in range(k)])
-        spread = float(np.sqrt((k - 1) * np.var(without)))
-        half = float(special.stdtrit(k - 1, 0.975)) * spread
+    sums, counts = held_out_parts(experiments, base, extended)
+    records = sum(bool(len(r)) for r in held_out_residuals(experiments, base))
+
+    def of(kept: npt.NDArray[np.bool_]) -> float:
+        return _log_ratio(np.sum(sums[kept], axis=0))
+
+    centre, half = jackknife(of, np.ones(len(counts), dtype=bool))
     low, high = (100.0 * (1.0 - float(np.exp(centre + side * half))) for side in (1.0, -1.0))
-    return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), records)
+    told = len(counts) if records >= _FEWEST else 0
+    return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), told)
 
 
 def _log_ratio(sums: FloatArray) -> float:

@@ -10,14 +10,12 @@ from scipy import special
 from psa_casadi.diagnosis.held_out.errors import held_out_residuals
 from psa_casadi.diagnosis.noise.colour import Colour, rms
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, knowable_of
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Held-out errors say that something is missing below this probability, and by this ratio [-] of
-#: their rms to that of the fit; those of whole records by this ratio to their noise.
-ALARM, RATIO, RATIO_OF_RECORDS = 1e-4, 1.05, 1.5
 #: Largest held-out errors that do not count (stray readings), the fewest that are tested, and those
 #: of a whole record: fewer do not tell the colour of its noise.
 _STRAY, _FEWEST, _FEWEST_OF_RECORDS = 2, 50, 512
@@ -60,8 +58,8 @@ def held_out_excess(
     ]
     found = _within(fit, experiments, parts, colour, own)
     worst = max(beyond, default=0.0)
-    if worst > max(RATIO_OF_RECORDS, found.factor):
-        found = Excess(worst, ALARM)
+    if worst > max(thresholds().unseen_ratio_of_records, found.factor):
+        found = Excess(worst, thresholds().unseen_alarm)
     size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / found.factor**2))
     return found if size > knowable_of(fit, experiments) else Excess()
 
@@ -95,4 +93,4 @@ def _within(
 
 
 def _tells(ratio: float, chance: float) -> bool:
-    return chance < ALARM and ratio > RATIO**2
+    return chance < thresholds().unseen_alarm and ratio > thresholds().unseen_ratio ** 2

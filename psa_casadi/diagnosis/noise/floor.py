@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, rms
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.quality.noise import first_order_noise
 from psa_casadi.records.quality.quantum import last_place_of, quantum_of
@@ -25,11 +26,6 @@ ENOUGH = 200
 VISIBLE = 0.1
 #: Samples from which the colour of the noise is known without a model.
 _COLOUR = 500
-#: A share of its range below which no difference between a stack and a model is of practical use.
-FORM = 2e-5
-#: A residual above this multiple of the rounding's rms holds noise of a fifth of the step or more,
-#: which makes rounding as good as white: it hides nothing then.
-DITHERED = 1.2
 #: Lags of the autocovariance that a first-order autoregression is given with.
 _LAGS = 30
 
@@ -100,14 +96,14 @@ def knowable(record: Record, error: float, residual: FloatArray) -> float:
     """Return the rms [m] below which a `residual` (n,) tells nothing of a stack.
 
     It is that of the simulation's own largest `error` [m], of the form that no model has exactly
-    (`FORM` of the range), and of rounding in the sensor or the file where the residual is hardly
+    (`form_of_range`), and of rounding in the sensor or the file where the residual is hardly
     more than that.
     """
     quantum, last_place, size = _resolution(record)
     rounding = _rounding(max(quantum or 0.0, last_place))
-    if rms(residual) > DITHERED * rounding:
+    if rms(residual) > thresholds().dithered * rounding:
         rounding = 0.0
-    return float(np.sqrt(rounding**2 + error**2 + (FORM * size) ** 2))
+    return float(np.sqrt(rounding**2 + error**2 + (thresholds().form_of_range * size) ** 2))
 
 
 def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:

@@ -7,11 +7,10 @@ import numpy.typing as npt
 from scipy import special
 
 from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.thresholds import thresholds
 
 FloatArray = npt.NDArray[np.float64]
 
-#: The tests alarm below this probability, which they share.
-ALARM = 1e-3
 _LAGS = 25
 #: Squares of the residual over their mean that count at most.
 _MOST = 9.0
@@ -34,7 +33,7 @@ class Omnibus:
     @property
     def alarm(self) -> bool:
         """Whether something besides noise is in the residual, large enough to be told."""
-        return self.p_value < ALARM and self.size > self.knowable
+        return self.p_value < thresholds().alarm and self.size > self.knowable
 
 
 def omnibus(

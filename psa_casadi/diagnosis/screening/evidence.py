@@ -15,17 +15,11 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.screen import Score, Screening
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 
 FloatArray = npt.NDArray[np.float64]
-
-#: ln B is divided by this, or by this share of the largest, before it becomes a probability: the
-#: effects are not the true equations, so that their evidence differs by more than noise, and the
-#: more the stronger the effect is. Checked by the reliability table of the benchmark `diagnose`.
-TEMPERATURE, FORM = 2.0, 0.004
-#: The set of effects that cannot be told apart holds the cause with this probability.
-CREDIBLE = 0.95
 
 
 def evidence(before: Fit, after: Fit, colour: Colour) -> float:
@@ -79,30 +73,23 @@ def levelled(
     return found
 
 
+def temperature(largest: float) -> float:
+    """Return what evidence is divided by before it becomes a probability.
+
+    The effects are not the true equations, so that their evidence differs by more than noise, and
+    the more the larger the `largest` one is.
+    """
+    return max(thresholds().temperature, thresholds().temperature_share * largest)
+
+
 def probabilities(evidences: Mapping[str, float]) -> dict[str, float]:
     """Return the probability of each effect, given that one of them is the cause."""
     if not evidences:
         return {}
     given = np.array(list(evidences.values()))
-    values = given / max(TEMPERATURE, FORM * float(np.max(given)))
+    values = given / temperature(float(np.max(given)))
     weights = np.exp(values - np.logaddexp.reduce(values))
     return dict(zip(evidences, weights.tolist(), strict=True))
-
-
-def bic_probabilities(before: Fit, after: Mapping[str, Fit], colour: Colour) -> dict[str, float]:
-    """Return probabilities from the Bayesian information criterion of fits with one more effect.
-
-    They are proportional to exp(-BIC/2), BIC = n ln(S/n) + k ln(n) of k unknowns: those of
-    `evidence` are better calibrated, which the controls of the benchmark `diagnose` show.
-    """
-    n = len(before.residuals)
-    values = {
-        name: -0.5 * n * float(np.log(np.mean(colour.whiten(fit.residuals) ** 2)))
-        - 0.5 * len(_added(before, fit)) * float(np.log(n))
-        for name, fit in after.items()
-    }
-    total = float(np.logaddexp.reduce(list(values.values()))) if values else 0.0
-    return {name: float(np.exp(v - total)) for name, v in values.items()}
 
 
 def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, ...]:

@@ -13,12 +13,11 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.colour import Colour, colour_of
 from psa_casadi.diagnosis.screening.probes import Direction
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Chance that clean data exceed the threshold.
-FALSE_ALARM = 0.005
 _DRAWS = 4000
 _SEED = 20150810  # of the threshold's simulation: the same data give the same verdict
 
@@ -173,4 +172,4 @@ def _threshold(unit: FloatArray) -> float:
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     noise = np.random.default_rng(_SEED).standard_normal((_DRAWS, len(gram)))
     largest = np.max((noise @ root.T) ** 2, axis=1)
-    return float(np.quantile(largest, 1.0 - FALSE_ALARM))
+    return float(np.quantile(largest, 1.0 - thresholds().false_alarm))

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Contender
-from psa_casadi.diagnosis.screening.evidence import CREDIBLE, credible_set
-from psa_casadi.diagnosis.search.extension import extend, polish
-from psa_casadi.diagnosis.search.rounds import Round, examine
-from psa_casadi.diagnosis.search.selection import starts_of
+from psa_casadi.diagnosis.screening.evidence import credible_set
+from psa_casadi.diagnosis.search.fits import to_end, with_cause
+from psa_casadi.diagnosis.search.hypothesis import Scale, hypothesis
+from psa_casadi.diagnosis.search.steps import Step
+from psa_casadi.diagnosis.search.view import examine
 from psa_casadi.diagnosis.task import Task, same_curves
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.search.multistart import fit_base
@@ -21,24 +23,24 @@ from psa_casadi.records.split import Experiment, whole
 
 
 def contenders(
-    r: Round, experiments: Sequence[Experiment], names: Sequence[str] = ()
+    step: Step, experiments: Sequence[Experiment], names: Sequence[str] = ()
 ) -> tuple[Contender, ...]:
     """Return effects of one step of the search with their fits; those not fitted are fitted now.
 
-    Without `names` they are the fewest that hold the cause with the probability `CREDIBLE`. An
+    Without `names` they are the fewest that hold the cause with the probability `credible`. An
     effect whose fit fails is left out.
     """
-    names = names or credible_set(r.probability, CREDIBLE)
-    found = {e.effect.name: e for e in r.extensions}
-    evidence = dict(r.evidence)
+    names = names or credible_set(step.probability, thresholds().credible)
+    found = dict(step.fitted)
+    scale = Scale(step.fit, step.screening.colour, 0.0)
+    known = dict(step.evidence)
     for name in names:
-        if name not in found:
-            scores = starts_of(r.screening, name)
-            fitted = extend(r.fit, experiments, scores, r.screening.colour) if scores else None
-            if fitted is not None:
-                found[name] = polish(r.fit, fitted, experiments, r.screening.colour)
-                evidence[name] = found[name].evidence
-    return tuple(Contender(n, found[n].fit, evidence[n]) for n in names if n in found)
+        scores = [] if name in found else step.view.starts_of(name)
+        fitted = with_cause(step.view.of, experiments, scores) if scores else None
+        if fitted is not None:
+            found[name] = to_end(fitted, experiments)
+            known[name] = scale.evidence(found[name])
+    return tuple(Contender(n, found[n].fit, known[n]) for n in names if n in found)
 
 
 def one_of_each(
@@ -80,10 +82,14 @@ def fit_contenders(
     experiments = tuple(whole(cleaned(r)) for r in records)
     start = chosen_start(records, model, None)[0].without(e.name for e in effects)
     base = fit_base(start, experiments, progress=progress)
-    predicted = tuple(base.predicted(experiments))
-    found = examine(base, predicted, Task(experiments, tuple(effects), progress=progress))
+    plain = hypothesis((), base, experiments, final=True)
+    if plain is None:
+        raise InputError(["The fitted base cannot be simulated over the whole of these records."])
+    task = Task(experiments, tuple(effects), progress=progress)
+    seen = examine(plain, task)
     progress("fitting the rivals")
-    chosen = contenders(found, experiments, [e.name for e in effects])
+    step = Step(seen, evidence=seen.estimated())
+    chosen = contenders(step, experiments, [e.name for e in effects])
     lost = {e.name for e in effects} - {c.effect for c in chosen}
     if lost:
         raise InputError(

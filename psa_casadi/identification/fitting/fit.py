@@ -216,6 +216,8 @@ def objective(
             return None
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
         j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
+        if not np.isfinite(np.sum(y) + np.sum(j)):
+            return None
         return (
             np.concatenate([(y - target) / weights, theta * prior]),
             np.vstack([j / weights[:, None], np.diag(prior)]),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import memory_names
 from psa_casadi.variables import nominal_value
@@ -103,7 +104,10 @@ class Unknowns:
         return matrix
 
     def coordinates(self, values: Mapping[str, float]) -> FloatArray:
-        """Return the theta of the parameters (k,) at the given values."""
+        """Return the theta of the parameters (k,) at the given values.
+
+        Raises PsaError for a loop that has no coordinates.
+        """
         value = np.array([values[n] for n in self.names])
         ratio = np.where(self.log, np.maximum(value, 1e-300), 1.0) / np.where(
             self.log, self.reference, 1.0
@@ -113,6 +117,8 @@ class Unknowns:
             where = list(self.loop)
             k_l, a, beta, gamma = value[where]
             r_k, r_a, r_beta, r_gamma = self.reference[where]
+            if (k_l + a) / (r_k + r_a) <= 0.0:
+                raise PsaError("A loop whose displacement falls with the voltage cannot be fitted.")
             now, then = a / (k_l + a), r_a / (r_k + r_a)
             theta[where] = [
                 np.log((k_l + a) / (r_k + r_a)),

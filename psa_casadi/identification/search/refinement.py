@@ -120,7 +120,10 @@ def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
         prior=np.concatenate([fresh.prior[: count + 1], best.unknowns.prior[count:]]),
     )
     theta = np.concatenate([np.zeros(count + 1), best.theta[count:]])
-    parts = predict(best.model, experiments, unknowns, theta, way=best.way)
+    try:
+        parts = predict(best.model, experiments, unknowns, theta, way=best.way)
+    except PsaError:
+        return False
     jacobian = np.vstack(
         [p.jacobian[e.used[: e.stop]] for p, e in zip(parts, experiments, strict=True)]
     )

@@ -5,11 +5,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from psa_casadi.components import BASE
+from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.records.record import Record
 
+#: Displacement per volt [m/V] of stacks, from a chip of 2 um at 120 V to a lever of 1 mm at 100 V,
+#: with a margin of ten.
+ORDINARY_STROKE = (1e-9, 1e-4)
 #: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
 ASSUMED_STIFFNESS = 5e7
 #: Stiffness of the wafers over that of the bonding layers, assumed.
@@ -33,8 +37,10 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     In the one-way cascade a load meets the bonding layers only, so the stiffness [N/m] that a data
     sheet measures is k_B; it is `ASSUMED_STIFFNESS` where none is given, since voltage and
     displacement do not determine forces. k_P = 5 k_B is assumed; k_L (1/k_P + 1/k_B) is the
-    regression slope of displacement on voltage (paper, eq. 14).
+    regression slope of displacement on voltage (paper, eq. 14). Raises InputError where that is
+    far from what any stack does.
     """
+    doubt = doubtful_unit(records)
     k_b = stiffness or ASSUMED_STIFFNESS
     k_p = _WAFER_RATIO * k_b
     span = max(float(np.ptp(r.voltage)) for r in records)
@@ -52,7 +58,10 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
         "n": LOOP_SHAPES[0]["n"],
     }
-    return compose(BASE, {**values, **_lags(values, sample_time)})
+    try:
+        return compose(BASE, {**values, **_lags(values, sample_time)})
+    except InputError as error:
+        raise InputError([doubt]) if doubt else error from None
 
 
 def chosen_start(
@@ -120,3 +129,17 @@ def static_slope(records: Sequence[Record]) -> float:
         top += float(v @ (y - np.mean(y)))
         bottom += float(v @ v)
     return top / bottom if bottom > 0 else 0.0
+
+
+def doubtful_unit(records: Sequence[Record]) -> str:
+    """Say that displacement per volt is not what stacks do; "" where it is, or is in counts."""
+    slope = abs(static_slope(records))
+    low, high = ORDINARY_STROKE
+    counts = any(r.displacement_unit == "counts" for r in records)
+    if counts or slope == 0.0 or low <= slope <= high:
+        return ""
+    side = "more" if slope > high else "less"
+    return (
+        f"The displacement changes by {slope:.1e} m per volt, {side} than piezoelectric stacks do"
+        f" ({low:.0e} to {high:.0e} m/V): its unit, or that of the voltage, is probably another."
+    )

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_write
+from psa_casadi.report.page.budget_part import add_budget
 from psa_casadi.report.page.cause_part import add_causes, add_evidence
 from psa_casadi.report.page.document import Document, Picture
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
@@ -47,6 +48,7 @@ def write_report(
     page.paragraph(verdict_sentence(d), "verdict")
     _picture(page, series, origin)
     page.tiles(_tiles(d))
+    add_budget(page, d)
     add_misfit(page, d)
     add_evidence(page, d)
     add_causes(page, d)

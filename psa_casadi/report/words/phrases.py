@@ -21,6 +21,7 @@ VERDICTS = {
     "partly_explained": "partly explained",
     "ambiguous": "ambiguous",
     "unexplained": "unexplained",
+    "not_driven": "not driven",
 }
 
 
@@ -162,10 +163,12 @@ def verdict_sentence(d: Diagnosis) -> str:
     )
     if d.verdict == "adequate":
         return f"Nothing beyond the noise is missing from the base model; {error}."
+    if d.verdict == "not_driven":
+        return f"The displacement does not follow the voltage: nothing can be diagnosed; {error}."
     if d.verdict == "unexplained" or not d.causes:
         return (
             "Something is missing that no effect in the table explains, so no cause is named; "
-            f"{error}."
+            f"{_unnamed(d)}{error}."
         )
     causes = listing([_cause(c) for c in d.causes])
     if d.verdict == "ambiguous":
@@ -178,8 +181,18 @@ def verdict_sentence(d: Diagnosis) -> str:
         )
     are = "cause is" if len(d.causes) == 1 else "causes are"
     if d.verdict == "partly_explained":
-        return f"The closest known {are} {causes}: {gain_sentence(d)}, but more than noise remains."
+        share = "" if d.budget is None else percent(max(0.0, min(1.0, d.budget.together.share)))
+        of = f" ({share} of its power above the noise)" if share else ""
+        return f"The closest known {are} {causes}: {gain_sentence(d)}{of}; more than noise remains."
     return f"The {are} {causes}: {gain_sentence(d)}."
+
+
+def _unnamed(d: Diagnosis) -> str:
+    """Say what the unnamed correction would remove, "" without one."""
+    if d.patch is None or d.budget is None or d.budget.unnamed is None:
+        return ""
+    share = percent(max(0.0, min(1.0, d.budget.unnamed.share)))
+    return f"{d.patch.sentence} would remove {share} of the error above the noise; "
 
 
 def _cause(cause: Cause) -> str:

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Cause, Diagnosis, Errors
+from psa_casadi.diagnosis.held_out.errors import Errors
+from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.identification.identify import Identification
 from psa_casadi.records.split import Experiment
+from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.phrases import (
     VERDICTS,
     Scale,
@@ -55,6 +57,9 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
     for cause in d.causes:
         lines.append(("cause", _cause(d, cause)))
         lines.append(("rivals", _rivals(d, cause)))
+    spent = budget_sentence(d, scale)
+    if spent and d.verdict not in ("adequate", "not_driven"):
+        lines.append(("budget", f"{spent}."))
     lines.append(("remains", rest_sentence(d)))
     lines.append(("blind to", _blind(d)))
     lines.append(("next", d.next_experiment.why))

@@ -1,13 +1,12 @@
-"""Further attempts at the base fit: a base that is lost looks like a base that lacks something."""
+"""Variants of the base: resonances and lags that it has missed, which look like half the table."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
+from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit.ringing import images, ringing
-from psa_casadi.diagnosis.search.extension import Extension
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -22,8 +21,6 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage
 
-#: A base fit from an extension's parameters counts if its rms falls to this share.
-BETTER_BASE = 0.95
 #: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
 #: of another effect.
 _AS_GOOD, _LIKE = 10.0, 3.0
@@ -40,16 +37,7 @@ _HOPEFUL = 2.0
 _AGAIN = 1.5
 #: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band; the
 #: decrease of the whitened sum of squares from which ringing is seen, and resonances at most.
-_NEAR_BAND, _SEEN, _RESONANCES = (300.0, 10_000.0), 40.0, 2
-
-
-@stage("base fit again")
-def from_extension(
-    first: Fit, extension: Extension, experiments: Sequence[Experiment]
-) -> Fit | None:
-    """Fit the base again from an extension's parameters; None where that cannot be simulated."""
-    names, least = first.unknowns.names, BETTER_BASE * first.rms
-    return _moved(first, extension.fit, names, experiments, least)
+_NEAR_BAND, SEEN, _RESONANCES = (300.0, 10_000.0), 40.0, 2
 
 
 @stage("base fit again")
@@ -79,84 +67,73 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
 
 
 @stage("base fit again")
-def from_band(
-    base: Fit, before: Fit, experiments: Sequence[Experiment], progress: Progress
-) -> Fit | None:
-    """Fit the base with resonances near or above the band; None where none explains much more.
+def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
+    """Fit with resonances near or above the band; None where none explains much more.
 
-    `before` is the model with the causes found so far. Steps excite such a resonance, and what a
-    slow record shows of its ringing looks like noise after each step.
+    Steps excite such a resonance, and what a slow record shows of its ringing looks like noise
+    after each step. `before` may hold causes; the mechanics is sought again where it holds none.
     """
     found = before
     for _ in range(_RESONANCES):
-        more = _with_ringing(found, experiments, progress, _SEEN)
+        more = _with_ringing(found, experiments, progress, SEEN)
         if more is None:
             break
         found = more
     if found.rms > _MUCH * before.rms:
         return None
-    resonant = _in_base(base, before, found, experiments)
-    return None if resonant is None else _tuned(resonant, experiments, progress)
+    return found if before.model.effects else _tuned(found, experiments, progress)
 
 
 @stage("base fit again")
-def from_mode(
-    base: Fit,
-    before: Fit,
-    mode: Extension,
-    experiments: Sequence[Experiment],
-    progress: Progress,
+def instead_of_mode(
+    before: Fit, mode: Component, found: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit the base with a resonance of its own where a further mode was found.
+    """Fit with a resonance of the stack's own where a further mode was `found`.
 
-    `before` is the model, perhaps with causes named before, to which the mode was added. A stack
-    that rings near the sampling rate shows a tone at one of its images, |k f_s + f| and
-    |k f_s - f|, which decays as fast: its damping ratio times its frequency is the same. None where
-    no mass explains the data about as well as the mode.
+    `before` is the model to which the mode was added. A stack that rings near the sampling rate
+    shows a tone at one of its images, |k f_s + f| and |k f_s - f|, which decays as fast: its
+    damping ratio times its frequency is the same. None where no mass explains the data about as
+    well as the mode.
     """
     progress("base fit, with the mode as a resonance of the stack's own")
-    found, values = mode.fit.model.values, before.model.values
-    tone, damping = found[mode.effect.tone or ""], found["mode_damping"]
+    values = found.model.values
+    tone, damping = values[mode.tone or ""], values["mode_damping"]
     rate = 1.0 / min(e.record.sample_time for e in experiments)
     near = images(tone, rate, _IMAGES)
-    starts = [m for f in near for m in _masses(values, [f], damping * tone / f)]
-    final = _with_masses(before, starts, experiments, _as_good(mode.fit, _AS_GOOD))
-    if final is None or _short(final, mode.fit) >= _AS_GOOD:
-        return None
-    return _in_base(base, before, final, experiments)
+    starts = [m for f in near for m in _masses(before.model.values, [f], damping * tone / f)]
+    return _with_masses(before, starts, experiments, _as_good(found, _AS_GOOD))
 
 
 @stage("base fit again")
 def instead_of(
-    base: Fit, extension: Extension, experiments: Sequence[Experiment], progress: Progress
+    base: Fit, found: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit the base with resonances of its own where an effect was found.
+    """Fit the base with resonances of its own where an effect was `found`.
 
     None where no masses explain the data about as well as the effect. A resonance above the band
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
     what looks like a further mode.
     """
-    if not rings(extension):
-        found = _with_ringing(base, experiments, progress, least=_as_good(extension.fit, _LIKE))
-        if found is not None and _short(found, extension.fit) < _LIKE:
-            return _tuned(found, experiments, progress)
+    own = _with_ringing(base, experiments, progress, least=_as_good(found, _LIKE))
+    if own is not None and _short(own, found) < _LIKE:
+        return _tuned(own, experiments, progress)
     if not shows_ringing(experiments):
         return None
-    again = retuned(base, experiments, progress, reached=extension.fit.rms)
+    again = retuned(base, experiments, progress, reached=found.rms)
     if _short(base, again) <= _CLEAR:
         return None
-    return without_blur(again, experiments) if _short(again, extension.fit) < _LIKE else None
+    return without_blur(again, experiments) if _short(again, found) < _LIKE else None
 
 
-def rings(extension: Extension) -> bool:
+def rings(effect: Component) -> bool:
     """Whether an effect is a further resonance of the plant."""
-    return extension.effect.tone is not None and extension.effect.belongs_to == "plant"
+    return effect.tone is not None and effect.belongs_to == "plant"
 
 
 def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
     """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
     left = ringing(found, experiments)
-    if left is None or left.decrease >= _SEEN:
+    if left is None or left.decrease >= SEEN:
         found = retuned(found, experiments, progress)
     return without_blur(found, experiments)
 
@@ -169,29 +146,6 @@ def _short(found: Fit, other: Fit) -> float:
 def _as_good(other: Fit, short: float) -> float:
     """Return the rms [m] that falls short of another fit's by n ln(ratio of rms) = `short`."""
     return other.rms * float(np.exp(short / len(other.residuals)))
-
-
-def _in_base(base: Fit, before: Fit, found: Fit, experiments: Sequence[Experiment]) -> Fit | None:
-    """Return the base fitted from where a fit with more masses, and perhaps causes, has led."""
-    if before is base:
-        return found
-    names = [n for n in found.unknowns.names if n in base.model.values]
-    return _moved(base, found, names, experiments)
-
-
-def _moved(
-    base: Fit,
-    found: Fit,
-    names: Sequence[str],
-    experiments: Sequence[Experiment],
-    least: float = np.inf,
-) -> Fit | None:
-    values = {n: found.model.values[n] for n in names}
-    try:
-        moved = replace(base, model=base.model.with_values(values))
-        return refit(moved, experiments, names, least=least)
-    except PsaError:
-        return None
 
 
 def _with_ringing(

@@ -1,0 +1,196 @@
+"""Fit the unnamed corrections beside a model, and say what each would remove.
+
+Beside the fitted model everything is linear: measured - predicted = J d + C w + noise, d the change
+of the model's own parameters, w ~ N(0, (s p)^2) the weights of one correction. The size s is that
+of the largest evidence. The evidence is on the scale of the hypotheses' score.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.corrections.kinds import KINDS, Kind, Signals
+from psa_casadi.diagnosis.noise.colour import Colour, rms
+from psa_casadi.diagnosis.screening.screen import independent, without
+from psa_casadi.diagnosis.task import shows_ringing
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import measured, predict
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.linear_part import linear_part
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Coordinates this near to a bound stay there.
+_AT_BOUND = 1e-6
+#: Sizes s that are tried, over the rms of what the correction may explain.
+_SIZES = np.geomspace(1e-3, 1e3, 25)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """One correction beside a model: evidence over it, what it leaves, and what it adds.
+
+    `predicted` [m] are whole records with the correction, `added` its own part of them; `weights`
+    those of the kind's columns; `holdout_rms` [m] the error in held-out samples; `moved` is how far
+    the model's own theta follows; `copies` the share of what named causes add that it can add as
+    well.
+    """
+
+    kind: Kind
+    evidence: float
+    train_rms: float
+    holdout_rms: float
+    weights: FloatArray
+    predicted: tuple[FloatArray, ...]
+    added: tuple[FloatArray, ...]
+    moved: FloatArray
+    copies: float = 0.0
+
+
+def corrections(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    colour: Colour,
+    named: Sequence[FloatArray] | None = None,
+) -> tuple[Correction, ...]:
+    """Return all corrections beside a fit, the one of the highest evidence first.
+
+    `named` are the predictions [m] of whole records with named causes, for `Correction.copies`.
+    """
+    try:
+        full = predict(
+            fit.model, experiments, fit.unknowns, fit.theta, way=fit.way, everything=True
+        )
+        signals = Signals(experiments, [p.displacement for p in full], _responses(fit, experiments))
+    except PsaError:
+        return ()
+    follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
+    fast = shows_ringing(experiments)
+    found = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
+    if named is not None:
+        found = [replace(c, copies=_copied(c.kind, signals, follow, named)) for c in found]
+    return tuple(sorted(found, key=lambda c: -c.evidence))
+
+
+def _copied(
+    kind: Kind, signals: Signals, follow: "_Following", named: Sequence[FloatArray]
+) -> float:
+    """Return the share of what named causes add that a kind's columns can add as well."""
+    experiments = signals.experiments
+    added = np.concatenate(
+        [(n - p)[e.used] for n, p, e in zip(named, signals.predicted, experiments, strict=True)]
+    )
+    used = np.vstack([kind.columns(signals, k)[e.used] for k, e in enumerate(experiments)])
+    target = follow.beside(added)
+    basis = independent(follow.beside(used))
+    power = float(target @ target)
+    return float(np.sum((basis.T @ target) ** 2)) / power if power > 0 else 0.0
+
+
+class _Following:
+    """The model's own parameters, which follow a correction as far as prior and bounds let them."""
+
+    def __init__(
+        self,
+        fit: Fit,
+        experiments: Sequence[Experiment],
+        colour: Colour,
+        jacobians: Sequence[FloatArray],
+    ) -> None:
+        self.experiments, self.colour = experiments, colour
+        self.whole = jacobians
+        low, high = fit.unknowns.bounds()
+        self.free = free = (fit.theta > low + _AT_BOUND) & (fit.theta < high - _AT_BOUND)
+        self.prior = np.where(np.isfinite(fit.unknowns.prior), fit.unknowns.prior, 1.0)[free]
+        known = np.isfinite(fit.unknowns.prior)[free]
+        self.jacobians = [j[:, free] * self.prior for j in jacobians]
+        self.used = np.vstack([j[e.used] for j, e in zip(self.jacobians, experiments, strict=True)])
+        self.held = np.diag(known.astype(np.float64))
+        white = np.vstack([colour.whiten(self.used) / colour.level, self.held])
+        self.basis = independent(white)
+        self.residuals = fit.residuals
+        self.target = self.beside(fit.residuals)
+
+    def beside(self, columns: FloatArray) -> FloatArray:
+        """Return columns over the noise, whitened, less what the parameters can follow."""
+        white = self.colour.whiten(columns) / self.colour.level
+        none = np.zeros((len(self.held), *columns.shape[1:]))
+        return without(np.concatenate([white, none]), self.basis)
+
+    def moved(self, added: FloatArray) -> FloatArray:
+        """Return the change of theta (size,) with what is added at used samples."""
+        white = self.colour.whiten(self.used) / self.colour.level
+        rest = self.colour.whiten(self.residuals - added) / self.colour.level
+        moved = np.linalg.lstsq(
+            np.vstack([white, self.held]), np.append(rest, np.zeros(len(self.held))), rcond=None
+        )[0]
+        theta = np.zeros(len(self.free))
+        theta[self.free] = self.prior * moved
+        return theta
+
+
+def _correction(kind: Kind, signals: Signals, follow: _Following) -> Correction:
+    experiments = signals.experiments
+    parts = [kind.columns(signals, k) for k in range(len(experiments))]
+    shape = kind.shape(parts[0].shape[1])
+    used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
+    weights, evidence = _weights(follow.beside(used), follow.target)
+    own = tuple(p @ (shape * weights) for p in parts)
+    moved = follow.moved(used @ weights)
+    changes = [j @ moved for j in follow.whole]
+    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, own, strict=True))
+    errors = [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
+    train = rms(np.concatenate([r[e.used] for r, e in zip(errors, experiments, strict=True)]))
+    held = rms(np.concatenate([r[e.held_out] for r, e in zip(errors, experiments, strict=True)]))
+    return Correction(kind, evidence, train, held, weights * shape, predicted, own, moved)
+
+
+def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
+    """Return the posterior mean of w ~ N(0, s^2) and ln of the Bayes factor, s the best one."""
+    n = len(target)
+    u, singular, vt = np.linalg.svd(columns, full_matrices=False)
+    along = u.T @ target
+    power = float(target @ target)
+    best: tuple[float, FloatArray] = (-np.inf, np.zeros(columns.shape[1]))
+    largest = float(np.max(singular, initial=0.0))
+    if largest <= 0.0 or power <= 0.0:
+        return best[1], 0.0
+    for size in _SIZES:
+        # the ratio of prior and noise, on the scale of the largest direction
+        ratio = (size / largest) ** 2 * n
+        shrunk = ratio * singular**2 / (1.0 + ratio * singular**2)
+        left = power - float(np.sum(shrunk * along**2))
+        log_ratio = -0.5 * n * np.log(left / power) - 0.5 * float(
+            np.sum(np.log1p(ratio * singular**2))
+        )
+        if log_ratio > best[0]:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                scaled = np.where(singular > 1e-12 * largest, shrunk / singular, 0.0) * along
+            best = (log_ratio, vt.T @ scaled)
+    return best[1], max(best[0] - float(np.log(len(_SIZES))), 0.0) if best[0] > 0 else best[0]
+
+
+def _responses(fit: Fit, experiments: Sequence[Experiment]):  # type: ignore[no-untyped-def]
+    """Return the filter of the plant from force to displacement, for records that show it."""
+    if not shows_ringing(experiments):
+        return lambda k, x: x
+    try:
+        part = linear_part(fit.model)
+        rest = part.response(np.zeros(1))[0]
+    except (PsaError, np.linalg.LinAlgError):
+        return lambda k, x: x
+
+    def respond(k: int, columns: FloatArray) -> FloatArray:
+        step, n = experiments[k].record.sample_time, len(columns)
+        pad = min(n, 4000)
+        long = np.concatenate([np.repeat(columns[:1], pad, axis=0), columns,
+                               np.repeat(columns[-1:], pad, axis=0)])  # fmt: skip
+        omega: FloatArray = np.asarray(2.0 * np.pi * np.fft.rfftfreq(len(long), step), dtype=float)
+        response = part.response(omega) / rest
+        out = np.fft.irfft(np.fft.rfft(long, axis=0) * response[:, None], len(long), axis=0)
+        return np.asarray(out[pad : pad + n])
+
+    return respond

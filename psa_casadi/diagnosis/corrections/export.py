@@ -1,0 +1,85 @@
+"""The unnamed correction as a component of the model, its weights fitted like any parameter."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.corrections.kinds import LONGEST, PER_DECADE
+from psa_casadi.diagnosis.corrections.patch import Patch
+from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.stepper import SimulationError
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Evaluations of the fit.
+_EVALUATIONS = 30
+
+
+def with_patch(
+    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> Fit:
+    """Return a fit with the correction beside the model, begun with the weights that it has.
+
+    The model's own values begin where they follow the correction, and where they were.
+
+    `predicted` [m] are the predictions of `before`. Raises InputError for a kind that no component
+    stands for, SimulationError where it cannot be simulated.
+    """
+    component = PATCHES.get((patch.kind, patch.port))
+    if component is None:
+        raise InputError(
+            f"The unnamed correction ({patch.name}) has no form that a model could hold; the page"
+            " shows it, and a further mode of the table is the nearest that can be fitted."
+        )
+    numbers = _numbers(before, patch, experiments, predicted)
+    names = [weight(k + 1) for k in range(len(patch.weights))]
+    values = {**numbers, GAIN: 1.0, **dict(zip(names, patch.weights.tolist(), strict=True))}
+
+    def begun(theta: FloatArray) -> Fit:
+        unknowns = before.unknowns
+        return fit(
+            before.model.with_effect(component, {**values, **unknowns.values(theta)}),
+            experiments,
+            [*unknowns.names, *names],
+            sigma=before.sigma,
+            start_states=[unknowns.start(theta, r) for r in range(unknowns.records)],
+            evaluations=_EVALUATIONS,
+        )
+
+    found = []
+    for theta in (before.theta + patch.moved, before.theta):
+        with suppress(SimulationError):
+            found.append(begun(theta))
+    if not found:
+        raise SimulationError("The model cannot be simulated with the unnamed correction.")
+    return min(found, key=lambda f: f.cost)
+
+
+def _numbers(
+    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> Mapping[str, float]:
+    """Return the parameters that are not fitted: the range, times."""
+    records = [e.record for e in experiments]
+    shortest, longest = min(r.sample_time for r in records), max(r.duration for r in records)
+    if patch.kind in ("direction", "memory") or patch.port == "drive voltage":
+        ends = [f(r.voltage) for f, r in ((f, r) for f in (np.min, np.max) for r in records)]
+    else:
+        moved = [y - before.offset(k) for k, y in enumerate(predicted)]
+        ends = [f(y) for f, y in ((f, y) for f in (np.min, np.max) for y in moved)]
+    numbers = {"patch_low": float(np.min(ends)), "patch_high": float(np.max(ends))}
+    if patch.kind == "time":
+        return {"patch_time": longest}
+    if patch.kind == "gain in time":
+        return {**numbers, "patch_time": longest}
+    if patch.kind == "relaxation":
+        count = max(2, round(PER_DECADE * float(np.log10(LONGEST * longest / shortest))))
+        ratio = (LONGEST * longest / shortest) ** (1.0 / (count - 1))
+        if count > RELAXATIONS:
+            raise InputError("The records span more decades of time than a correction can hold.")
+        return {**numbers, "patch_time": shortest, "patch_ratio": ratio}
+    return numbers

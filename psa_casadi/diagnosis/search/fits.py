@@ -1,0 +1,185 @@
+"""Fits of neighbours: one more cause, one less, another one in its place; and fits to the end."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.screening.screen import Copy, Score
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis
+from psa_casadi.diagnosis.search.quick_fits import QUICK, continued, fit_from, quick_fit
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
+from psa_casadi.identification.search.refitting import quick_rtol, refit
+from psa_casadi.identification.start.ordinary import ordinary_values
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.side_by_side import side_by_side
+
+#: Evaluations of quick fits beside other causes, and of those afresh that go on; of these the best
+#: so many of one effect, and of any; there the gain begins at so many ordinary sizes.
+_BESIDE, _AFRESH = 12, 17
+_CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
+#: Tolerance of stepper and fit, and evaluations, to the end.
+_POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
+
+
+def with_cause(
+    before: Hypothesis, experiments: Sequence[Experiment], scores: Sequence[Score]
+) -> Hypothesis | None:
+    """Fit quickly with one more cause from its best directions; None if every fit fails."""
+    effect = scores[0].direction.effect
+    starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
+    quick = quick_fit(before.fit, experiments, effect, starts, {})
+    return hypothesis((*before.causes, effect), quick, experiments)
+
+
+def afresh(
+    before: Hypothesis, experiments: Sequence[Experiment], first: Hypothesis
+) -> Hypothesis | None:
+    """Fit the last cause of a hypothesis again from an ordinary base and gains of both signs.
+
+    A base fit without the effect has bent its loop and its lags to imitate it, and may hold the
+    search there. Where the gain acts by thresholds or lags, it starts at their steps as well.
+    """
+    effect = first.causes[-1]
+    fits = _from_ordinary(before.fit, experiments, effect, first.fit.model.values)
+    return hypothesis(first.causes, _best_continued(fits, experiments, _CONTINUED), experiments)
+
+
+def any_afresh(
+    before: Hypothesis, experiments: Sequence[Experiment], scores: Sequence[Score]
+) -> Hypothesis | None:
+    """Fit the effects of the scores afresh; return the best of all."""
+    found = side_by_side(
+        lambda d: _from_ordinary(before.fit, experiments, d.effect, d.values),
+        [score.direction for score in scores],
+    )
+    final = _best_continued([f for own in found for f in own], experiments, _CONTINUED_ANY)
+    if final is None:
+        return None
+    effect = next(e for e in final.model.components if e not in before.fit.model.components)
+    return hypothesis((*before.causes, effect), final, experiments)
+
+
+def in_place(
+    whole: Hypothesis,
+    less: Hypothesis,
+    reached: Fit,
+    own: Fit,
+    effect: Component,
+    experiments: Sequence[Experiment],
+) -> Hypothesis | None:
+    """Fit an effect beside the causes of `less`, where the `whole` has another one.
+
+    The effect begins with its values in its `own` fit, the rest with those that were `reached`;
+    what `reached` does not have stays as in `less`.
+    """
+    other, values = reached.model.values, own.model.values
+    start = (
+        {p.name: values[p.name] for p in effect.parameters if p.name != effect.gain},
+        values[effect.gain or ""],
+        tuple({**s, **r} for s, r in zip(own.starts(), reached.starts(), strict=True)),
+    )
+    base = {n: other[n] for n in less.fit.unknowns.names if n in other}
+    causes = tuple(effect if c not in less.causes else c for c in whole.causes)
+    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE)
+    return hypothesis(causes, quick, experiments)
+
+
+def like(
+    whole: Hypothesis,
+    less: Hypothesis,
+    copy: Copy,
+    experiments: Sequence[Experiment],
+) -> Hypothesis | None:
+    """Fit an effect that could copy a cause of the `whole`, from where that has led the base.
+
+    `less` is the hypothesis without the cause; its base is bent to imitate it. The effect begins
+    with the gain that copies best.
+    """
+    effect, direction = copy.direction.effect, copy.direction
+    values = whole.fit.model.values
+    base = {n: values[n] for n in less.fit.unknowns.names if n in values}
+    usable = copy.gain > 0 or not direction.one_sided
+    start = (direction.values, copy.gain if usable else direction.unit_gain, direction.memory)
+    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE)
+    causes = tuple(effect if c not in less.causes else c for c in whole.causes)
+    return hypothesis(causes, quick, experiments)
+
+
+def without(
+    whole: Hypothesis, cause: Component, experiments: Sequence[Experiment]
+) -> Hypothesis | None:
+    """Fit without a cause from where the whole has led; None where that cannot be simulated."""
+    model = whole.fit.model.without([cause.name])
+    names = [n for n in whole.fit.unknowns.names if n in model.values]
+    try:
+        found = refit(replace(whole.fit, model=model), experiments, names)
+    except PsaError:
+        return None
+    causes = [c for c in whole.causes if c is not cause]
+    return hypothesis(causes, found, experiments, final=True)
+
+
+def together(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+    """Fit all parameters once more, weighted by the noise that the residuals now suggest."""
+    try:
+        found = refit(of.fit, experiments, of.fit.unknowns.names)
+    except PsaError:
+        return None
+    return hypothesis(of.causes, found, experiments, final=True)
+
+
+def to_end(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis:
+    """Continue a fit until it converges, loosely first, then at full tolerance."""
+    current = of.fit
+    loosest = quick_rtol(current.sigma, experiments)
+    for rtol, tolerance, evaluations in _POLISHING:
+        try:
+            current = continued(current, experiments, min(rtol, loosest), tolerance, evaluations)
+        except PsaError:
+            return ended(of)
+    return hypothesis(of.causes, current, experiments, final=True) or ended(of)
+
+
+def _from_ordinary(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    effect: Component,
+    known: Mapping[str, float],
+) -> list[Fit]:
+    """Quick fits from an ordinary base and gains; forms and frequencies are the `known` ones."""
+    gain = next(p for p in effect.parameters if p.name == effect.gain)
+    size = gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
+    sizes = [_ORDINARY, *(s for s in effect.finite_step if s > _ORDINARY)]
+    if gain.bounds[0] < 0:
+        sizes.append(-_ORDINARY)
+    values = {
+        n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
+        for n, grid in effect.probe.items()
+    }
+    ordinary = ordinary_values(before.model, [e.record for e in experiments])
+    starts = [(values, s * size, tuple(before.starts())) for s in sizes]
+    found = side_by_side(
+        lambda s: fit_from(before, experiments, effect, s, ordinary, QUICK), starts
+    )
+    return [f for f in found if f is not None]
+
+
+def _best_continued(
+    fits: Sequence[Fit], experiments: Sequence[Experiment], count: int
+) -> Fit | None:
+    """Go on with the best so many fits; return the best then."""
+
+    def further(quick: Fit) -> Fit:
+        try:
+            rtol = quick_rtol(quick.sigma, experiments)
+            return continued(quick, experiments, rtol, 1e-3, _AFRESH)
+        except PsaError:
+            return quick
+
+    best = sorted(fits, key=lambda f: f.cost)[:count]
+    return min([*fits, *side_by_side(further, best)], key=lambda f: f.cost, default=None)
+
+
+def _declared(effect: Component, name: str) -> float:
+    return next(p.value for p in effect.parameters if p.name == name)

@@ -1,0 +1,108 @@
+"""A hypothesis: a model with a set of causes, fitted; and the one score that all are compared by.
+
+    score = ln B - price * causes
+    ln B  = n/2 ln(S_0 / S) - 1/2 ln det(1 + P H P)
+
+Laplace's approximation of the Bayes factor over the plain base fit. S and S_0 are sums of squares
+of the whitened residuals, the noise level being the data's own; H is the information on the
+unknowns that the base has not, those it has projected out, and P their prior standard deviations.
+An unknown that the data do not tell costs nothing, a sharp one costs what its prior range is wider
+than its interval (MacKay, Neural Computation 4 (1992), 415). The price is the prior of a cause.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.held_out.errors import held_out_rms, whole_residuals
+from psa_casadi.diagnosis.noise.colour import Colour, rms
+from psa_casadi.diagnosis.screening.evidence import evidence
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.records.split import Experiment
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A model with some causes beside the base, fitted to the records.
+
+    `causes` are in the order in which the search found them; `predicted` [m] are the predictions of
+    whole records, `holdout_rms` and `whole_rms` [m] the errors in held-out and in all samples;
+    `final` says that the fit went on to its end.
+    """
+
+    causes: tuple[Component, ...]
+    fit: Fit
+    predicted: tuple[FloatArray, ...]
+    holdout_rms: float
+    whole_rms: float
+    final: bool = False
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the causes."""
+        return frozenset(c.name for c in self.causes)
+
+    @property
+    def power(self) -> float:
+        """Mean square of the residuals [m^2]."""
+        return self.fit.rms**2
+
+    def removes(self, before: "Hypothesis") -> float:
+        """Power [m^2] that it takes from the residual of another one."""
+        return before.power - self.power
+
+    def share(self, before: "Hypothesis", root: "Hypothesis") -> float:
+        """What it takes from another one's error over whole records, over what that one takes."""
+        taken = root.whole_rms**2 - before.whole_rms**2
+        more = before.whole_rms**2 - self.whole_rms**2
+        return more / taken if taken > 0 else np.inf
+
+
+def hypothesis(
+    causes: Sequence[Component],
+    fit: Fit | None,
+    experiments: Sequence[Experiment],
+    *,
+    final: bool = False,
+) -> Hypothesis | None:
+    """Return a fit as a hypothesis; None without a fit, or where it cannot predict the records."""
+    if fit is None:
+        return None
+    try:
+        predicted = tuple(fit.predicted(experiments))
+    except PsaError:
+        return None
+    held = held_out_rms(experiments, predicted)
+    whole = rms(np.concatenate(whole_residuals(experiments, predicted)))
+    return Hypothesis(tuple(causes), fit, predicted, held, whole, final=final)
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """What hypotheses are compared by: the plain base fit, the colour of the noise, the price."""
+
+    base: Fit
+    colour: Colour
+    price: float
+    _known: dict[Fit, float] = field(init=False, default_factory=dict)
+
+    def evidence(self, of: Hypothesis) -> float:
+        """Ln of the Bayes factor over the plain base."""
+        if of.fit not in self._known:
+            self._known[of.fit] = evidence(self.base, of.fit, self.colour)
+        return self._known[of.fit]
+
+    def score(self, of: Hypothesis) -> float:
+        """Evidence less the price of the causes."""
+        return self.evidence(of) - self.price * len(of.causes)
+
+
+def ended(of: Hypothesis) -> Hypothesis:
+    """Return a hypothesis whose fit cannot go on."""
+    return replace(of, final=True)

@@ -1,0 +1,140 @@
+"""What a fitted hypothesis still shows: the screening of further effects, the residual's test."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.noise.colour import noise_rms, residual_colour
+from psa_casadi.diagnosis.noise.floor import knowable_of, known_colour
+from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
+from psa_casadi.diagnosis.screening.evidence import estimated
+from psa_casadi.diagnosis.screening.probes import Direction, directions
+from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.simulation.timings import stage
+
+#: An effect whose screening score is below this share of the best one is not fitted; so many of
+#: the others are, more of them where their scores are this close to the best one's; and so many
+#: starts each gets.
+_WORTH, _LEADING, _MOST, _AS_NEAR, _STARTS = 0.1, 4, 7, 0.4, 2
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the residual of a hypothesis shows.
+
+    `of` is the hypothesis as it was seen, `trials` the directions of further effects there,
+    `screening` their scores with the colour of the noise, `test` the omnibus test.
+    """
+
+    of: Hypothesis
+    trials: tuple[Direction, ...]
+    screening: Screening
+    test: Omnibus
+
+    @property
+    def decrease(self) -> float:
+        """Decrease of the whitened sum of squares along the best direction, over the variance."""
+        return max((s.decrease for s in self.screening.scores), default=0.0)
+
+    @property
+    def promise(self) -> float:
+        """Power [m^2] that the best direction would remove, linearly estimated."""
+        return self.decrease * self.screening.colour.level**2 / len(self.of.fit.residuals)
+
+    @property
+    def shows(self) -> bool:
+        """Whether a direction is above the threshold and would remove what can be told of a stack.
+
+        Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
+        """
+        seen = self.decrease >= self.screening.threshold and self.promise > self.test.knowable**2
+        return seen and (self.test.alarm or not self.of.causes)
+
+    def estimated(self) -> dict[str, float]:
+        """Evidence of every further effect over this hypothesis, without a fit."""
+        return estimated(self.of.fit, self.screening)
+
+    def leading(self) -> list[list[Score]]:
+        """Return the best starts of the effects worth a fit, the best effect first."""
+        best = self.screening.best_by_effect()
+        if not best:
+            return []
+        top = next(iter(best.values())).decrease
+        limit = max(self.screening.threshold, _WORTH * top)
+        near = [s for s in best.values() if s.decrease >= max(limit, _AS_NEAR * top)]
+        count = max(_LEADING, min(len(near), _MOST))
+        chosen = [name for name, score in best.items() if score.decrease >= limit][:count]
+        return [self.starts_of(name) for name in chosen]
+
+    def starts_of(self, name: str) -> list[Score]:
+        """Return the best directions of one effect, from which its fits start.
+
+        Of an effect that has two forms, between which no fit moves, each form gets a start.
+        """
+        own = [s for s in self.screening.scores if s.direction.effect.name == name]
+        near = [s for s in own if s.decrease >= 0.3 * own[0].decrease]
+        starts: list[Score] = []
+        for score in near:
+            if all(_form(score) != _form(s) for s in starts):
+                starts.append(score)
+        for score in near:
+            known = [s.direction.values for s in starts]
+            new = score.direction.values not in known or score.direction.finite
+            if new and score not in starts and len(starts) < _STARTS:
+                starts.append(score)
+        return starts
+
+
+@stage("screening")
+def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View:
+    """Screen the effects that a hypothesis does not hold yet, and test its residual.
+
+    Directions that are `known` from the base are used again: what an effect adds hardly changes
+    with another effect beside it, and a full fit judges.
+    """
+    task.progress("screening effects")
+    fit, experiments = of.fit, task.experiments
+    table = [e for e in task.table if e not in fit.model.components]
+    kept = [d for d in known if d.effect in table]
+    if known:
+        lines = [e for e in table if e.tone is not None]  # the residual's lines are new ones
+        kept = [d for d in kept if d.effect not in lines] + _directions(fit, task, lines)
+    else:
+        kept = _directions(fit, task, table)
+    screening = _screened(fit, kept, task)
+    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    time = np.concatenate([e.record.time[e.used] for e in experiments])
+    test = omnibus(
+        fit.residuals,
+        voltage,
+        time,
+        screening.colour,
+        noise_rms(fit.residuals, screening.colour),
+        knowable=knowable_of(fit, experiments),
+        even=bool(of.causes),
+    )
+    return View(of, tuple(kept), screening, test)
+
+
+def _form(score: Score) -> dict[str, float]:
+    direction = score.direction
+    return {n: v for n, v in direction.values.items() if n not in direction.effect.fitted}
+
+
+def _directions(fit: Fit, task: Task, effects: Sequence[Component]) -> list[Direction]:
+    finite = "finite steps" not in task.method.without
+    return directions(fit, task.experiments, effects, finite_steps=finite)
+
+
+def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
+    lengths = [int(e.used.sum()) for e in task.experiments]
+    residuals = fit.residuals_of(task.experiments)
+    known = [known_colour(e.record, r) for e, r in zip(task.experiments, residuals, strict=True)]
+    if "remainder" in task.method.without:
+        return screen(fit, trials, lengths, colour=residual_colour(fit.residuals, lengths))
+    return screen(fit, trials, lengths, known)

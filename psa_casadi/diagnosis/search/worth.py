@@ -1,0 +1,69 @@
+"""Which hypotheses may be the answer: what a cause must remove, and what held-out data must say."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis
+from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.records.drive import among_harmonics
+from psa_casadi.records.split import Experiment
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def confirmed(
+    of: Hypothesis,
+    before: Hypothesis,
+    experiments: Sequence[Experiment],
+    colour: Colour,
+    *,
+    alarm: bool,
+) -> bool:
+    """Whether held-out samples do not speak against what a hypothesis adds to another one.
+
+    A change of prediction with the sum of squares D promises a gain of the log-likelihood of
+    p = D/2 over the noise's power, give or take sqrt(2 p). Found must be `held_out`, or, where the
+    residual's test gives an `alarm` and these samples can hardly show the cause, two such errors
+    less than what is promised.
+    """
+    held = np.concatenate([e.held_out for e in experiments])
+    if not np.any(held):
+        return True
+    change = np.concatenate(
+        [(new - old) for new, old in zip(of.predicted, before.predicted, strict=True)]
+    )[held]
+    samples = np.count_nonzero(held) / colour.inflation
+    after = max(of.holdout_rms, 1e-300)
+    gained = samples * float(np.log(max(before.holdout_rms, 1e-300) / after))
+    if not alarm:
+        return bool(gained > thresholds().held_out)
+    promise = 0.5 * samples * float(np.mean(change**2)) / after**2
+    return bool(gained > min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise))))
+
+
+def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
+    """Whether the data ask for this effect and not for something else.
+
+    Not with a parameter pushed to the end of its range, or a tone among the harmonics of a
+    periodic drive.
+    """
+    values = fit.model.values
+    tone = cause.tone
+    if tone is not None and any(among_harmonics(values[tone], e.record) for e in experiments):
+        return False
+    for p in cause.parameters:
+        if not p.fitted or p.name == cause.gain:
+            continue
+        low, high = p.bounds
+        margin = 1e-3 * (high - low) if not p.log else 0.0
+        value = values[p.name]
+        if p.log and (value < 1.01 * low or value > high / 1.01):
+            return False
+        if not p.log and (value <= low + margin or value >= high - margin):
+            return False
+    return True

@@ -1,0 +1,204 @@
+"""Unnamed corrections as components: generic forms with fitted weights, at a port of the stack.
+
+They are no effects and in no search: a diagnosis offers one where nothing named explains the data,
+and writes it on request. What it stands for is not known, so that nothing may be concluded from its
+parameters; outside of the range of its records it means nothing.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import casadi as ca
+
+from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.effects.hysteresis_memory import stop_rate
+from psa_casadi.effects.sizes import static_stiffness
+from psa_casadi.scales import stroke_scale, voltage_scale
+from psa_casadi.variables import Parameter, State, Values
+
+#: Terms of a curve and of one for each direction or over time; play and stop elements; relaxations.
+CURVE, BRANCH, ELEMENTS, RELAXATIONS = 24, 8, 10, 16
+#: Share of the voltage's range over which a branch changes to the other one.
+NARROW = 0.01
+GAIN = "patch_gain"
+_SOURCE = "a form without a name, fitted to records: Prandtl-Ishlinskii elements, cosines, lags"
+
+
+def weight(index: int) -> str:
+    """Return the name of a weight, counted from 1."""
+    return f"patch_w{index}"
+
+
+def radius(index: int) -> float:
+    """Return the threshold of a play over the range of the voltage; `index` counts from 0."""
+    return (index + 0.5) / (1.5 * ELEMENTS)
+
+
+def _weights(s: Symbols, count: int) -> list[Expression]:
+    return [getattr(s, weight(k + 1)) for k in range(count)]
+
+
+def _cosines(s: Symbols, q: Expression, first: int, count: int) -> Expression:
+    terms = [w * ca.cos(ca.pi * (first + k) * q) for k, w in enumerate(_weights(s, count))]
+    return s.patch_gain * sum(terms)
+
+
+def _place(s: Symbols, value: Expression) -> Expression:
+    return (value - s.patch_low) / (s.patch_high - s.patch_low)
+
+
+def _at_reading(s: Symbols) -> Equations:
+    curve = _cosines(s, _place(s, s.displacement), 1, CURVE)
+    return Equations(add={"measured_displacement": curve})
+
+
+def _at_voltage(s: Symbols) -> Equations:
+    curve = _cosines(s, _place(s, s.u), 1, CURVE)
+    return Equations(add={"free_force": static_stiffness(s) * curve})
+
+
+def _at_force(s: Symbols) -> Equations:
+    moved = (s.k_L * s.u + s.f_H) / static_stiffness(s)
+    curve = _cosines(s, _place(s, moved), 1, CURVE)
+    return Equations(add={"free_force": static_stiffness(s) * curve})
+
+
+def _direction(s: Symbols) -> Equations:
+    narrow = NARROW * (s.patch_high - s.patch_low)
+    curve = _cosines(s, _place(s, s.u), 0, BRANCH)
+    return Equations(
+        der={"z_p1": stop_rate(s, s.z_p1, narrow)},
+        add={"free_force": static_stiffness(s) * s.z_p1 / narrow * curve},
+    )
+
+
+def _memory(s: Symbols) -> Equations:
+    span, q = s.patch_high - s.patch_low, _place(s, s.u)
+    stops = [getattr(s, f"z_p{k + 1}") for k in range(ELEMENTS)]
+    weights = _weights(s, 2 * ELEMENTS)
+    total = sum(w * z / span for w, z in zip(weights[:ELEMENTS], stops, strict=True))
+    total += sum(w * (q - z / span) ** 2 for w, z in zip(weights[ELEMENTS:], stops, strict=True))
+    return Equations(
+        der={f"z_p{k + 1}": stop_rate(s, z, radius(k) * span) for k, z in enumerate(stops)},
+        add={"free_force": static_stiffness(s) * s.patch_gain * total},
+    )
+
+
+def _relaxation(s: Symbols) -> Equations:
+    span = s.patch_high - s.patch_low
+    lags = [getattr(s, f"z_p{k + 1}") for k in range(RELAXATIONS)]
+    x = s.tip_displacement
+    total = sum(w * (z - x) for w, z in zip(_weights(s, RELAXATIONS), lags, strict=True))
+    return Equations(
+        der={
+            f"z_p{k + 1}": (x - z) / (s.patch_time * s.patch_ratio**k) for k, z in enumerate(lags)
+        },
+        add={"displacement": s.patch_gain * total / span},
+    )
+
+
+def _in_time(s: Symbols) -> Equations:
+    curve = _cosines(s, s.time / s.patch_time, 1, BRANCH)
+    return Equations(add={"measured_displacement": curve})
+
+
+def _gain_in_time(s: Symbols) -> Equations:
+    curve = _cosines(s, s.time / s.patch_time, 1, BRANCH)
+    return Equations(add={"displacement": _place(s, s.tip_displacement) * curve})
+
+
+def _size(p: Values) -> float:
+    return 1e-3 * stroke_scale(p)
+
+
+def _parameters(count: int, unit: str = "") -> tuple[Parameter, ...]:
+    gain = Parameter(GAIN, 0.0, "1", (0.0, 1.0), "1 with the correction, 0 without", fitted=False)
+    weights = [
+        Parameter(weight(k + 1), 0.0, "m", (-1.0, 1.0), f"weight of term {k + 1}", scale=_size)
+        for k in range(count)
+    ]
+    if not unit:
+        return (gain, *weights)
+    ends = [
+        Parameter(f"patch_{end}", value, unit, (-1e6, 1e6), f"{end} end of the records' range",
+                  fitted=False)
+        for end, value in (("low", 0.0), ("high", 1.0 if unit == "V" else 1e-5))
+    ]  # fmt: skip
+    return (gain, *ends, *weights)
+
+
+def _time(name: str, text: str) -> Parameter:
+    return Parameter(name, 1.0, "s", (1e-9, 1e9), text, log=True, fitted=False)
+
+
+_RATIO = Parameter(
+    "patch_ratio", 10**0.5, "1", (1.0, 1e3), "from one time constant to the next", fitted=False
+)
+
+
+def _states(
+    count: int, unit: str, scale: Callable[[Values], float], *, settles: bool
+) -> tuple[State, ...]:
+    return tuple(
+        State(f"z_p{k + 1}", unit, f"element {k + 1}", scale, memory=True, settles=settles)
+        for k in range(count)
+    )
+
+
+def _patch(
+    kind: str,
+    port: str,
+    equations: Callable[[Symbols], Equations],
+    parameters: Sequence[Parameter],
+    states: tuple[State, ...] = (),
+) -> Component:
+    return Component(
+        name=f"patch_{kind}_{port}".replace(" ", "_"),
+        description=f"unnamed correction: {kind} at the {port}",
+        source=_SOURCE,
+        gain=GAIN,
+        parameters=tuple(parameters),
+        states=states,
+        equations=equations,
+        belongs_to="sensor" if port == "reading" else "plant",
+        looks_like="what no effect of the table describes",
+    )
+
+
+#: The corrections by kind and port.
+PATCHES: Mapping[tuple[str, str], Component] = {
+    ("curve", "reading"): _patch("curve", "reading", _at_reading, _parameters(CURVE, "m")),
+    ("curve", "drive voltage"): _patch(
+        "curve", "drive voltage", _at_voltage, _parameters(CURVE, "V")
+    ),
+    ("curve", "force"): _patch("curve", "force", _at_force, _parameters(CURVE, "m")),
+    ("direction", "force"): _patch(
+        "direction",
+        "force",
+        _direction,
+        _parameters(BRANCH, "V"),
+        _states(1, "V", voltage_scale, settles=False),
+    ),
+    ("memory", "force"): _patch(
+        "memory",
+        "force",
+        _memory,
+        _parameters(2 * ELEMENTS, "V"),
+        _states(ELEMENTS, "V", voltage_scale, settles=False),
+    ),
+    ("relaxation", "force"): _patch(
+        "relaxation",
+        "force",
+        _relaxation,
+        (*_parameters(RELAXATIONS, "m"), _time("patch_time", "first time constant"), _RATIO),
+        _states(RELAXATIONS, "m", stroke_scale, settles=True),
+    ),
+    ("time", "reading"): _patch(
+        "time", "reading", _in_time, (*_parameters(BRANCH), _time("patch_time", "duration"))
+    ),
+    ("gain in time", "force"): _patch(
+        "gain in time",
+        "force",
+        _gain_in_time,
+        (*_parameters(BRANCH, "m"), _time("patch_time", "duration")),
+    ),
+}

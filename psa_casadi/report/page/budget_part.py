@@ -1,0 +1,30 @@
+"""The part of a page that says where the error goes, with the unnamed correction's picture."""
+
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.plots.patch_plot import patch_plot
+from psa_casadi.report.words.budget_words import budget_table, patch_text
+from psa_casadi.report.words.phrases import length_scale
+
+
+def add_budget(page: Document, d: Diagnosis) -> None:
+    """Add the error budget, and what the unnamed correction adds."""
+    b = d.budget
+    if b is None or b.excess_rms_m <= 0.0:
+        return
+    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
+    scale = length_scale(b.excess_rms_m, counts=counts)
+    page.section("Where the error goes")
+    page.paragraph(
+        f"The base model's held-out error above the noise is {scale.text(b.excess_rms_m)} rms."
+        " Shares are of its power; each cause's is what the model fitted again without it would"
+        " leave more."
+    )
+    page.table(budget_table(d, scale))
+    if d.patch is None:
+        return
+    beside = "beyond the named causes" if d.causes else "that no effect of the table describes"
+    text = patch_text(d.patch)
+    page.paragraph(f"What is missing {beside} is best described by {text}. It has no name.")
+    coordinate, plot = patch_plot(d, d.patch)
+    page.picture(Picture(f"Unnamed correction: {d.patch.name}, over the {coordinate}", plot))

@@ -1,0 +1,116 @@
+"""The benchmark `ablation`: the method without each of its steps, with each constant moved."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from psa_casadi.diagnosis.task import STEPS, Method
+from psa_casadi.diagnosis.thresholds import Thresholds
+from psa_casadi.report.words.tables import Table
+from tests.benchmarks.hidden import diagnose_all
+from tests.benchmarks.hidden_cases import Case, Found, study
+from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.plants.table import FOREIGN, KNOWN
+
+#: The first of the seeds, which no other benchmark uses.
+FIRST = 770901
+#: Of a study with one seed for each effect every so manyth case of a kind is repeated.
+_EVERY = {"known": 2, "weak": 4, "clean": 2, "ringing": 1, "foreign": 2, "left out": 3, "two": 1}
+
+Diagnosed = Callable[[Sequence[Case], Method], Sequence[Found]]
+
+
+def run(progress: Progress, quick: bool) -> Outcome:
+    """Diagnose the same cases without each step, then with each constant halved and doubled."""
+
+    def diagnosed(cases: Sequence[Case], method: Method) -> Sequence[Found]:
+        return diagnose_all(cases, progress, method)
+
+    cases = chosen_cases(4 if quick else 1)
+    whole = diagnosed(cases, Method())
+    tables = [ablation_table("Without a step", without_steps(), whole, diagnosed)]
+    if not quick:
+        moved = ablation_table("With a constant moved", moved_constants(), whole, diagnosed)
+        tables.append(moved)
+    return Outcome(tuple(tables))
+
+
+def chosen_cases(step: int) -> list[Case]:
+    """Return the cases that are repeated, every so manyth of those of the whole benchmark."""
+    seen: Counter[str] = Counter()
+    kept = []
+    for case in study(KNOWN, FOREIGN, 1, FIRST):
+        every = _EVERY.get(case.kind)
+        if every is not None and seen[case.kind] % (every * step) == 0:
+            kept.append(case)
+        seen[case.kind] += 1
+    return kept
+
+
+def without_steps() -> dict[str, Method]:
+    """Return the method without each of its steps."""
+    return {f"without {step}": Method(frozenset({step})) for step in STEPS}
+
+
+def moved_constants() -> dict[str, Method]:
+    """Return the method with each constant halved and doubled."""
+    moved = {}
+    for f in fields(Thresholds):
+        value = getattr(Thresholds(), f.name)
+        for factor in (0.5, 2.0):
+            other = max(1, round(factor * value)) if isinstance(value, int) else factor * value
+            if other == value or (f.name == "credible" and factor > 1.0):
+                continue
+            constants = replace(Thresholds(), **{f.name: other})
+            moved[f"{f.name} = {other:g}"] = Method(thresholds=constants)
+    return moved
+
+
+def ablation_table(
+    title: str, methods: dict[str, Method], whole: Sequence[Found], diagnosed: Diagnosed
+) -> TitledTable:
+    """Return what each method says of the cases beside the whole method."""
+    rows = [("the method", *figures(whole), "")]
+    for name, method in methods.items():
+        found = diagnosed([f.case for f in whole], method)
+        rows.append((name, *figures(found), changed(whole, found)))
+    head = ("method", "right in the set", "right alone", "wrong alone", "clean named",
+            "port of the patch removes", "s each", "verdicts changed")  # fmt: skip
+    note = (
+        f"{len(whole)} cases. Right: hidden effects of the table, weak ones and pairs too. Wrong"
+        " alone: `cause_named` without the cause, foreign and left out ones too. The patch's share"
+        " is the median over foreign and left out causes that are not named."
+    )
+    return TitledTable(title, Table(head, tuple(rows)), note)
+
+
+def figures(found: Sequence[Found]) -> tuple[str, ...]:
+    """Return the figures of one method."""
+    hidden = [f for f in found if f.case.kind in ("known", "weak", "two") and f.reached]
+    clean = [f for f in found if f.case.kind in ("clean", "ringing")]
+    open_ones = [f for f in found if f.case.kind in ("foreign", "left out") and not f.named]
+    wrong = [f for f in found if f.alone and f.alone not in (f.case.effect, f.case.second)]
+    patched = float(np.median([f.patched for f in open_ones])) if open_ones else 0.0
+    return (
+        f"{sum(_within(f) for f in hidden)} of {len(hidden)}",
+        f"{sum(f.right_alone for f in hidden)} of {len(hidden)}",
+        f"{len(wrong)} of {len(found)}",
+        f"{sum(bool(f.named) for f in clean)} of {len(clean)}",
+        f"{100.0 * patched:.0f} % of {len(open_ones)}",
+        f"{np.mean([f.seconds for f in found]):.1f}",
+    )
+
+
+def changed(whole: Sequence[Found], found: Sequence[Found]) -> str:
+    """Return how many verdicts or sets of names differ from the whole method's."""
+    by_case = {f.case: f for f in found}
+    pairs = [(f, by_case[f.case]) for f in whole]
+    count = sum(a.verdict != b.verdict or set(a.within) != set(b.within) for a, b in pairs)
+    return f"{count} of {len(pairs)}"
+
+
+def _within(f: Found) -> bool:
+    causes = {c for c in (f.case.effect, f.case.second) if c is not None}
+    return causes <= set(f.within)

@@ -1,0 +1,170 @@
+"""Unnamed corrections find their own kind and port, keep silent on noise, and weigh on names."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psa_casadi.components import BASE
+from psa_casadi.diagnosis.budget import budget
+from psa_casadi.diagnosis.corrections.correct import Correction, corrections
+from psa_casadi.diagnosis.corrections.export import with_patch
+from psa_casadi.diagnosis.corrections.patch import patch_of
+from psa_casadi.diagnosis.held_out.errors import held_out_rms
+from psa_casadi.diagnosis.judgement import Weighed
+from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.model.compose import compose
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.records import Record
+from psa_casadi.records.split import Experiment, split
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+
+TIME: FloatArray = np.linspace(0.0, 4.0, 2001)
+#: Loops of several sizes about several places, so that voltage, displacement and time differ.
+VOLTAGE = 50.0 + 25.0 * np.sin(2 * np.pi * TIME) + 20.0 * np.sin(2 * np.pi * 0.37 * TIME + 1.0)
+NOISE = 2e-9
+
+
+def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
+    experiments = (split(Record("r", TIME, VOLTAGE, y)),)
+    found = fit(compose(BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
+    return found, experiments, Colour((np.zeros(0),), NOISE, (len(found.residuals),))
+
+
+def _held(found: Fit, experiments: tuple[Experiment, ...]) -> float:
+    return held_out_rms(experiments, found.predicted(experiments))
+
+
+@pytest.fixture(scope="module")
+def clean() -> FloatArray:
+    return simulate(compose(BASE), TIME, VOLTAGE).displacement
+
+
+def _measured(clean: FloatArray, added: FloatArray) -> FloatArray:
+    size = 40.0 * NOISE / float(np.ptp(added))
+    noise = NOISE * np.random.default_rng(8).standard_normal(TIME.size)
+    y: FloatArray = clean + size * added + noise
+    return y
+
+
+def _play(v: FloatArray, radius: float) -> FloatArray:
+    found, state = np.empty_like(v), float(v[0])
+    for k, value in enumerate(v.tolist()):
+        state = min(max(state, value - radius), value + radius)
+        found[k] = state
+    return found
+
+
+def _relaxed(x: FloatArray, tau: float) -> FloatArray:
+    step, z = TIME[1] - TIME[0], np.empty_like(x)
+    z[0] = x[0]
+    for k in range(1, len(x)):
+        z[k] = z[k - 1] + (x[k] - z[k - 1]) * (1.0 - np.exp(-step / tau))
+    return z
+
+
+HIDDEN: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "curve at the reading": lambda x: np.arctan(6.0 * (x - np.mean(x)) / np.ptp(x)),
+    "curve at the drive voltage": lambda _: np.tanh((VOLTAGE - 60.0) / 12.0),
+    "direction at the force": lambda _: (VOLTAGE - _play(VOLTAGE, 0.4)) * VOLTAGE,
+    "memory at the force": lambda _: _play(VOLTAGE, 9.0),
+    "relaxation at the force": lambda x: _relaxed(x, 0.35),
+    "time at the reading": lambda _: np.sin(2 * np.pi * 0.3 * TIME),
+    "gain in time at the force": lambda x: x * np.exp(-TIME / 2.0),
+}
+
+
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> None:
+    y = _measured(clean, HIDDEN[hidden](clean))
+    found, experiments, colour = _fitted(y)
+    seen = corrections(found, experiments, colour)
+    base = (np.asarray(found.predicted(experiments)[0]),)
+    patch = patch_of(seen, experiments, _held(found, experiments), colour)
+    assert patch is not None
+    assert hidden in (patch.name, *patch.open_to)
+    spent = budget(experiments, base, base, [], (patch.name, patch.predicted), NOISE)
+    assert spent.unnamed is not None
+    assert spent.unnamed.share > 0.7
+    assert spent.unnamed.interval[0] > 0.0
+
+
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatArray) -> None:
+    """In the model it does what the linear estimate promises; the file reads back the same."""
+    found, experiments, colour = _fitted(_measured(clean, HIDDEN[hidden](clean)))
+    predicted = found.predicted(experiments)
+    held = held_out_rms(experiments, predicted)
+    kind, port = hidden.split(" at the ")
+    seen = [c for c in corrections(found, experiments, colour) if c.kind.name == kind]
+    seen = [c for c in seen if c.kind.port == port]
+    patch = patch_of(seen, experiments, held, colour)
+    assert patch is not None
+    again = with_patch(found, patch, experiments, predicted)
+    after = held_out_rms(experiments, again.predicted(experiments))
+    assert after**2 - NOISE**2 < 0.3 * (held**2 - NOISE**2)
+    model = loads(dumps(again.model))
+    assert model.values == again.model.values
+    assert "unnamed correction" in model.effects[-1].description
+    assert model.without([model.effects[-1].name]).effects == ()
+
+
+def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
+    found, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
+    modes = [c for c in corrections(found, experiments, colour) if c.kind.name == "modes"]
+    patch = patch_of(modes, experiments, 1.0, colour)
+    assert patch is not None
+    with pytest.raises(InputError, match="no form that a model could hold"):
+        with_patch(found, patch, experiments, found.predicted(experiments))
+
+
+def test_noise_gets_no_correction(clean: FloatArray) -> None:
+    noise = NOISE * np.random.default_rng(3).standard_normal(TIME.size)
+    found, experiments, colour = _fitted(clean + noise)
+    seen = corrections(found, experiments, colour)
+    assert max(c.evidence for c in seen) < 3.0
+    assert patch_of(seen, experiments, _held(found, experiments), colour) is None
+
+
+def test_a_correction_takes_names_away_only_where_it_clearly_explains_more(
+    clean: FloatArray,
+) -> None:
+    found, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
+    first, second, *_ = corrections(found, experiments, colour)
+    first, second = (
+        replace(c, evidence=e, copies=s) for c, e, s in ((first, 900.0, 0.5), (second, 500.0, 0.9))
+    )
+
+    def beaten(evidence: float, share: float, given: tuple[Correction, ...]) -> Correction | None:
+        return Weighed(evidence, 1, share, given, [0.9] * len(given)).beaten_by()
+
+    assert beaten(700.0, 0.8, (first, second)) is first
+    assert beaten(895.0, 0.8, (first, second)) is None
+    own_kind = (replace(first, copies=0.95), second)
+    assert beaten(700.0, 0.8, own_kind) is None
+    assert beaten(700.0, 0.3, own_kind) is own_kind[0]
+    assert Weighed(700.0, 1, 0.8, (first,), [-0.1]).beaten_by() is None
+    assert Weighed(0.0, 0, 0.0, (), ()).beaten_by() is None
+
+
+def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
+    """Two causes of 3 and 4 times the noise: 9/25 and 16/25 of what is above it."""
+    rng = np.random.default_rng(6)
+    truth = np.zeros(4000)
+    held = np.arange(4000) % 2 == 1
+    noise = NOISE * rng.standard_normal(4000)
+    time: FloatArray = np.arange(4000, dtype=float) * 1e-3
+    experiments = (Experiment(Record("r", time, time, truth + noise), ~held, held),)
+    one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))
+    without = [("one", (truth + one,)), ("other", (truth + other,))]
+    spent = budget(experiments, (truth + one + other,), (truth,), without, None, NOISE)
+    assert spent.excess_rms_m == pytest.approx(5.0 * NOISE, rel=0.05)
+    assert [s.share for s in spent.causes] == pytest.approx([9 / 25, 16 / 25], abs=0.04)
+    assert spent.together.share == pytest.approx(1.0, abs=0.02)
+    for s in (*spent.causes, spent.together):
+        assert s.interval[0] < s.share < s.interval[1]
+    assert spent.remains_rms_m < 0.3 * NOISE

@@ -1,0 +1,110 @@
+"""Records whose displacement does not follow the voltage, with another sign or unit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.cli.diagnose import _write_patch
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.model_file import load_model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import write_record
+from psa_casadi.records.record import Record
+from psa_casadi.report.words.text import story
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+from tests.report_cases import diagnosis
+from tests.test_cli import done
+from tests.tiers import slow
+
+TIME: FloatArray = np.arange(2000, dtype=float) * 1e-3
+VOLTAGE = 50.0 - 50.0 * np.cos(2 * np.pi * TIME)
+TABLE = [EFFECTS["slow_creep"], EFFECTS["offset_drift"]]
+
+
+@pytest.fixture(scope="module")
+def shown() -> FloatArray:
+    """What a stack does, with a little noise."""
+    found = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
+    return found + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
+
+
+@pytest.mark.parametrize("kind", ["noise", "drift", "another device"])
+def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    y: FloatArray = {
+        "noise": 1e-7 * rng.standard_normal(TIME.size),
+        "drift": 1e-6 * TIME + 1e-8 * rng.standard_normal(TIME.size),
+        "another device": 1e-6 * np.sin(2 * np.pi * 3.7 * TIME),
+    }[kind]
+    found = diagnose([Record(kind, TIME, VOLTAGE, y)], effects=TABLE)
+    assert found.verdict == "not_driven"
+    assert not found.causes
+    assert "same device" in found.notes[-1]
+    assert "does not follow the voltage" in story(found)
+
+
+def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
+    found = diagnose([Record("r", TIME, VOLTAGE, -shown)], effects=TABLE)
+    assert found.verdict == "not_driven"
+    assert (
+        "the sign of the displacement flipped the base model explains 100.00 %" in found.notes[-1]
+    )
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e3])
+def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray) -> None:
+    found = diagnose([Record("r", TIME, VOLTAGE, factor * shown)], effects=TABLE)
+    assert found.verdict == "adequate"
+    assert "its unit, or that of the voltage, is probably another" in found.notes[-1]
+
+
+def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
+    with pytest.raises(InputError, match="m per volt, more than piezoelectric stacks do"):
+        diagnose([Record("r", TIME, VOLTAGE, 1e6 * shown)], effects=TABLE)
+
+
+def _curved(shown: FloatArray) -> FloatArray:
+    """A reading with a ripple that no effect of the table forms."""
+    return shown + 1e-7 * np.sin(4.0 * shown / 1e-6)
+
+
+@slow
+def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) -> None:
+    time = np.arange(4000) * 1e-3
+    voltage = 50.0 + 30.0 * np.sin(2 * np.pi * time) + 15.0 * np.sin(2 * np.pi * 0.31 * time)
+    clean = simulate(stack_model("P-885.51"), time, voltage).displacement
+    noise = 5e-9 * np.random.default_rng(2).standard_normal(time.size)
+    write_record(
+        tmp_path / "r.csv",
+        {"time [s]": time, "voltage [V]": voltage, "displacement [m]": _curved(clean) + noise},
+    )
+    paths = {n: tmp_path / n for n in ("ext.json", "patched.json", "d.json", "r.html")}
+    said = done(
+        "diagnose", tmp_path / "r.csv", "-o", paths["ext.json"], "--patch", paths["patched.json"],
+        "--json", paths["d.json"], "--report", paths["r.html"],
+    ).stdout  # fmt: skip
+    told = json.loads(paths["d.json"].read_text(encoding="utf-8"))
+    assert told["verdict"] == "unexplained"
+    assert (told["patch"]["kind"], told["patch"]["port"]) == ("curve", "reading")
+    assert told["budget"]["unnamed"]["share"] > 0.9
+    assert "unnamed correction would remove" in " ".join(said.split())
+    page = paths["r.html"].read_text(encoding="utf-8")
+    assert "Where the error goes" in page
+    assert "Unnamed correction: curve at the reading" in page
+    patched = load_model(paths["patched.json"])
+    assert [c.name for c in patched.effects] == ["patch_curve_reading"]
+    assert [c.name for c in load_model(paths["ext.json"]).effects] == []
+    moved = simulate(patched, time, voltage)
+    error = moved.outputs["measured_displacement"] - _curved(clean)
+    assert np.std(error) < 0.3 * np.std(_curved(clean) - clean)
+
+
+def test_without_a_correction_nothing_is_written_and_it_says_so(tmp_path: Path) -> None:
+    said = _write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
+    assert "No unnamed correction" in said
+    assert not (tmp_path / "p.json").exists()
