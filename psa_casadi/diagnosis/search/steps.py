@@ -134,15 +134,18 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
             more = with_cause(before, task.experiments, view.starts_of(name))
             evidence[name] = -np.inf if more is None else scale.evidence(more) - own
     good = {n for n, c in fitted.items() if c.names in found.worth}
+    unfit: set[str] = set()
     if chosen is not None:
         cause = chosen.causes[-1]
-        good.add(cause.name)
         evidence, beside = _beside(found, evidence, cause.name, best)
-        good |= beside
+        rest = best.names - {cause.name}
+        unfit = {n for n in beside if n != cause.name and rest | {n} not in found.worth}
+        unfit |= {n for g in task.alike(before.fit) if unfit & set(g) for n in g} - {cause.name}
+        good = (good | beside | {cause.name}) - unfit
     alike = task.alike(before.fit)
     fit = {n for n, c in fitted.items() if in_character(c.fit, _named(c, n), task.experiments)}
     same = {n for group in alike if good & set(group) for n in group if n in fit}
-    refused = set(fitted) - good - same
+    refused = (set(fitted) - good - same) | unfit
     if chosen is not None:  # beside the other causes
         refused |= best.names - {chosen.causes[-1].name}
     evidence = levelled(evidence, alike, good)
@@ -163,15 +166,16 @@ def _beside(
 ) -> tuple[dict[str, float], set[str]]:
     """Return the evidence beside all other causes, and the effects that were fitted there.
 
-    What was not keeps its distance to the cause.
+    What was not keeps its distance to the cause, but is not before it: it was not tried there.
     """
     rest = best.names - {cause}
     less = found.known.get(rest)
     if not rest or less is None:
         return dict(evidence), set()
     own = found.scale.evidence(less)
-    shift = found.scale.evidence(best) - own - evidence[cause]
-    moved = {n: v + shift for n, v in evidence.items()}
+    most = found.scale.evidence(best) - own
+    shift = most - evidence[cause]
+    moved = {n: min(v + shift, most) for n, v in evidence.items()}
     there = {n: found.known.get(rest | {n}) for n in evidence if n not in rest}
     known = {n: found.scale.evidence(h) - own for n, h in there.items() if h is not None}
     return {**moved, **known}, set(known)

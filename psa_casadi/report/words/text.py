@@ -76,15 +76,16 @@ def _cause(d: Diagnosis, cause: Cause) -> str:
 def _rivals(d: Diagnosis, cause: Cause) -> str:
     """Return what a cause cannot be told from, else the next most probable effect of the first."""
     known = {c.effect: c.probability for c in d.candidates}
+    first = cause is d.causes[0]  # the candidates are those of the first step
     if cause.cannot_be_told_from:
         rivals = [
-            f"{plain(n)} ({probability_text(known[n])})" if known.get(n) else plain(n)
+            f"{plain(n)} ({probability_text(known[n])})" if first and known.get(n) else plain(n)
             for n in cause.cannot_be_told_from
         ]
         return f"these data cannot tell it from {listing(rivals, 'or')}"
     named = {c.effect for c in d.causes}
     others = [(p, n) for n, p in known.items() if n not in named]
-    if not others or cause is not d.causes[0]:  # the candidates are those of the first step
+    if not others or not first:
         return "none left open"
     probability, name = max(others)
     return f"none left open; the next is {plain(name)} ({probability_text(probability)})"
