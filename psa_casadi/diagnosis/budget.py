@@ -59,18 +59,29 @@ class Removed:
 
     def share(self, what: str, before: Sequence[FloatArray], after: Sequence[FloatArray]) -> Share:
         """Return the share of the base's excess that `after` removes of what `before` leaves."""
+        of, count = self._of(before, after)
+        centre, half = jackknife(of, np.ones(count, dtype=bool))
+        return Share(what, centre, (centre - half, centre + half))
+
+    def from_base(self, after: Sequence[FloatArray]) -> float:
+        """Return the share that `after` removes of the base's excess, without its interval."""
+        of, count = self._of(self.base, after)
+        return of(np.ones(count, dtype=bool))
+
+    def _of(
+        self, before: Sequence[FloatArray], after: Sequence[FloatArray]
+    ) -> tuple[Callable[[npt.NDArray[np.bool_]], float], int]:
+        """Return the share over chosen parts, and their number, 0 where there is no excess."""
         sums, counts = held_out_parts(self.experiments, self.base, before, after)
         floor = self.noise**2
+        if not len(counts) or not np.sum(sums[:, 0]) / np.sum(counts) > floor:
+            return lambda _: 0.0, 0
 
         def of(kept: npt.NDArray[np.bool_]) -> float:
             base, left, rest = np.sum(sums[kept], axis=0) / np.sum(counts[kept])
             return float((left - rest) / max(base - floor, 1e-300))
 
-        every = np.ones(len(counts), dtype=bool)
-        if not len(counts) or not np.sum(sums[:, 0]) / np.sum(counts) > floor:
-            return Share(what, 0.0, (0.0, 0.0))
-        centre, half = jackknife(of, every)
-        return Share(what, centre, (centre - half, centre + half))
+        return of, len(counts)
 
 
 def budget(
@@ -89,11 +100,10 @@ def budget(
     removed = Removed(experiments, base, noise)
     sums, counts = held_out_parts(experiments, base, extended)
     powers = np.sum(sums, axis=0) / max(int(np.sum(counts)), 1)
-    above: Callable[[float], float] = lambda p: float(np.sqrt(max(p - noise**2, 0.0)))  # noqa: E731
-    remains = above(powers[1])
+    excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
     largest = max(e.record.range_m for e in experiments)
     return Budget(
-        excess_rms_m=above(powers[0]),
+        excess_rms_m=excess,
         noise_rms_m=noise,
         together=removed.share("together", base, extended),
         causes=tuple(removed.share(name, less, extended) for name, less in without),

@@ -77,15 +77,14 @@ def conclude(
         corrections(first.fit, experiments, colour, last.predicted) if missing and driven else ()
     )
     removed = Removed(experiments, first.predicted, floor)
-    share = removed.share("", first.predicted, last.predicted).share
+    share = removed.from_base(last.predicted)
     weighed = Weighed(
         evidence=Scale(first.fit, colour, thresholds().price).evidence(last.view.of),
         causes=len(steps) - 1,
         share=share,
         corrections=beside_base,
-        shares=[removed.share("", first.predicted, c.predicted).share for c in beside_base],
+        shares=[removed.from_base(c.predicted) for c in beside_base],
     )
-    gain = gain_of(experiments, first.predicted, last.predicted)
     verdict: Verdict = (
         "not_driven"
         if not driven
@@ -117,7 +116,7 @@ def conclude(
         noise_floor_rms_m=floor,
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
-        gain=gain if named else gain_of(experiments, first.predicted, first.predicted),
+        gain=gain_of(experiments, first.predicted, final.predicted),
         blind_to=_blind_spots(final, table),
         remaining=_remaining(final, Excess() if named else beyond),
         next_experiment=_next_experiment(

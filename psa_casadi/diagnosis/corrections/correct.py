@@ -5,19 +5,20 @@ of the model's own parameters, w ~ N(0, (s p)^2) the weights of one correction. 
 of the largest evidence. The evidence is on the scale of the hypotheses' score.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.corrections.kinds import KINDS, Kind, Signals
-from psa_casadi.diagnosis.noise.colour import Colour, rms
+from psa_casadi.diagnosis.held_out.errors import held_out_rms
+from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured, predict
+from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.linear_part import linear_part
 
@@ -41,7 +42,6 @@ class Correction:
 
     kind: Kind
     evidence: float
-    train_rms: float
     holdout_rms: float
     weights: FloatArray
     predicted: tuple[FloatArray, ...]
@@ -69,25 +69,8 @@ def corrections(
         return ()
     follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
     fast = shows_ringing(experiments)
-    found = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
-    if named is not None:
-        found = [replace(c, copies=_copied(c.kind, signals, follow, named)) for c in found]
+    found = [_correction(kind, signals, follow, named) for kind in KINDS if fast or not kind.fast]
     return tuple(sorted(found, key=lambda c: -c.evidence))
-
-
-def _copied(
-    kind: Kind, signals: Signals, follow: "_Following", named: Sequence[FloatArray]
-) -> float:
-    """Return the share of what named causes add that a kind's columns can add as well."""
-    experiments = signals.experiments
-    added = np.concatenate(
-        [(n - p)[e.used] for n, p, e in zip(named, signals.predicted, experiments, strict=True)]
-    )
-    used = np.vstack([kind.columns(signals, k)[e.used] for k, e in enumerate(experiments)])
-    target = follow.beside(added)
-    basis = independent(follow.beside(used))
-    power = float(target @ target)
-    return float(np.sum((basis.T @ target) ** 2)) / power if power > 0 else 0.0
 
 
 class _Following:
@@ -100,52 +83,62 @@ class _Following:
         colour: Colour,
         jacobians: Sequence[FloatArray],
     ) -> None:
-        self.experiments, self.colour = experiments, colour
-        self.whole = jacobians
+        self.colour, self.whole, self.residuals = colour, jacobians, fit.residuals
         low, high = fit.unknowns.bounds()
-        self.free = free = (fit.theta > low + _AT_BOUND) & (fit.theta < high - _AT_BOUND)
-        self.prior = np.where(np.isfinite(fit.unknowns.prior), fit.unknowns.prior, 1.0)[free]
-        known = np.isfinite(fit.unknowns.prior)[free]
-        self.jacobians = [j[:, free] * self.prior for j in jacobians]
-        self.used = np.vstack([j[e.used] for j, e in zip(self.jacobians, experiments, strict=True)])
-        self.held = np.diag(known.astype(np.float64))
-        white = np.vstack([colour.whiten(self.used) / colour.level, self.held])
-        self.basis = independent(white)
-        self.residuals = fit.residuals
+        self.free = (fit.theta > low + _AT_BOUND) & (fit.theta < high - _AT_BOUND)
+        known = np.isfinite(fit.unknowns.prior)
+        self.prior = np.where(known, fit.unknowns.prior, 1.0)[self.free]
+        self.held = np.diag(known[self.free].astype(np.float64))
+        used = np.vstack([j[e.used] for j, e in zip(jacobians, experiments, strict=True)])
+        scaled = used[:, self.free] * self.prior
+        self.white = np.vstack([self.over_noise(scaled), self.held])
+        self.basis = independent(self.white)
         self.target = self.beside(fit.residuals)
+
+    def over_noise(self, columns: FloatArray) -> FloatArray:
+        """Return columns at the used samples, whitened, over the noise."""
+        white: FloatArray = self.colour.whiten(columns) / self.colour.level
+        return white
 
     def beside(self, columns: FloatArray) -> FloatArray:
         """Return columns over the noise, whitened, less what the parameters can follow."""
-        white = self.colour.whiten(columns) / self.colour.level
         none = np.zeros((len(self.held), *columns.shape[1:]))
-        return without(np.concatenate([white, none]), self.basis)
+        return without(np.concatenate([self.over_noise(columns), none]), self.basis)
 
     def moved(self, added: FloatArray) -> FloatArray:
         """Return the change of theta (size,) with what is added at used samples."""
-        white = self.colour.whiten(self.used) / self.colour.level
-        rest = self.colour.whiten(self.residuals - added) / self.colour.level
-        moved = np.linalg.lstsq(
-            np.vstack([white, self.held]), np.append(rest, np.zeros(len(self.held))), rcond=None
-        )[0]
+        rest = np.append(self.over_noise(self.residuals - added), np.zeros(len(self.held)))
         theta = np.zeros(len(self.free))
-        theta[self.free] = self.prior * moved
+        theta[self.free] = self.prior * np.linalg.lstsq(self.white, rest, rcond=None)[0]
         return theta
 
 
-def _correction(kind: Kind, signals: Signals, follow: _Following) -> Correction:
+def _correction(
+    kind: Kind, signals: Signals, follow: _Following, named: Sequence[FloatArray] | None
+) -> Correction:
     experiments = signals.experiments
     parts = [kind.columns(signals, k) for k in range(len(experiments))]
     shape = kind.shape(parts[0].shape[1])
     used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
-    weights, evidence = _weights(follow.beside(used), follow.target)
+    free = follow.beside(used)
+    weights, evidence = _weights(free, follow.target)
     own = tuple(p @ (shape * weights) for p in parts)
     moved = follow.moved(used @ weights)
     changes = [j @ moved for j in follow.whole]
     predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, own, strict=True))
-    errors = [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
-    train = rms(np.concatenate([r[e.used] for r, e in zip(errors, experiments, strict=True)]))
-    held = rms(np.concatenate([r[e.held_out] for r, e in zip(errors, experiments, strict=True)]))
-    return Correction(kind, evidence, train, held, weights * shape, predicted, own, moved)
+    copied = 0.0 if named is None else _copied(free, signals, follow, named)
+    held = held_out_rms(experiments, predicted)
+    return Correction(kind, evidence, held, weights * shape, predicted, own, moved, copied)
+
+
+def _copied(
+    free: FloatArray, signals: Signals, follow: _Following, named: Sequence[FloatArray]
+) -> float:
+    """Return the share of what named causes add that columns (samples, k) can add as well."""
+    pairs = zip(named, signals.predicted, signals.experiments, strict=True)
+    target = follow.beside(np.concatenate([(n - p)[e.used] for n, p, e in pairs]))
+    power = float(target @ target)
+    return float(np.sum((independent(free).T @ target) ** 2)) / power if power > 0 else 0.0
 
 
 def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
@@ -173,7 +166,9 @@ def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float
     return best[1], max(best[0] - float(np.log(len(_SIZES))), 0.0) if best[0] > 0 else best[0]
 
 
-def _responses(fit: Fit, experiments: Sequence[Experiment]):  # type: ignore[no-untyped-def]
+def _responses(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> Callable[[int, FloatArray], FloatArray]:
     """Return the filter of the plant from force to displacement, for records that show it."""
     if not shows_ringing(experiments):
         return lambda k, x: x

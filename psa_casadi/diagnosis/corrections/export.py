@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.corrections.kinds import LONGEST, PER_DECADE
+from psa_casadi.diagnosis.corrections.kinds import time_constants
 from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight
 from psa_casadi.errors import InputError
@@ -65,21 +65,19 @@ def _numbers(
 ) -> Mapping[str, float]:
     """Return the parameters that are not fitted: the range, times."""
     records = [e.record for e in experiments]
-    shortest, longest = min(r.sample_time for r in records), max(r.duration for r in records)
+    longest = max(r.duration for r in records)
     if patch.kind in ("direction", "memory") or patch.port == "drive voltage":
-        ends = [f(r.voltage) for f, r in ((f, r) for f in (np.min, np.max) for r in records)]
+        every = np.concatenate([r.voltage for r in records])
     else:
-        moved = [y - before.offset(k) for k, y in enumerate(predicted)]
-        ends = [f(y) for f, y in ((f, y) for f in (np.min, np.max) for y in moved)]
-    numbers = {"patch_low": float(np.min(ends)), "patch_high": float(np.max(ends))}
+        every = np.concatenate([y - before.offset(k) for k, y in enumerate(predicted)])
+    numbers = {"patch_low": float(np.min(every)), "patch_high": float(np.max(every))}
     if patch.kind == "time":
         return {"patch_time": longest}
     if patch.kind == "gain in time":
         return {**numbers, "patch_time": longest}
     if patch.kind == "relaxation":
-        count = max(2, round(PER_DECADE * float(np.log10(LONGEST * longest / shortest))))
-        ratio = (LONGEST * longest / shortest) ** (1.0 / (count - 1))
-        if count > RELAXATIONS:
+        taus = time_constants(records)
+        if len(taus) > RELAXATIONS:
             raise InputError("The records span more decades of time than a correction can hold.")
-        return {**numbers, "patch_time": shortest, "patch_ratio": ratio}
+        return {**numbers, "patch_time": float(taus[0]), "patch_ratio": float(taus[1] / taus[0])}
     return numbers

@@ -23,14 +23,15 @@ import numpy.typing as npt
 
 from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
 from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Relaxations per decade, modes.
-PER_DECADE, MODES = 2, 24
+_PER_DECADE, MODES = 2, 24
 #: Damping ratio of modes; relaxations go to so many times the record.
-_DAMPING, LONGEST = 0.05, 3.0
+_DAMPING, _LONGEST = 0.05, 3.0
 #: A mode rings so many times in the longest record, and within a hundred samples.
 _PERIODS, _SLOWEST = 8.0, 0.01
 
@@ -111,11 +112,18 @@ def _memory(s: Signals, k: int) -> FloatArray:
 def _relaxation(s: Signals, k: int) -> FloatArray:
     record = s.experiments[k].record
     x = s.displacement(k)
-    shortest, longest = s.times()
-    decades = np.log10(LONGEST * longest / shortest)
-    taus = np.geomspace(shortest, LONGEST * longest, max(2, round(PER_DECADE * decades)))
+    taus = time_constants([e.record for e in s.experiments])
     step = np.append(0.0, np.diff(record.time))
     return np.column_stack([_relaxed(x, step, float(tau)) - x for tau in taus])
+
+
+def time_constants(records: Sequence[Record]) -> FloatArray:
+    """Return the time constants of a relaxation [s], evenly over the decades of the records."""
+    shortest = min(r.sample_time for r in records)
+    longest = _LONGEST * max(r.duration for r in records)
+    count = max(2, round(_PER_DECADE * float(np.log10(longest / shortest))))
+    found: FloatArray = np.geomspace(shortest, longest, count)
+    return found
 
 
 def _modes(s: Signals, k: int) -> FloatArray:

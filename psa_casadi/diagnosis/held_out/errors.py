@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from psa_casadi.diagnosis.noise.colour import rms, uncertain
+from psa_casadi.diagnosis.noise.colour import rms
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import Experiment
 
@@ -81,27 +81,6 @@ def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
         holdout_max_m=float(np.max(np.abs(held))),
         holdout_nrmse_percent=100.0 * float(np.sqrt(squares / shares)),
     )
-
-
-def explained_share(
-    experiments: Sequence[Experiment],
-    before: Sequence[FloatArray],
-    after: Sequence[FloatArray],
-    floor: float,
-) -> float:
-    """Share of the excess power that the predictions `after` remove from those `before`, 0 to 1.
-
-    Judged by what is left in the held-out samples, against the excess there or that over the whole
-    records, whichever is larger: what an effect does in a few blocks of one record may be little by
-    chance. What the noise's own power is uncertain by is no excess.
-    """
-    errors = np.concatenate(whole_residuals(experiments, before))
-    valid = errors[np.isfinite(errors)]
-    noise = floor**2 * (1.0 + uncertain(valid))
-    powers = (float(np.mean(valid**2)), held_out_rms(experiments, before) ** 2)
-    excess = max(powers) - noise
-    left = held_out_rms(experiments, after) ** 2 - noise
-    return float(np.clip(1.0 - left / excess, 0.0, 1.0)) if excess > 0 else float(left <= 0)
 
 
 def held_out_parts(

@@ -129,7 +129,7 @@ class _Search:
         None where nothing is left in the best one, or nothing else is worth a visit.
         """
         best = self.best()
-        way = [self.known.get(frozenset(c.name for c in best.causes[:k])) for k in _upto(best)]
+        way = [self.known.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
         for own in way:
             if own is not None and (own is best or own.names in self.expanded) and self.unseen(own):
                 return own
@@ -216,19 +216,10 @@ class _Search:
         self.tell(h, f"fitting {', '.join(names)}")
         for found in side_by_side(lambda s: with_cause(h, experiments, s), leading):
             self.note(found)
-        self.fitted[h.names] = tuple(dict.fromkeys([*self.fitted.get(h.names, ()), *names]))
+        self.remember(h, *names)
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
-        children = self.children(h)
-        if not children:
-            return
-        own = self.scale.evidence(h)
-        gains = [self.scale.evidence(c) - own for c in children]
-        limit = min(_SHARE * gains[0], gains[0] - NEAR)
-        finalists = [c for c, g in zip(children, gains, strict=True) if g > limit and not c.final][
-            :_FINALISTS
-        ]
-        self.finish(finalists)
+        self.finish([c for c in self.leaders(h) if not c.final][:_FINALISTS])
 
     def different(self, effect: Component, h: Hypothesis) -> bool:
         """Whether an effect bends another curve than the causes of a hypothesis do."""
@@ -257,8 +248,7 @@ class _Search:
         found = any_afresh(root, self.task.experiments, scores)
         if found is not None:
             self.note(found)
-            names = (*self.fitted.get(root.names, ()), found.causes[-1].name)
-            self.fitted[root.names] = tuple(dict.fromkeys(names))
+            self.remember(root, found.causes[-1].name)
 
     def challenge(self, h: Hypothesis) -> None:
         """Fit with every cause taken out, and with resonances of the stack's own in its place."""
@@ -267,7 +257,7 @@ class _Search:
             for cause in h.causes:
                 task.progress(f"without {cause.name}")
                 self.note(without(h, cause, task.experiments))
-        before = self.known.get(frozenset(c.name for c in h.causes[:-1]))
+        before = self.known.get(h.names_upto(len(h.causes) - 1))
         if "resonances" in task.method.without or before is None:
             return
         last, found = h.causes[-1], None
@@ -317,19 +307,19 @@ class _Search:
         if "exchange" in self.task.method.without:
             return
         for k, cause in enumerate(h.causes):
-            before = self.known.get(frozenset(c.name for c in h.causes[:k]))
+            before = self.known.get(h.names_upto(k))
             less = self.known.get(h.names - {cause.name})
             if before is None or less is None:
                 continue
             if len(h.causes) > 1:
-                for rival in self.rivals(before, cause, h):
+                for rival in self.rivals(before, h):
                     self.task.progress(f"{rival.causes[-1].name} in the place of {cause.name}")
                     self.put_in_place(h, less, rival)
             for copy in self.copies(h, less):
                 name = copy.direction.effect.name
                 self.task.progress(f"{name}, which could copy {cause.name}")
                 self.note(like(h, less, copy, self.task.experiments))
-                self.fitted[before.names] = (*self.fitted.get(before.names, ()), name)
+                self.remember(before, name)
 
     def put_in_place(self, h: Hypothesis, less: Hypothesis, rival: Hypothesis) -> None:
         """Fit a rival's last cause beside those of `less`, to the end where that is near."""
@@ -365,20 +355,10 @@ class _Search:
                 lost[name] = left
         return [found[n] for n in sorted(lost, key=lambda n: lost[n])[:_FINALISTS]]
 
-    def rivals(self, before: Hypothesis, cause: Component, h: Hypothesis) -> list[Hypothesis]:
+    def rivals(self, before: Hypothesis, h: Hypothesis) -> list[Hypothesis]:
         """Return the fitted neighbours that were nearly as likely as a cause, the best first."""
-        children = self.children(before)
-        if not children:
-            return []
-        own = self.scale.evidence(before)
-        top = self.scale.evidence(children[0]) - own
-        limit = own + min(_SHARE * top, top - NEAR)
-        near = [
-            c
-            for c in children
-            if c.causes[-1].name not in h.names and self.scale.evidence(c) > limit
-        ]
-        return [c for c in near if c.causes[-1] is not cause][:_FINALISTS]
+        near = self.leaders(before)
+        return [c for c in near if c.causes[-1].name not in h.names][:_FINALISTS]
 
     # What is known
 
@@ -407,6 +387,17 @@ class _Search:
         found = [self.known.get(h.names | {n}) for n in names]
         own = [replace(c, causes=(*h.causes, _added(c, h))) for c in found if c is not None]
         return sorted(own, key=lambda c: -self.scale.evidence(c))
+
+    def leaders(self, h: Hypothesis) -> list[Hypothesis]:
+        """Return those of the children that are nearly as likely as the best one, best first."""
+        own, children = self.scale.evidence(h), self.children(h)
+        gains = [self.scale.evidence(c) - own for c in children]
+        least = min(_SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
+        return [c for c, gained in zip(children, gains, strict=True) if gained > least]
+
+    def remember(self, h: Hypothesis, *names: str) -> None:
+        """Keep that these effects were fitted beside a hypothesis."""
+        self.fitted[h.names] = tuple(dict.fromkeys([*self.fitted.get(h.names, ()), *names]))
 
     def sorted(self) -> list[Hypothesis]:
         return sorted(self.known.values(), key=lambda h: -self.scale.score(h))
@@ -471,10 +462,6 @@ class _Search:
 def _left(view: View) -> bool:
     """Whether anything is left to explain."""
     return view.test.alarm or view.shows
-
-
-def _upto(h: Hypothesis) -> range:
-    return range(len(h.causes) + 1)
 
 
 def _added(child: Hypothesis, parent: Hypothesis) -> Component:

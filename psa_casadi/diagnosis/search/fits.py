@@ -6,7 +6,7 @@ from dataclasses import replace
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.screening.screen import Copy, Score
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis
-from psa_casadi.diagnosis.search.quick_fits import QUICK, continued, fit_from, quick_fit
+from psa_casadi.diagnosis.search.quick_fits import QUICK, Start, continued, fit_from, quick_fit
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.search.refitting import quick_rtol, refit
@@ -73,16 +73,13 @@ def in_place(
     The effect begins with its values in its `own` fit, the rest with those that were `reached`;
     what `reached` does not have stays as in `less`.
     """
-    other, values = reached.model.values, own.model.values
+    values = own.model.values
     start = (
         {p.name: values[p.name] for p in effect.parameters if p.name != effect.gain},
         values[effect.gain or ""],
         tuple({**s, **r} for s, r in zip(own.starts(), reached.starts(), strict=True)),
     )
-    base = {n: other[n] for n in less.fit.unknowns.names if n in other}
-    causes = tuple(effect if c not in less.causes else c for c in whole.causes)
-    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE)
-    return hypothesis(causes, quick, experiments)
+    return _exchanged(whole, less, effect, start, reached, experiments)
 
 
 def like(
@@ -97,12 +94,24 @@ def like(
     with the gain that copies best.
     """
     effect, direction = copy.direction.effect, copy.direction
-    values = whole.fit.model.values
-    base = {n: values[n] for n in less.fit.unknowns.names if n in values}
     usable = copy.gain > 0 or not direction.one_sided
     start = (direction.values, copy.gain if usable else direction.unit_gain, direction.memory)
-    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE)
+    return _exchanged(whole, less, effect, start, whole.fit, experiments)
+
+
+def _exchanged(
+    whole: Hypothesis,
+    less: Hypothesis,
+    effect: Component,
+    start: Start,
+    reached: Fit,
+    experiments: Sequence[Experiment],
+) -> Hypothesis | None:
+    """Fit an effect where the `whole` has the cause that `less` lacks, the rest as `reached`."""
+    values = reached.model.values
+    base = {n: values[n] for n in less.fit.unknowns.names if n in values}
     causes = tuple(effect if c not in less.causes else c for c in whole.causes)
+    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE)
     return hypothesis(causes, quick, experiments)
 
 

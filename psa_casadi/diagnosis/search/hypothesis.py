@@ -48,6 +48,10 @@ class Hypothesis:
         """Names of the causes."""
         return frozenset(c.name for c in self.causes)
 
+    def names_upto(self, count: int) -> frozenset[str]:
+        """Names of the first so many causes."""
+        return frozenset(c.name for c in self.causes[:count])
+
     @property
     def power(self) -> float:
         """Mean square of the residuals [m^2]."""

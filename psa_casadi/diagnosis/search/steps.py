@@ -1,6 +1,6 @@
 """The causes of the best hypothesis one by one: what each was chosen from, and how likely it is."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -96,7 +96,7 @@ def unsearched(base: Fit, task: Task) -> list[Step]:
 def _way(found: Searched, task: Task, count: int) -> Hypothesis:
     """Return the hypothesis with the first so many of the best one's causes."""
     best = found.best
-    own = found.known.get(frozenset(c.name for c in best.causes[:count]))
+    own = found.known.get(best.names_upto(count))
     if own is not None:
         return own
     for cause in best.causes[: count - 1 : -1]:
@@ -183,8 +183,3 @@ def _beside(
 
 def _named(h: Hypothesis, name: str) -> Component:
     return next(c for c in h.causes if c.name == name)
-
-
-def named_causes(steps: Sequence[Step]) -> list[Component]:
-    """Return the causes of all steps."""
-    return [s.cause for s in steps if s.chosen is not None]
