@@ -144,6 +144,16 @@ def test_holds_show_the_noise_around_a_creep(correlation: float) -> None:
     assert found.autocovariance[1] / found.autocovariance[0] == pytest.approx(correlation, abs=0.05)
 
 
+def test_ringing_after_a_step_is_no_noise_of_a_hold() -> None:
+    """A mode of 30 Hz with damping 0.02 rings for most of a hold, thirty times above the noise."""
+    n, step, omega = 6000, 1500, 2 * np.pi * 30.0
+    since = STEP * (np.arange(n) % step)
+    ringing = 30 * LEVEL * np.exp(-0.02 * omega * since) * np.cos(omega * since)
+    found = holds(record(10.0 * (np.arange(n) // step % 2), ringing + noise(n, 0.0)))
+    assert found is not None
+    assert found.level == pytest.approx(LEVEL, rel=0.25)
+
+
 def test_held_spans_are_no_ramps() -> None:
     v, _ = held_levels()
     assert held(record(v, v)) == [(k, k + 5_000) for k in range(0, 20_000, 5_000)]

@@ -45,6 +45,7 @@ class _Run(ctypes.Structure):
         ("zero_order_hold", ctypes.c_int), ("p", _POINTER), ("x0", _POINTER), ("z0", _POINTER),
         ("nominal", _POINTER),
         ("rtol", ctypes.c_double), ("max_step", ctypes.c_double), ("steps_limit", ctypes.c_long),
+        ("steps_most", ctypes.c_long),
         ("x", _POINTER), ("z", _POINTER), ("y", _POINTER),
         ("count", ctypes.c_int), ("which", _POINTER), ("s0", _POINTER), ("output", ctypes.c_int),
         ("dy", _POINTER), ("work", _POINTER), ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
@@ -89,6 +90,7 @@ def run(
     hold: str = "linear",
     max_step: float = 0.0,
     steps_limit: int = 0,
+    steps_most: int = 0,
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
     output: str = "measured_displacement",
@@ -99,7 +101,8 @@ def run(
 
     `unknowns` names the parameters of the sensitivities d output / d unknown; an integer k stands
     for the initial value of state k. `s0` (nx, k) is d x0 / d unknown, zero by default except for
-    the initial values themselves. `steps_limit` bounds the work between two samples.
+    the initial values themselves. `steps_limit` bounds the work between two samples, `steps_most` that of the
+    whole run; 0 is none.
 
     Sampled states start at `z0` (nz,), their declared starts by default. Steps end at their
     instants, also between the times; one at t[0] is taken before the first output, one at another
@@ -121,6 +124,7 @@ def run(
         rtol=rtol,
         max_step=max_step,
         steps_limit=steps_limit,
+        steps_most=steps_most,
         count=count,
         output=model.output_names.index(output) if count else 0,
         **{name: array.ctypes.data for name, array in arrays.items()},

@@ -75,10 +75,11 @@ def trace(
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
     steps_limit: int = 0,
+    steps_most: int = 0,
 ) -> Traced:
     """Return one output of a run and its derivatives by `unknowns` (see `run`).
 
-    `steps_limit` bounds the stepper's work between two samples. Raises SimulationError where both
+    `steps_limit` bounds the stepper's work between two samples, `steps_most` its whole. Raises SimulationError where both
     ways fail.
     """
     none = np.zeros((len(t), 0))
@@ -93,8 +94,8 @@ def trace(
         except NotExact:
             pass
     steps = run(
-        model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, unknowns=unknowns, s0=s0,
-        output=output,
+        model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, steps_most=steps_most,
+        unknowns=unknowns, s0=s0, output=output,
     )  # fmt: skip
     slopes = none if steps.sensitivity is None else steps.sensitivity
     return Traced(steps.y[:, model.output_names.index(output)], slopes, STEPPER)
