@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.records import Record
 from psa_casadi.records.quality.noise import correlation_inflation, high_frequency_noise
-from psa_casadi.records.split import reversals, split, whole
+from psa_casadi.records.split import divided, split, whole
+from psa_casadi.records.turns import reversals
 
 FloatArray = NDArray[np.float64]
 
@@ -85,6 +87,40 @@ def test_without_a_reversal_nearby_the_blocks_are_cut_where_they_end() -> None:
     assert (e.stop, int(e.held_out.sum())) == (1600, 400)
 
 
+def with_a_hold() -> FloatArray:
+    """Loops of 50 samples, but for a hold from 1/4 to 3/8 of the record: blocks 4 and 5."""
+    voltage = triangle(1600, 50)
+    voltage[400:600] = 0.0
+    return voltage
+
+
+def test_every_kind_of_stretch_is_fitted_and_held_out() -> None:
+    e = split(record(with_a_hold()))
+    hold = slice(400, 600)
+    assert e.used[hold].any()
+    assert e.held_out[hold].any()
+    assert coverage_notes([e]) == ()
+
+
+def test_what_is_not_held_out_is_told() -> None:
+    voltage = with_a_hold()
+    voltage[500:600] = triangle(100, 50)  # the hold fills one block, which is fitted
+    (note,) = coverage_notes([split(record(voltage))])
+    assert "held voltages" in note
+    assert note.startswith("8 % of the fitted samples")
+
+
+def test_what_is_held_out_but_not_fitted_is_told() -> None:
+    """Slow and wide loops are held out; their first tenth, which gives their start, is fitted."""
+    small, slow = 0.2 * triangle(1600, 50), triangle(1600, 800)
+    found = coverage_notes(divided([record(small)], [record(slow)]))
+    assert len(found) == 3
+    assert "large falls of 0.25 to 1 s" in found[0]
+    assert "extrapolates" in found[0]
+    assert "says nothing" in found[1]
+    assert "from 0 to 50 V, fitted ones from 0 to 19.88 V" in found[2]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_the_extremes_of_voltage_and_rate_are_fitted(seed: int) -> None:
     """Levels and ramps of any size: one block of every four is held out, none with an extreme."""
@@ -97,8 +133,9 @@ def test_the_extremes_of_voltage_and_rate_are_fitted(seed: int) -> None:
         beyond = np.max(signal[e.held_out]) - np.max(signal[e.used])
         assert beyond < 2e-3 * np.ptp(signal)  # blocks end on reversals: neighbours share them
     quarters = np.array_split(e.held_out, 4)
-    assert all(0.1 < np.mean(q) < 0.4 for q in quarters)
-    assert e.used[:200].all()
+    # one block of four in each quarter, either end moved by half a block at most
+    assert all(0.05 < np.mean(q) < 0.5 for q in quarters)
+    assert e.used[:125].all()  # the first block, at least half of its length
 
 
 def test_where_not_every_extreme_can_be_fitted_most_are() -> None:

@@ -10,6 +10,7 @@ from psa_casadi.diagnosis.budget import Budget, Removed, budget
 from psa_casadi.diagnosis.corrections.correct import corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
 from psa_casadi.diagnosis.corrections.patch import patch_of
+from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import (
     errors_of,
     gain_of,
@@ -122,7 +123,7 @@ def conclude(
         next_experiment=_next_experiment(
             causes, verdict, same_curves(experiments, table, first.fit)
         ),
-        notes=() if stiffness_given else (FORCE_NOTE,),
+        notes=(*(() if stiffness_given else (FORCE_NOTE,)), *coverage_notes(experiments)),
         experiments=tuple(experiments),
         base_fit=first.fit,
         extended_fit=final.fit,

@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.records.record import Record
+from psa_casadi.records.stretches import stretches
+from psa_casadi.records.turns import reversals
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -16,6 +18,8 @@ BoolArray = npt.NDArray[np.bool_]
 BLOCKS, HELD_OUT_EVERY = 16, 4
 #: Blocks that come this close to the record's highest or lowest value, over its range, reach it.
 _REACHED = 2e-3
+#: A part shows a kind of stretch from this share of its samples on.
+_SHOWN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +46,8 @@ def split(record: Record) -> Experiment:
 
     It is the last one of each four, unless the voltage or its rate would then be highest or lowest
     in held-out samples alone: what only shows there (a limited current, a clipped voltage) has to
-    be learnt before it can be judged. What the displacement is has no say in it.
+    be learnt before it can be judged. And unless another choice shows more kinds of stretch (rises,
+    falls and holds, see `stretches`) in both parts. What the displacement is has no say in it.
 
     Blocks begin at voltage reversals, so that a segment between two reversals is never cut unless
     it is longer than a block. Taking the held-out quarter from all over the record, rather than
@@ -65,19 +70,38 @@ def _held_out(record: Record, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
     """Return the blocks to hold out, one of every four; `index` (n,) is the block of each sample.
 
     Of all choices, the one that holds the fewest extremes of voltage and rate out, among the
-    samples that have a reading; of these the one nearest to the last of each four. The first block
-    is always fitted: the record's start is found there.
+    samples that have a reading; of these the one with the smallest share of samples whose kind of
+    stretch is not fitted, or not held out, which counts half; of these the one nearest to the last
+    of each four. The first block is always fitted: the record's start is found there.
     """
     voltage = record.voltage
     rate = np.r_[0.0, np.diff(voltage) / np.diff(record.time)]
     extremes = [_reaching(s, record.mask, index) for v in (voltage, rate) for s in (v, -v)]
     groups = [range(g, g + HELD_OUT_EVERY) for g in range(0, BLOCKS, HELD_OUT_EVERY)]
+    shares, near = _shares_of_kinds(record, index)
 
     def missed(choice: tuple[int, ...]) -> int:
         return sum(found <= set(choice) for found in extremes if found)
 
+    def unlike(choice: tuple[int, ...]) -> float:
+        whole = np.sum(shares, axis=1)
+        held = np.sum(shares[:, choice], axis=1)
+        unlearnt, unjudged = near @ (whole - held) < _SHOWN * whole, near @ held < _SHOWN * whole
+        return round(float(whole @ (unlearnt + 0.5 * unjudged)), 2)
+
     choices = (c for c in product(*groups) if 0 not in c)
-    return min(choices, key=lambda c: (missed(c), -sum(c), c))
+    return min(choices, key=lambda c: (missed(c), unlike(c), -sum(c), c))
+
+
+def _shares_of_kinds(record: Record, index: npt.NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Return the share of a record's samples in each kind of stretch and block, (kinds, blocks).
+
+    And which kinds are near each other, (kinds, kinds).
+    """
+    kinds, which = stretches(record, float(np.ptp(record.voltage)))
+    shares = np.zeros((len(kinds), BLOCKS))
+    np.add.at(shares, (which[record.mask], index[record.mask]), 1.0 / max(1, record.mask.sum()))
+    return shares, np.array([[float(k.near(other)) for other in kinds] for k in kinds])
 
 
 def _reaching(values: FloatArray, valid: BoolArray, index: npt.NDArray[np.int64]) -> set[int]:
@@ -105,28 +129,3 @@ def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Exper
         lead = np.arange(record.n) < max(8, record.n // 10)
         held.append(Experiment(record, record.mask & lead, record.mask & ~lead))
     return (*(whole(r) for r in records), *held)
-
-
-def reversals(voltage: FloatArray, threshold: float | None = None) -> npt.NDArray[np.int64]:
-    """Return the samples at which the voltage turns and comes back by more than `threshold` [V].
-
-    Without a threshold it is 1e-4 of the range, which is taken for noise.
-    """
-    threshold = 1e-4 * float(np.ptp(voltage)) if threshold is None else threshold
-    step = np.diff(voltage)
-    moving = np.flatnonzero(step)
-    up = step[moving] > 0
-    places = np.r_[0, moving[np.flatnonzero(up[1:] != up[:-1])] + 1, voltage.size - 1]
-    turns: list[int] = []
-    direction, extreme, level = 0, 0, float(voltage[0])
-    for k, v in zip(places.tolist(), voltage[places].tolist(), strict=True):
-        change = v - level
-        if direction == 0:
-            if abs(change) > threshold:
-                direction, extreme, level = (1 if change > 0 else -1), k, v
-        elif change * direction > 0:
-            extreme, level = k, v
-        elif -change * direction > threshold:
-            turns.append(extreme)
-            direction, extreme, level = -direction, k, v
-    return np.array(turns, dtype=np.int64)

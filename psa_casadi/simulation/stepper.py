@@ -101,8 +101,8 @@ def run(
 
     `unknowns` names the parameters of the sensitivities d output / d unknown; an integer k stands
     for the initial value of state k. `s0` (nx, k) is d x0 / d unknown, zero by default except for
-    the initial values themselves. `steps_limit` bounds the work between two samples, `steps_most` that of the
-    whole run; 0 is none.
+    the initial values themselves. `steps_limit` bounds the work between two samples,
+    `steps_most` that of the whole run; 0 is none.
 
     Sampled states start at `z0` (nz,), their declared starts by default. Steps end at their
     instants, also between the times; one at t[0] is taken before the first output, one at another

@@ -79,8 +79,8 @@ def trace(
 ) -> Traced:
     """Return one output of a run and its derivatives by `unknowns` (see `run`).
 
-    `steps_limit` bounds the stepper's work between two samples, `steps_most` its whole. Raises SimulationError where both
-    ways fail.
+    `steps_limit` bounds the stepper's work between two samples, `steps_most` that of the run.
+    Raises SimulationError where both ways fail.
     """
     none = np.zeros((len(t), 0))
     if not way.stepped:

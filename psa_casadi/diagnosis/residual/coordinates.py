@@ -10,7 +10,7 @@ from psa_casadi.diagnosis.residual.views import COARSE, FINE, Axis
 from psa_casadi.records.quality.fast_noise import fast_noise
 from psa_casadi.records.quality.repetitions import held
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import reversals
+from psa_casadi.records.turns import reversals
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]

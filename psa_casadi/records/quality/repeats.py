@@ -85,9 +85,8 @@ def holds(record: Record) -> Holds | None:
     pieces = []
     for start, stop in held(record):
         first = start + (stop - start) // 4
-        stop = min(stop, first + ENOUGH)
-        t = (record.time[first:stop] - record.time[start]) / record.duration
-        y = record.displacement[first:stop]
+        part = slice(first, min(stop, first + ENOUGH))
+        t, y = record.time[part] - record.time[start], record.displacement[part]
         d = _without_creep(t, y)
         while d is not None and _rings(d):
             half = d.size // 2
@@ -106,7 +105,8 @@ def _without_creep(t: FloatArray, y: FloatArray) -> FloatArray | None:
         return None
     place = t / t[-1]
     x = np.column_stack([np.ones_like(t), place, place**2, np.log(place)])
-    return y - x @ np.linalg.lstsq(x[there], y[there])[0]
+    left: FloatArray = y - x @ np.linalg.lstsq(x[there], y[there])[0]
+    return left
 
 
 def _rings(d: FloatArray) -> bool:
