@@ -87,7 +87,7 @@ def test_two_causes_are_found_whichever_of_their_like_leads(tmp_path: Path) -> N
     """A spring that hardens looks like a lost preload while a mode still rings."""
     make_record(
         "load_stiffness", 31003, tmp_path / "a.csv", visible=(1.0, 3.0),
-        second="structural_mode", second_visible=(1.0, 3.0),
+        more=("structural_mode",), more_visible=(1.0, 3.0),
     )  # fmt: skip
     record = read_record(tmp_path / "a.csv").slice(0, 3000)
     seen, task = _begun(record, ("preload_loss", "load_stiffness", "structural_mode"))

@@ -149,7 +149,8 @@ def test_ringing_after_a_step_is_no_noise_of_a_hold() -> None:
     n, step, omega = 6000, 1500, 2 * np.pi * 30.0
     since = STEP * (np.arange(n) % step)
     ringing = 30 * LEVEL * np.exp(-0.02 * omega * since) * np.cos(omega * since)
-    found = holds(record(10.0 * (np.arange(n) // step % 2), ringing + noise(n, 0.0)))
+    levels = np.where(np.arange(n) // step % 2, 10.0, 0.0)
+    found = holds(record(levels, np.asarray(ringing + noise(n, 0.0), np.float64)))
     assert found is not None
     assert found.level == pytest.approx(LEVEL, rel=0.25)
 

@@ -28,7 +28,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     def diagnosed(cases: Sequence[Case], method: Method) -> Sequence[Found]:
         return diagnose_all(cases, progress, method)
 
-    cases = chosen_cases(4 if quick else 1)
+    cases = chosen_cases(2 if quick else 1)
     whole = diagnosed(cases, Method())
     tables = [ablation_table("Without a step", without_steps(), whole, diagnosed)]
     if not quick:
@@ -91,7 +91,7 @@ def figures(found: Sequence[Found]) -> tuple[str, ...]:
     hidden = [f for f in found if f.case.kind in ("known", "weak", "two") and f.reached]
     clean = [f for f in found if f.case.kind in ("clean", "ringing")]
     open_ones = [f for f in found if f.case.kind in ("foreign", "left out") and not f.named]
-    wrong = [f for f in found if f.alone and f.alone not in (f.case.effect, f.case.second)]
+    wrong = [f for f in found if f.alone and f.alone not in f.case.hidden]
     patched = float(np.median([f.patched for f in open_ones])) if open_ones else 0.0
     return (
         f"{sum(_within(f) for f in hidden)} of {len(hidden)}",
@@ -112,5 +112,4 @@ def changed(whole: Sequence[Found], found: Sequence[Found]) -> str:
 
 
 def _within(f: Found) -> bool:
-    causes = {c for c in (f.case.effect, f.case.second) if c is not None}
-    return causes <= set(f.within)
+    return set(f.case.hidden) <= set(f.within)

@@ -42,7 +42,7 @@ def diagnose_all(
         for job in as_completed(jobs):
             one = job.result()
             found.append(one)
-            hidden = " and ".join(filter(None, (one.case.effect, one.case.second))) or "nothing"
+            hidden = " and ".join(one.case.hidden) or "nothing"
             progress(
                 f"{len(found)} of {len(cases)}: {one.case.kind}, {hidden} ({one.case.seed}), rho"
                 f" {one.rho:.2f}: {one.verdict} {', '.join(one.within)} [{one.seconds:.0f} s]"
@@ -69,12 +69,13 @@ def _share(found: Sequence[Found], holds: Callable[[Found], bool]) -> str:
 
 
 def _wrong(f: Found) -> bool:
-    return f.alone is not None and f.alone not in (f.case.effect, f.case.second)
+    return f.alone is not None and f.alone not in f.case.hidden
 
 
 def _summary(found: Sequence[Found]) -> TitledTable:
     known, weak, clean = (of_kind(found, k) for k in ("known", "weak", "clean"))
-    two = of_kind(found, "two")
+    two, three, six = (of_kind(found, k) for k in ("two", "three", "six"))
+    one = [f for k in ("known", "weak", "poor", "design", "six") for f in of_kind(found, k)]
     poor, ringing = ([f for f in found if f.case.kind == k] for k in ("poor", "ringing"))
     design = of_kind(found, "design")
     told = [f for f in known if f.named]
@@ -106,7 +107,13 @@ def _summary(found: Sequence[Found]) -> TitledTable:
         ("foreign plants: not named alone", "97 %",
          _share(of_kind(found, "foreign"), lambda f: f.alone is None)),
         ("two causes: both named, no third", "80 %",
-         _share(two, lambda f: set(f.named) == {f.case.effect, f.case.second})),
+         _share(two, lambda f: set(f.named) == set(f.case.hidden))),
+        ("three causes: all named, no fourth", "70 %",
+         _share(three, lambda f: set(f.named) == set(f.case.hidden))),
+        ("six records of a device: right name in the named set", "98 %",
+         _share(six, lambda f: f.case.effect in f.within)),
+        ("one cause: a second named beside the right one", "at most 3 %",
+         _share([f for f in one if f.case.effect in f.named], lambda f: len(f.named) > 1)),
         ("poor voltages: a single wrong name", "-", _share(poor, _wrong)),
         ("poor voltages: right in the set, or said to be blind", "-",
          _share(poor, lambda f: f.case.effect in (*f.within, *f.blind))),

@@ -20,12 +20,17 @@ from psa_casadi.diagnosis.result import Diagnosis, Verdict
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from tests.plants.again import play_again
 from tests.plants.designs import DesignKind
 from tests.plants.excitations import ExcitationKind, PoorKind
 from tests.plants.make import Truth, make_record
 from tests.plants.noise import NoiseKind
 
-Kind = Literal["known", "weak", "clean", "left out", "foreign", "two", "poor", "design", "ringing"]
+Kind = Literal[
+    "known", "weak", "clean", "left out", "foreign", "two", "poor", "design", "ringing",
+    "three", "six",
+]  # fmt: skip
 
 #: Ranges of rho, from which a case's is drawn evenly in its logarithm.
 ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
@@ -37,30 +42,38 @@ POOR: tuple[PoorKind, ...] = ("sine", "triangle", "steps", "slow", "loops")
 #: the static effects of the plants are no physics.
 DESIGNS: tuple[DesignKind, ...] = ("bipolar", "short", "long", "sines", "staircase", "small")
 RINGING: tuple[DesignKind, ...] = ("fast", "sweep", "short")
+#: Samples of each of several records of a device.
+_CUT = 2400
 #: Noises of the cases of one effect, in turn: most sensors' is white, many have a filter.
 NOISES: tuple[NoiseKind, ...] = ("white", "ar", "white", "quantised", "drop-outs")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One record: what is hidden in it, with which noise and voltage, from which seed."""
+    """Records of one device: what is hidden, with which noise and voltage, from which seed."""
 
     kind: Kind
     effect: str | None
     seed: int
     rho: tuple[float, float] = ORDINARY
-    second: str | None = None
+    more: tuple[str, ...] = ()
     noise: NoiseKind = "white"
     excitation: ExcitationKind = "rich"
+    records: int = 1
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of all that is hidden."""
+        return (*((self.effect,) if self.effect else ()), *self.more)
 
 
 @dataclass(frozen=True)
 class Found:
     """What a diagnosis said of a case.
 
-    `rho` was reached, of two causes the smaller, 0 where nothing is hidden; `named` are the causes,
-    `within` the named ones with what they cannot be told from; `blind` the effects that the record
-    is said not to show. `confidence` is that of the first cause; `probability` and
+    `rho` was reached, of several causes the smallest, 0 where nothing is hidden; `named` are the
+    causes, `within` the named ones with what they cannot be told from; `blind` the effects that the
+    record is said not to show. `confidence` is that of the first cause; `probability` and
     `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
     the noise; `seconds` the processor time; `patch` the unnamed correction that is offered, which
     would remove the share `patched` of the base's held-out excess.
@@ -97,37 +110,46 @@ class Found:
         return self.named == (self.case.effect,) == self.within
 
 
+def records_of(case: Case, folder: Path) -> tuple[Truth, list[Record]]:
+    """Make the records of a case as files in a folder, and read them."""
+    path = folder / "record_0.csv"
+    truth = make_record(
+        case.effect,
+        case.seed,
+        path,
+        noise=case.noise,
+        excitation=case.excitation,
+        visible=case.rho if case.effect else None,
+        more=case.more,
+        more_visible=case.rho if case.more else None,
+    )
+    paths = [path]
+    for k in range(1, case.records):
+        paths.append(folder / f"record_{k}.csv")
+        play_again(truth, case.seed + 10_000 * k, paths[-1])
+    records = [read_record(p) for p in paths]
+    if case.records > 1:
+        records = [r.slice(0, min(_CUT, r.n)) for r in records]
+    return truth, records
+
+
 def run_case(case: Case, method: Method | None = None) -> Found:
-    """Make the record of a case, diagnose the file, and compare."""
+    """Make the records of a case, diagnose the files, and compare."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "record.csv"
-        truth = make_record(
-            case.effect,
-            case.seed,
-            path,
-            noise=case.noise,
-            excitation=case.excitation,
-            visible=case.rho if case.effect else None,
-            second=case.second,
-            second_visible=case.rho if case.second else None,
-        )
-        record = read_record(path)
+        truth, records = records_of(case, Path(folder))
     table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.effect]
     begin = time.process_time()
-    d = diagnose([record], effects=table, method=method)
+    d = diagnose(records, effects=table, method=method)
     return _found(case, d, truth, time.process_time() - begin)
 
 
 def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
     named = tuple(c.effect for c in d.causes)
     alike = tuple(n for c in d.causes for n in c.cannot_be_told_from)
-    held = d.experiments[0].held_out
-    noise = np.asarray(d.experiments[0].record.displacement) - truth.displacement
-    level = float(np.sqrt(np.mean(noise[held] ** 2)))
     patched = None if d.budget is None else d.budget.unnamed
     return Found(
         case=case,
-        rho=min(float(h.visible) for h in (truth, truth.second) if h is not None),
+        rho=float(min([truth.visible, *(h.visible for h in truth.more)])),
         verdict=d.verdict,
         named=named,
         within=tuple(dict.fromkeys((*named, *alike))),
@@ -135,11 +157,20 @@ def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
         confidence=d.causes[0].confidence if d.causes else 0.0,
         probability={c.effect: c.probability for c in d.candidates},
         evidence={c.effect: c.evidence for c in d.candidates},
-        ratio=d.extended_errors.holdout_rms_m / level,
+        ratio=d.extended_errors.holdout_rms_m / _level(d, truth),
         seconds=seconds,
         patch="" if d.patch is None else d.patch.name,
         patched=0.0 if not patched else patched.share,
     )
+
+
+def _level(d: Diagnosis, truth: Truth) -> float:
+    """Return the rms of the noise that was added, of a first record in its held-out samples [m]."""
+    if len(d.experiments) > 1:
+        return truth.sigma
+    held = d.experiments[0].held_out
+    noise = np.asarray(d.experiments[0].record.displacement) - truth.displacement
+    return float(np.sqrt(np.mean(noise[held] ** 2)))
 
 
 def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: int) -> list[Case]:
@@ -164,7 +195,7 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
     cases += [Case("foreign", e, next(seed)) for e in foreign for _ in half]
     for _ in range(3 * seeds):
         one, other = rng.choice(known, 2, replace=False)
-        cases.append(Case("two", str(one), next(seed), STRONG, str(other)))
+        cases.append(Case("two", str(one), next(seed), STRONG, (str(other),)))
     for k in range(4 * seeds):
         poor = POOR[k % len(POOR)]
         cases.append(Case("poor", str(rng.choice(known)), next(seed), excitation=poor))
@@ -173,4 +204,9 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
         cases.append(Case("design", str(rng.choice(known)), next(seed), excitation=design))
     for k in range(3 * seeds):
         cases.append(Case("ringing", None, next(seed), excitation=RINGING[k % len(RINGING)]))
+    for _ in range(2 * seeds):
+        one, *others = (str(name) for name in rng.choice(known, 3, replace=False))
+        cases.append(Case("three", one, next(seed), STRONG, tuple(others)))
+    for _ in range(3 * seeds):
+        cases.append(Case("six", str(rng.choice(known)), next(seed), records=6))
     return cases

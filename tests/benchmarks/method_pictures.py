@@ -33,7 +33,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     """Search one record, and say where its error goes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "record.csv"
-        make_record(HIDDEN[0], SEED, path, visible=RHO, second=HIDDEN[1], second_visible=RHO)
+        make_record(HIDDEN[0], SEED, path, visible=RHO, more=HIDDEN[1:], more_visible=RHO)
         record = read_record(path)
     if quick:
         record = record.slice(0, 3000)

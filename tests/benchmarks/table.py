@@ -52,6 +52,11 @@ BENCHES: dict[str, Bench] = {
             "the diagnosis without each of its steps, and with each deciding constant moved",
         ),
         _later(
+            "stability",
+            "stability",
+            "the diagnosis of data changed by 1 % of their noise: verdicts and names that stay",
+        ),
+        _later(
             "method_pictures",
             "method",
             "the picture of docs/method.md: the hypotheses of one search, and its error budget",

@@ -31,11 +31,7 @@ def play_again(
     truth = in_terms_of(truth, times, command)
     run = simulate_base(truth.stack, times, command)
     clean, temperature = run.displacement, None
-    parts = [] if truth.effect is None else [(truth.effect, truth.parameters, truth.gain)]
-    if truth.second is not None:
-        second = truth.second
-        parts.append((second.effect.name, second.parameters, second.gain))
-    for name, parameters, gain in parts:
+    for name, parameters, gain in truth.hidden:
         effect = effect_called(name)
         clean = clean + effect.contribution(run, parameters, gain)
         if effect.room is not None:

@@ -1,4 +1,4 @@
-"""Synthetic records with one hidden effect, or none, or two, and the truth behind them.
+"""Synthetic records with one hidden effect, none, or several, and the truth behind them.
 
     python -m tests.plants.make demo OUT.csv
     python -m tests.plants.make EFFECT SEED OUT.csv
@@ -39,8 +39,8 @@ class Truth:
     the gain wanted was beyond the effect's plausible range and was clipped. times, voltage,
     displacement, base_displacement: (N,) clean [s, V, m], the last without any effect. noise: kind
     and figures of the noise; lost: (N,) True where a sample is missing or stuck. excitation: class
-    of the voltage. temperature: (N,) [degC] where the record has a thermometer. second: a second
-    hidden effect, added to the first.
+    of the voltage. temperature: (N,) [degC] where the record has a thermometer. more: further
+    hidden effects, added to the first.
     """
 
     effect: str | None
@@ -60,7 +60,13 @@ class Truth:
     lost: npt.NDArray[np.bool_]
     excitation: ExcitationKind
     temperature: FloatArray | None
-    second: Hidden | None
+    more: tuple[Hidden, ...]
+
+    @property
+    def hidden(self) -> tuple[tuple[str, Mapping[str, float], float], ...]:
+        """Name, parameters and gain of every hidden effect."""
+        first = () if self.effect is None else ((self.effect, self.parameters, self.gain),)
+        return (*first, *((h.effect.name, h.parameters, h.gain) for h in self.more))
 
 
 def make_record(
@@ -72,40 +78,43 @@ def make_record(
     noise: NoiseKind = "white",
     excitation: ExcitationKind = "rich",
     visible: Visible | None = None,
-    second: str | None = None,
-    second_strength: float = 1.0,
-    second_visible: Visible | None = None,
+    more: tuple[str, ...] = (),
+    more_visible: Visible | None = None,
 ) -> Truth:
     """Write a synthetic record as CSV and return the truth; the same seed gives the same bytes.
 
     effect: a name of `HIDDEN_EFFECTS` or None. strength scales the drawn visible ratio (1.5 to 4);
     0 removes the effect; `visible` (a ratio or a range) replaces it. The same seed gives the same
-    stack, voltage and noise with every effect, and the same stack with every excitation. second: a
-    further effect with its own strength; what the two add is summed, because their interaction is
-    the product of two small shares of the stroke, far below the noise.
+    stack, voltage and noise with every effect, and the same stack with every excitation. more:
+    further effects, each as visible as `more_visible` says; what they add is summed, because their
+    interaction is the product of two small shares of the stroke, far below the noise.
     """
     _check(noise, excitation)
-    chosen = [None if name is None else effect_called(name) for name in (effect, second)]
-    base_rng, effect_rng, noise_rng, second_rng = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(4)
+    chosen = None if effect is None else effect_called(effect)
+    further = [effect_called(name) for name in more]
+    base_rng, effect_rng, noise_rng, *more_rng = (
+        np.random.default_rng(child)
+        for child in np.random.SeedSequence(seed).spawn(3 + len(further))
     )
     stack = draw_stack(base_rng)
     run = simulate_base(stack, *draw_excitation(base_rng, excitation, stack.u_rated))
     kind = draw_noise(noise_rng, noise, float(np.ptp(run.displacement)))
-    directions = np.empty((run.times.size, 0)) if chosen == [None, None] else base_directions(run)
-    orders = (
-        (chosen[0], effect_rng, strength, visible),
-        (chosen[1], second_rng, second_strength, second_visible),
+    bare = chosen is None and not further
+    directions = np.empty((run.times.size, 0)) if bare else base_directions(run)
+    first = (
+        None
+        if chosen is None
+        else hide(chosen, run, effect_rng, directions, kind.rms, strength, visible)
     )
-    first, other = (
-        None if one is None else hide(one, run, rng, directions, kind.rms, size, ratio)
-        for one, rng, size, ratio in orders
+    others = tuple(
+        hide(one, run, rng, directions, kind.rms, 1.0, more_visible)
+        for one, rng in zip(further, more_rng, strict=True)
     )
     clean = run.displacement
-    for found in (first, other):
+    for found in (first, *others):
         clean = clean if found is None else clean + found.added
     read, lost = disturb(noise_rng, kind, clean)
-    truth = _truth(run, clean, kind, lost, excitation, first, other)
+    truth = _truth(run, clean, kind, lost, excitation, first, others)
     write_csv(path, run.times, run.command, read, truth.temperature)
     return truth
 
@@ -123,10 +132,10 @@ def _truth(
     lost: npt.NDArray[np.bool_],
     excitation: ExcitationKind,
     first: Hidden | None,
-    second: Hidden | None,
+    more: tuple[Hidden, ...],
 ) -> Truth:
     temperature = None
-    for found in (first, second):
+    for found in (first, *more):
         if found is not None and found.effect.room is not None:
             temperature = found.effect.room(run.times, found.parameters)
     return Truth(
@@ -147,7 +156,7 @@ def _truth(
         lost=lost,
         excitation=excitation,
         temperature=temperature,
-        second=second,
+        more=more,
     )
 
 

@@ -25,7 +25,7 @@ _IN_LENGTHS = ("exponential", "q", "s_1")
 def in_terms_of(truth: Truth, times: FloatArray, command: FloatArray) -> Truth:
     """Return the truth whose effect on times (N,) [s] and commands (N,) [V] is the same device's.
 
-    A second effect stays as it is.
+    Further effects stay as they are.
     """
     if truth.effect == "offset_drift":
         ratio = _length(times) / _length(truth.times)

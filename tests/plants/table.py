@@ -1,6 +1,7 @@
 """All hidden effects by name."""
 
 from tests.plants.ageing import AGEING
+from tests.plants.asymmetric_memory import ASYMMETRIC_MEMORY
 from tests.plants.backlash import BACKLASH
 from tests.plants.charge_leakage import CHARGE_LEAKAGE
 from tests.plants.cross_axis import CROSS_AXIS
@@ -65,6 +66,7 @@ HIDDEN_EFFECTS: dict[str, HiddenEffect] = {
         CROSS_AXIS,
         RANGE_SWITCH,
         SOURCE_POWER,
+        ASYMMETRIC_MEMORY,
     )
 }
 """In the project's table, then the foreign ones. Reciprocal coupling has a plant of its own

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from tests.plants import cross_axis, guide_stiffness, range_switch, source_power
+from tests.plants import (
+    asymmetric_memory,
+    cross_axis,
+    guide_stiffness,
+    hysteresis_memory,
+    range_switch,
+    source_power,
+)
 from tests.plants.base import Run, simulate_base
 from tests.plants.dead_zone_hysteresis import preisach
 from tests.plants.excitation import draw_voltage
@@ -79,3 +86,14 @@ def test_flicker_is_stationary_and_correlated_over_its_time() -> None:
         expected = (1.0 + lag / 50.0) * np.exp(-lag / 50.0)
         assert np.mean(n[lag:] * n[:-lag]) == pytest.approx(expected, abs=0.06)
     assert np.std(n[:30_000]) == pytest.approx(np.std(n[30_000:]), rel=0.2)
+
+
+def test_asymmetric_memory_is_a_play_and_its_square(run: Run) -> None:
+    """No weight on squares gives the plays alone; branches differ most at the top of the span."""
+    drawn = asymmetric_memory.draw(np.random.default_rng(3), run)
+    plain = asymmetric_memory.contribution(run, {**drawn, "b": 0.0}, 0.1)
+    assert np.allclose(plain, hysteresis_memory.contribution(run, drawn, 0.1), atol=1e-15)
+    squares = asymmetric_memory.contribution(run, {**drawn, "b": 1.0}, 0.1) - plain
+    top = run.command > 0.8 * run.command.max()
+    low = run.command < 0.2 * run.command.max()
+    assert np.ptp(squares[top]) > 2.0 * np.ptp(squares[low])

@@ -107,16 +107,16 @@ def test_visible_ratio_is_what_was_asked_for(effect: str, tmp_path: Path) -> Non
 
 def test_two_effects_add_up(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    both = make_record("slow_creep", 5, path, second="mains_hum", second_visible=2.0)
+    both = make_record("slow_creep", 5, path, more=("mains_hum",), more_visible=2.0)
     read = column(path, 2)
     alone = make_record("slow_creep", 5, path)
-    assert both.second is not None
-    assert both.second.effect.name == "mains_hum"
-    assert both.second.visible == pytest.approx(2.0, rel=0.01)
+    (second,) = both.more
+    assert second.effect.name == "mains_hum"
+    assert second.visible == pytest.approx(2.0, rel=0.01)
     assert both.gain == alone.gain
-    assert np.allclose(both.displacement, alone.displacement + both.second.added, atol=1e-18)
+    assert np.allclose(both.displacement, alone.displacement + second.added, atol=1e-18)
     assert np.std(read * 1e-6 - both.displacement) == pytest.approx(both.sigma, rel=0.05)
-    only = make_record(None, 5, path, second="mains_hum", second_visible=2.0)
+    only = make_record(None, 5, path, more=("mains_hum",), more_visible=2.0)
     assert only.effect is None
     assert np.array_equal(only.displacement - only.base_displacement != 0.0, only.times >= 0.0)
 
