@@ -1,0 +1,42 @@
+"""README's rows on the measured micromanipulator are what a diagnosis says of it."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.records import read_record
+
+README = Path(__file__).parent.parent / "README.md"
+FILES = {"`sine_1hz.csv`": ("sine_1hz",), "`minor_loops.csv`": ("minor_loops",),
+         "both files": ("sine_1hz", "minor_loops")}  # fmt: skip
+
+
+def rows() -> dict[str, list[str]]:
+    """Cells of the table under `psa diagnose` on, by their first one."""
+    table = README.read_text(encoding="utf-8").split("| `psa diagnose` on |")[1].split("\n\n")[0]
+    cells = [[c.strip() for c in line.strip("|").split("|")] for line in table.split("\n")[2:]]
+    return {row[0]: row[1:] for row in cells}
+
+
+def percent(cell: str) -> float:
+    found = re.match(r"([0-9.]+) %", cell)
+    assert found is not None, cell
+    return float(found[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", FILES)
+def test_the_measured_row_is_played_again(given: str, measured_data: Path) -> None:
+    base, extended, said = rows()[given]
+    files = [measured_data / "micromanipulator" / f"{name}.csv" for name in FILES[given]]
+    d = diagnose([read_record(f) for f in files])
+    assert said.startswith(f"`{d.verdict}`")
+    named = {n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)}
+    written = set(re.findall(r"`([a-z_]+)`", said)) & set(EFFECTS)
+    assert {c.effect for c in d.causes} <= written <= named
+    assert d.base_errors.holdout_nrmse_percent == pytest.approx(percent(base), abs=0.01)
+    after = percent(base) if extended == "the same" else percent(extended)
+    assert d.extended_errors.holdout_nrmse_percent == pytest.approx(after, abs=0.01)
