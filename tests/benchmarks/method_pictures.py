@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.search.best_first import Searched, best_first
+from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
+from psa_casadi.diagnosis.search.known import Searched
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.search.multistart import fit_base

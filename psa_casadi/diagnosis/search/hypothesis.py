@@ -23,6 +23,7 @@ from psa_casadi.diagnosis.screening.evidence import evidence
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.stepper import SimulationError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -85,6 +86,16 @@ def hypothesis(
     held = held_out_rms(experiments, predicted)
     whole = rms(np.concatenate(whole_residuals(experiments, predicted)))
     return Hypothesis(tuple(causes), fit, predicted, held, whole, final=final)
+
+
+def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
+    """Return a base fit as the hypothesis without causes. Raises SimulationError."""
+    root = hypothesis((), base, experiments, final=True)
+    if root is None:
+        raise SimulationError(
+            "The fitted base cannot be simulated over the whole records; start from a model."
+        )
+    return root
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,15 +10,14 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.noise.residual_tests import Omnibus
 from psa_casadi.diagnosis.screening.evidence import levelled, probabilities, temperature
 from psa_casadi.diagnosis.screening.screen import Screening
-from psa_casadi.diagnosis.search.best_first import Searched
 from psa_casadi.diagnosis.search.fits import with_cause, without
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, root_of
+from psa_casadi.diagnosis.search.known import Searched
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import in_character
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.simulation.stepper import SimulationError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -86,10 +85,7 @@ def steps_of(found: Searched, task: Task) -> list[Step]:
 
 def unsearched(base: Fit, task: Task) -> list[Step]:
     """Return the one step of a base fit that is not worth a search."""
-    root = hypothesis((), base, task.experiments, final=True)
-    if root is None:
-        raise SimulationError("The fitted base cannot be simulated over the whole records.")
-    view = examine(root, task)
+    view = examine(root_of(base, task.experiments), task)
     return [Step(view, evidence=view.estimated())]
 
 

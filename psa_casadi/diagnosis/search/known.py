@@ -1,0 +1,187 @@
+"""What a search has found so far: every hypothesis by its causes, and which of them is the best."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
+from psa_casadi.diagnosis.search.fits import to_end
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of
+from psa_casadi.diagnosis.search.view import View, examine
+from psa_casadi.diagnosis.search.worth import confirmed, in_character
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.simulation.side_by_side import side_by_side
+
+#: Neighbours are nearly as likely as the best one if their evidence is this share of its, or within
+#: so many nats of it.
+SHARE, NEAR = 0.8, 30.0
+#: Effects far behind in the screening are fitted afresh where less than this share of the excess
+#: power is explained.
+_EXPLAINED = 0.8
+
+Names = frozenset[str]
+NONE: Names = frozenset()
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """What a search has found: every hypothesis by its causes, and the best of them.
+
+    `views` are of hypotheses whose residual was looked at, `fitted` the effects fitted beside each.
+    """
+
+    best: Hypothesis
+    known: dict[Names, Hypothesis]
+    views: dict[Names, View]
+    fitted: dict[Names, tuple[str, ...]]
+    worth: frozenset[Names]
+    scale: Scale
+
+
+class Known:
+    """The hypotheses of a search, from a base fit on. Raises SimulationError where that one fails.
+
+    `closed` are the causes of hypotheses that leave nothing, whatever more causes would explain.
+    """
+
+    def __init__(self, base: Fit, task: Task) -> None:
+        self.base, self.task = base, task
+        root = root_of(base, task.experiments)
+        first = examine(root, task)
+        self.trials = first.trials
+        self.scale = Scale(base, first.screening.colour, thresholds().price)
+        self.found: dict[Names, Hypothesis] = {root.names: root}
+        self.views: dict[Names, View] = {root.names: first}
+        self.fitted: dict[Names, tuple[str, ...]] = {}
+        self.closed: set[Names] = set()
+
+    @property
+    def root(self) -> Hypothesis:
+        """The base without causes, as it is fitted by now."""
+        return self.found[NONE]
+
+    def get(self, names: Names) -> Hypothesis | None:
+        """Return the hypothesis with these causes, None if there is none yet."""
+        return self.found.get(names)
+
+    def result(self) -> Searched:
+        """Return what was found, the best hypothesis looked at."""
+        best = self.best()
+        self.view(best)
+        worth = frozenset(n for n, h in self.found.items() if self.worth(h))
+        return Searched(best, self.found, self.views, self.fitted, worth, self.scale)
+
+    def note(self, found: Hypothesis | None) -> None:
+        """Keep a hypothesis if it is the best of its causes."""
+        if found is None:
+            return
+        old = self.found.get(found.names)
+        if old is None or self.scale.evidence(found) > self.scale.evidence(old):
+            causes = found.causes if old is None else old.causes
+            self.found[found.names] = replace(found, causes=causes)
+
+    def view(self, h: Hypothesis) -> View:
+        """Look at what a hypothesis leaves; the noise of all others is told from the best one."""
+        old = self.views.get(h.names)
+        if old is None or old.of is not h:
+            known = self.trials if h.causes else ()
+            self.views[h.names] = old = examine(h, self.task, known)
+        if h is self.best():
+            self.scale = replace(self.scale, colour=old.screening.colour)
+        return old
+
+    def children(self, h: Hypothesis) -> list[Hypothesis]:
+        """Return the hypotheses with one more cause that were fitted beside one, best first."""
+        names = self.fitted.get(h.names, ())
+        found = [self.found.get(h.names | {n}) for n in names]
+        own = [replace(c, causes=(*h.causes, _added(c, h))) for c in found if c is not None]
+        return sorted(own, key=lambda c: -self.scale.evidence(c))
+
+    def leaders(self, h: Hypothesis) -> list[Hypothesis]:
+        """Return those of the children that are nearly as likely as the best one, best first."""
+        own, children = self.scale.evidence(h), self.children(h)
+        gains = [self.scale.evidence(c) - own for c in children]
+        least = min(SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
+        return [c for c, gained in zip(children, gains, strict=True) if gained > least]
+
+    def remember(self, h: Hypothesis, *names: str) -> None:
+        """Keep that these effects were fitted beside a hypothesis."""
+        self.fitted[h.names] = tuple(dict.fromkeys([*self.fitted.get(h.names, ()), *names]))
+
+    def ranked(self) -> list[Hypothesis]:
+        """Return all hypotheses, that of the highest score first."""
+        return sorted(self.found.values(), key=lambda h: -self.scale.score(h))
+
+    def best(self) -> Hypothesis:
+        """Return the answer so far: of the highest score and worth having, fitted to its end.
+
+        Where nothing is left of a hypothesis with fewer causes, that one.
+        """
+        for names in sorted(self.closed, key=len):
+            return self.found[names]
+        while True:
+            top = next(h for h in self.ranked() if self.worth(h))
+            if top.final:
+                return top
+            self.finish([top])
+
+    def finish(self, hypotheses: Sequence[Hypothesis]) -> None:
+        """Fit hypotheses to their end."""
+        if hypotheses:
+            names = ", ".join("+".join(sorted(h.names)) for h in hypotheses)
+            self.task.progress(f"{names} to the end")
+        for ended in side_by_side(lambda h: to_end(h, self.task.experiments), hypotheses):
+            old = self.found[ended.names]
+            better = self.scale.evidence(ended) >= self.scale.evidence(old)
+            self.found[ended.names] = ended if better else replace(old, final=True)
+
+    def worth(self, h: Hypothesis) -> bool:
+        """Whether every cause removes what can be told, and held-out data confirm it."""
+        root = self.root
+        knowable = self.views[root.names].test.knowable
+        experiments, out = self.task.experiments, self.task.method.without
+        for cause in h.causes:
+            if not in_character(h.fit, cause, experiments):
+                return False
+            before = self.found.get(h.names - {cause.name})
+            if before is None:
+                continue
+            if h.removes(before) <= knowable**2:
+                return False
+            if before.causes and "form" not in out and h.share(before, root) <= thresholds().form:
+                return False
+            if "held out" in out:
+                continue
+            seen = self.views.get(before.names)
+            alarm = seen is None or seen.test.alarm
+            if not confirmed(h, before, experiments, self.scale.colour, alarm=alarm):
+                return False
+        return True
+
+    def gained(self, before: Hypothesis, after: Hypothesis) -> bool:
+        """Whether a fit has more evidence than an earlier one by the price of a cause."""
+        return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.price
+
+    def different(self, effect: Component, h: Hypothesis) -> bool:
+        """Whether an effect bends another curve than the causes of a hypothesis do."""
+        groups = self.task.alike(self.root.fit)
+        return not any(effect.name in g and h.names & set(g) for g in groups)
+
+    def is_open(self, h: Hypothesis) -> bool:
+        """Whether structure remains and the causes explain less than most of the excess."""
+        colour = self.view(h).screening.colour
+        floor = noise_rms(h.fit.residuals, colour)
+        excess = excess_power(self.base.residuals, colour, floor)
+        explained = self.base.rms**2 - h.power
+        return self.view(h).test.alarm and explained < _EXPLAINED * excess
+
+
+def is_left(view: View) -> bool:
+    """Whether anything is left to explain."""
+    return view.test.alarm or view.shows
+
+
+def _added(child: Hypothesis, parent: Hypothesis) -> Component:
+    return next(c for c in child.causes if c.name not in parent.names)
