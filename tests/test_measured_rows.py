@@ -37,6 +37,9 @@ def test_the_measured_row_is_played_again(given: str, measured_data: Path) -> No
     named = {n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)}
     written = set(re.findall(r"`([a-z_]+)`", said)) & set(EFFECTS)
     assert {c.effect for c in d.causes} <= written <= named
+    assert not named & {b.effect for b in d.blind_to}
+    withdrawn = [n for n in d.notes if "not named, because" in n]
+    assert bool(withdrawn) == (d.verdict == "unexplained")
     assert d.base_errors.holdout_nrmse_percent == pytest.approx(percent(base), abs=0.01)
     after = percent(base) if extended == "the same" else percent(extended)
     assert d.extended_errors.holdout_nrmse_percent == pytest.approx(after, abs=0.01)

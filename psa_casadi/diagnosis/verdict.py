@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.budget import Budget, Removed, budget
-from psa_casadi.diagnosis.corrections.correct import corrections
+from psa_casadi.diagnosis.corrections.correct import Correction, corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
 from psa_casadi.diagnosis.corrections.patch import patch_of
 from psa_casadi.diagnosis.held_out.coverage import coverage_notes
@@ -86,10 +86,11 @@ def conclude(
         corrections=beside_base,
         shares=[removed.from_base(c.predicted) for c in beside_base],
     )
+    beaten = weighed.beaten_by()
     verdict: Verdict = (
         "not_driven"
         if not driven
-        else verdict_of(steps, missing=missing, beaten=weighed.beaten_by() is not None, share=share)
+        else verdict_of(steps, missing=missing, beaten=beaten is not None, share=share)
     )
     named = [s for s in steps if s.chosen] if verdict in NAMING else []
     final = last if named else first
@@ -118,12 +119,16 @@ def conclude(
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain_of(experiments, first.predicted, final.predicted),
-        blind_to=_blind_spots(final, table),
+        blind_to=_blind_spots(final, [e for e in table if e.name not in _shown(steps)]),
         remaining=_remaining(final, Excess() if named else beyond),
         next_experiment=_next_experiment(
             causes, verdict, same_curves(experiments, table, first.fit)
         ),
-        notes=(*(() if stiffness_given else (FORCE_NOTE,)), *coverage_notes(experiments)),
+        notes=(
+            *(() if stiffness_given else (FORCE_NOTE,)),
+            *(_withdrawn(steps, weighed, beaten) if verdict == "unexplained" else ()),
+            *coverage_notes(experiments),
+        ),
         experiments=tuple(experiments),
         base_fit=first.fit,
         extended_fit=final.fit,
@@ -156,6 +161,37 @@ def patched_model(d: Diagnosis) -> Model:
     given = d.model.provenance.force_scale == "given"
     told = determinacy(found, d.experiments)
     return with_provenance(found.model, told, [e.record for e in d.experiments], given)
+
+
+def _shown(steps: Sequence[Step]) -> set[str]:
+    """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
+
+    Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
+    """
+    price = thresholds().price
+    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > price}
+    return fitted.union(*(told_from(s) for s in steps))
+
+
+def _withdrawn(
+    steps: Sequence[Step], weighed: Weighed, beaten: Correction | None
+) -> tuple[str, ...]:
+    """Say which names were found but not told, and why."""
+    names = ", ".join(s.cause.name for s in steps if s.chosen is not None)
+    if not names:
+        return ()
+    found = (
+        f"{names}: found with a ln of the Bayes factor over the base of {weighed.evidence:.0f},"
+        f" would remove {100 * max(0.0, weighed.share):.0f} % of the held-out error above the noise"
+    )
+    if beaten is None:
+        least = 100 * thresholds().partly
+        return (f"{found}; not named, because that is less than {least:.0f} % and much remains.",)
+    share = weighed.shares[list(weighed.corrections).index(beaten)]
+    return (
+        f"{found}; not named, because an unnamed correction explains more: {beaten.kind.sentence},"
+        f" with {beaten.evidence:.0f} and {100 * share:.0f} %.",
+    )
 
 
 def _misfits(
