@@ -4,7 +4,7 @@ Every set of causes has one hypothesis, the best fit of it that was found. The b
 looked at: is anything left in its residual? Then its neighbours are fitted: the base with
 resonances that it has missed; with one more cause; with one less (which fits the base again from
 where the cause has led); with one cause in another's place. That goes on while one of them is
-better, or, where something is left, with the next best ones until the budget ends.
+better; where much is left, from another base and with all effects.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ from psa_casadi.diagnosis.search.fits import (
     without,
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.known import NEAR, NONE, SHARE, Known, Names, Searched, is_left
+from psa_casadi.diagnosis.search.known import NEAR, NONE, Known, Names, Searched, is_left
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -79,9 +79,9 @@ class _Search:
     # What to do next
 
     def next(self) -> Hypothesis | None:
-        """Return the hypothesis to visit: the best or one on its way; else the next best one.
+        """Return the hypothesis to visit: the best one, or one on its way that has become better.
 
-        None where nothing is left in the best one, or nothing else is worth a visit.
+        None where neither is new, and nothing dear is left to try.
         """
         best = self.known.best()
         way = [self.known.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
@@ -95,9 +95,7 @@ class _Search:
             return self.next()
         if self.known.is_open(best) and self.otherwise():
             return self.next()
-        if not self.known.view(best).shows or "going back" in self.task.method.without:
-            return None
-        return self.second_best(best)
+        return None
 
     def otherwise(self) -> bool:
         """Try what is dear, where most is left: another base, all effects; whether that was new."""
@@ -127,15 +125,6 @@ class _Search:
             return False
         self.known.closed.add(h.names)
         return True
-
-    def second_best(self, best: Hypothesis) -> Hypothesis | None:
-        """Return the best first cause that was not visited and may lead further than the best."""
-        least = SHARE * self.known.scale.score(best)
-        for h in self.known.ranked():
-            near = self.known.scale.score(h) > least and len(h.causes) == 1
-            if near and h.names not in self.expanded and self.known.worth(h):
-                return h
-        return None
 
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""

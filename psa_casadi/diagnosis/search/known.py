@@ -16,7 +16,7 @@ from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Neighbours are nearly as likely as the best one if their evidence is this share of its, or within
 #: so many nats of it.
-SHARE, NEAR = 0.8, 30.0
+_SHARE, NEAR = 0.8, 30.0
 #: Effects far behind in the screening are fitted afresh where less than this share of the excess
 #: power is explained.
 _EXPLAINED = 0.8
@@ -103,7 +103,7 @@ class Known:
         """Return those of the children that are nearly as likely as the best one, best first."""
         own, children = self.scale.evidence(h), self.children(h)
         gains = [self.scale.evidence(c) - own for c in children]
-        least = min(SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
+        least = min(_SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
         return [c for c, gained in zip(children, gains, strict=True) if gained > least]
 
     def remember(self, h: Hypothesis, *names: str) -> None:
