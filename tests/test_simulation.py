@@ -175,6 +175,19 @@ def test_a_limit_of_steps_stops_a_costly_trial() -> None:
         run(model, t, u, np.zeros(7), steps_limit=5)
 
 
+def test_the_steps_of_a_whole_run_are_bounded() -> None:
+    """As many as it takes are enough, one less is not."""
+    model = stack("P-885.51", **LINEAR)
+    t = np.linspace(0.0, 1e-2, 101)
+    u = np.column_stack([50.0 * np.sin(600.0 * t), np.zeros_like(t)])
+    x0 = np.zeros(len(model.state_names))
+    whole = run(model, t, u, x0)
+    taken = whole.steps + whole.rejected
+    assert run(model, t, u, x0, steps_most=taken).steps == whole.steps
+    with pytest.raises(SimulationError, match="too many steps"):
+        run(model, t, u, x0, steps_most=taken - 1)
+
+
 def test_bad_samples_are_named() -> None:
     model, t = stack("PTBS200"), np.array([0.0, 0.1, 0.1])
     with pytest.raises(InputError) as caught:

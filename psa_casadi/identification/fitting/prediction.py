@@ -24,9 +24,10 @@ from psa_casadi.simulation.ways import Traced, Way, trace
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Steps between two samples, and mean ones of a whole record, beyond which a trial point counts as
-#: failed. Dozens are ordinary; of 74 runs in 19 diagnoses the means were 25 and less but for two.
-_STEPS, _MEAN_STEPS = 2000, 60
+#: Steps between two samples, and mean ones of a record, beyond which a trial point counts as failed.
+#: Dozens are ordinary: of 74 runs in 19 diagnoses the means were 25 and less, but for two. The mean
+#: is meant at this tolerance of a step, and grows as the root of the method's order below.
+_STEPS, _MEAN_STEPS, _AT, _ORDER = 2000, 60, 1e-5, 4
 OUTPUT = "measured_displacement"
 
 
@@ -104,7 +105,7 @@ def trace_record(
         unknowns=unknowns,
         s0=s0,
         steps_limit=_STEPS,
-        steps_most=_MEAN_STEPS * stop,
+        steps_most=int(_MEAN_STEPS * max(1.0, _AT / way.step_rtol) ** (1.0 / _ORDER) * stop),
     )
 
 
