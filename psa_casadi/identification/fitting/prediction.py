@@ -24,7 +24,7 @@ from psa_casadi.simulation.ways import Traced, Way, trace
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Steps between two samples, and mean ones of a record, beyond which a trial point counts as failed.
+#: Steps between two samples, and mean ones of a record, beyond which a trial point has failed.
 #: Dozens are ordinary: of 74 runs in 19 diagnoses the means were 25 and less, but for two. The mean
 #: is meant at this tolerance of a step, and grows as the root of the method's order below.
 _STEPS, _MEAN_STEPS, _AT, _ORDER = 2000, 60, 1e-5, 4
