@@ -131,7 +131,7 @@ int psa_run(psa_trajectory *run) {
         status = next_sample(run, &solver, &work, &held, carried, sample);
         if (status == PSA_OK && write_sample(run, &solver, held.p, carried, sample + 1))
             status = PSA_NOT_FINITE;
-        if (run->steps_most > 0 && solver.steps + solver.rejected > run->steps_most)
+        if (status == PSA_OK && run->steps_most > 0 && solver.steps + solver.rejected > run->steps_most)
             status = PSA_TOO_MANY_STEPS;
     }
     run->steps = (long)solver.steps;

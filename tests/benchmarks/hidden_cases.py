@@ -143,16 +143,22 @@ def run_case(case: Case, method: Method | None = None) -> Found:
     return _found(case, d, truth, time.process_time() - begin)
 
 
-def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
+def names_of(d: Diagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the named causes, and these with what they cannot be told from."""
     named = tuple(c.effect for c in d.causes)
-    alike = tuple(n for c in d.causes for n in c.cannot_be_told_from)
+    alike = (n for c in d.causes for n in c.cannot_be_told_from)
+    return named, tuple(dict.fromkeys((*named, *alike)))
+
+
+def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
+    named, within = names_of(d)
     patched = None if d.budget is None else d.budget.unnamed
     return Found(
         case=case,
         rho=float(min([truth.visible, *(h.visible for h in truth.more)])),
         verdict=d.verdict,
         named=named,
-        within=tuple(dict.fromkeys((*named, *alike))),
+        within=within,
         blind=tuple(b.effect for b in d.blind_to),
         confidence=d.causes[0].confidence if d.causes else 0.0,
         probability={c.effect: c.probability for c in d.candidates},

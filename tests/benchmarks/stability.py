@@ -13,7 +13,7 @@ import numpy as np
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.hidden_cases import Case, records_of, study
+from tests.benchmarks.hidden_cases import Case, names_of, records_of, study
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
 from tests.plants.table import FOREIGN, KNOWN
 
@@ -86,8 +86,8 @@ def said_of(case: Case, draw: int) -> Said:
 
 
 def _said(d: Diagnosis) -> Said:
-    named = frozenset(c.effect for c in d.causes)
-    return d.verdict, named, named | {n for c in d.causes for n in c.cannot_be_told_from}
+    named, within = names_of(d)
+    return d.verdict, frozenset(named), frozenset(within)
 
 
 def table(found: Sequence[Repeated]) -> TitledTable:

@@ -39,7 +39,7 @@ from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage
 
 #: Hypotheses whose neighbours are fitted, at most, and visits to them.
-EXPANSIONS, _VISITS = 5, 24
+_EXPANSIONS, _VISITS = 5, 24
 #: Neighbours whose residual is within this factor of the noise, or that remove this share of the
 #: excess power, need no fits afresh; of a first and a further cause so many get some.
 _SETTLED, _NEARLY, _AFRESH, _AFRESH_FURTHER = 1.02, 0.95, 4, 2
@@ -65,7 +65,7 @@ class _Search:
     def run(self) -> None:
         for _ in range(_VISITS):
             chosen = self.next()
-            if chosen is None or len(self.expanded) > EXPANSIONS:
+            if chosen is None or len(self.expanded) > _EXPANSIONS:
                 break
             self.visit(chosen)
 
