@@ -16,6 +16,8 @@ Expression = Any
 
 #: Probe value that stands for "the frequencies where the residual's spectrum peaks", in Hz.
 SPECTRAL_PEAKS = "spectral_peaks"
+#: The same for the periods with which the residual repeats over the displacement, in m.
+DISPLACEMENT_PEAKS = "displacement_peaks"
 #: Probe value that stands for the duration of the longest record, in s.
 RECORD_DURATION = "record_duration"
 
@@ -127,6 +129,11 @@ class Component:
     sampled: tuple[State, ...] = ()
     sample_period: str | None = None
     home: str = ""
+
+    @property
+    def from_residual(self) -> bool:
+        """Whether trial values are read off a residual, so that another one has other ones."""
+        return any(grid in (SPECTRAL_PEAKS, DISPLACEMENT_PEAKS) for grid in self.probe.values())
 
     @property
     def fitted(self) -> tuple[str, ...]:

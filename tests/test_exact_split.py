@@ -86,7 +86,7 @@ def test_the_base_is_a_linear_part_and_hysteresis_along_the_voltage() -> None:
 @pytest.mark.parametrize(
     ("effect", "along", "port"),
     [
-        ("hysteresis_memory", {"u": ["f_H", "z_m1", "z_m2", "z_m3"]}, {}),
+        ("hysteresis_memory", {"u": ["f_H", "z_m1", "z_m2", "z_m3", "z_m4"]}, {}),
         ("self_heating", {"u": ["f_H", "heat"]}, {}),
         ("ageing", {"u": ["f_H", "travel"]}, {}),
         ("backlash", {"u": ["f_H"], "x": ["z_b"]}, {}),

@@ -16,7 +16,7 @@ import pytest
 import psa_casadi as psa
 from tests.benchmarks.hidden_cases import Case, run_case
 from tests.plants.make import Truth, make_record
-from tests.plants.table import FOREIGN, KNOWN
+from tests.plants.table import FOREIGN, KNOWN, called
 from tests.tiers import slow, slow_but
 
 NAMING = ("cause_named", "partly_explained", "ambiguous")
@@ -46,7 +46,7 @@ def within(found: psa.Diagnosis) -> set[str]:
 def test_the_hidden_effect_is_named_and_the_gain_is_real(effect: str, tmp_path: Path) -> None:
     found, truth = diagnose(effect, SEED, tmp_path)
     assert found.verdict in NAMING, found.remaining.where
-    assert effect in within(found)
+    assert called(effect) in within(found)
     assert found.extended_errors.holdout_rms_m < found.base_errors.holdout_rms_m
     assert found.noise_floor_rms_m == pytest.approx(truth.sigma, rel=0.2)
     # the clean displacement is known here: the extended model must be nearer to it than the base
@@ -99,5 +99,5 @@ def test_fresh_records_every_time() -> None:
     found = [run_case(case) for case in cases]
     for f in found:
         print(f.case, f.rho, f.verdict, f.within)
-    assert sum(f.alone is not None and f.alone != f.case.effect for f in found) <= 1
-    assert sum(f.case.effect in f.within or f.rho < 0.9 for f in found) >= FRESH - 1
+    assert sum(f.alone is not None and f.alone != f.case.right for f in found) <= 1
+    assert sum(f.case.right in f.within or f.rho < 0.9 for f in found) >= FRESH - 1

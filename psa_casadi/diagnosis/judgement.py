@@ -27,17 +27,21 @@ class Weighed:
     def beaten_by(self) -> Correction | None:
         """Return the unnamed correction that takes the names away, if there is one.
 
-        It has clearly more evidence, a price paid for it too, and held-out data confirm it. One of
-        their own kind, which of all can best add what they add, takes nothing while they do as
-        much: it only has more freedom.
+        It has clearly more evidence, a price paid for it too, and removes more of the held-out
+        excess than they do, by more than what their form may cost. One that can add what they add,
+        of all corrections best or but for their form, takes nothing while they do as much: it only
+        has more freedom.
         """
         own = self.evidence - thresholds().price * self.causes
-        alike = max(self.corrections, key=lambda c: c.copies, default=None)
+        best = max((c.copies for c in self.corrections), default=0.0)
+        alike = min(best, 1.0 - thresholds().form)
         for c, share in zip(self.corrections, self.shares, strict=True):
             clearly = thresholds().clearly * temperature(max(self.evidence, c.evidence))
-            if share <= 0.0 or c.evidence - thresholds().price <= own + clearly:
-                continue
-            if c is not alike or self.share < thresholds().as_much * share:
+            enough = share - thresholds().form
+            if c.copies >= alike:
+                enough = thresholds().as_much * share
+            removes_more = share > 0.0 and self.share < enough
+            if removes_more and c.evidence - thresholds().price > own + clearly:
                 return c
         return None
 

@@ -20,6 +20,7 @@ from psa_casadi.effects.self_heating import SELF_HEATING
 from psa_casadi.effects.sensor_delay import SENSOR_DELAY
 from psa_casadi.effects.sensor_lag import SENSOR_LAG
 from psa_casadi.effects.sensor_nonlinearity import SENSOR_NONLINEARITY
+from psa_casadi.effects.sensor_ripple import SENSOR_RIPPLE
 from psa_casadi.effects.slow_creep import SLOW_CREEP
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.effects.temperature import TEMPERATURE
@@ -48,6 +49,7 @@ EFFECTS: dict[str, Component] = {
         SENSOR_DELAY,
         SENSOR_LAG,
         SENSOR_NONLINEARITY,
+        SENSOR_RIPPLE,
         OFFSET_DRIFT,
         MAINS_HUM,
         TEMPERATURE,

@@ -1,5 +1,7 @@
 """Hysteresis memory: the error depends on past reversal points; minor loops nest differently."""
 
+import math
+
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.scales import voltage_scale
 from psa_casadi.smooth import magnitude_power, rate_magnitude, signed_power
@@ -9,9 +11,9 @@ from psa_casadi.variables import Parameter, State, Values
 _SHARPNESS = 4.0
 #: Narrowest first threshold, over rated voltage. The memory of a ferroelectric is spread over the
 #: loop; a dwell much narrower than the loop is friction or backlash and not this effect.
-_NARROWEST = 0.025
-#: Thresholds of the elements over the first one.
-_RATIOS = (1.0, 2.0, 4.0)
+_NARROWEST = 0.0125
+#: Thresholds of the elements over the first one: a decade and a half of the loop.
+_RATIOS = (1.0, 2.5, 6.0, 15.0)
 
 
 def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
@@ -23,16 +25,25 @@ def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
     )
 
 
+def _weights(s: Symbols) -> list[Expression]:
+    """Weights over the mean one: a smooth curve over the elements, two cosines."""
+    places = [math.pi * (i + 0.5) / len(_RATIOS) for i in range(len(_RATIOS))]
+    return [1.0 + s.memory_slope * math.cos(x) + s.memory_bend * math.cos(2.0 * x) for x in places]
+
+
 def _equations(s: Symbols) -> Equations:
-    elements = {"z_m1": s.z_m1, "z_m2": s.z_m2, "z_m3": s.z_m3}
-    first = s.memory_threshold * s.u_rated
-    weighted = s.z_m1 + s.memory_weight_2 * s.z_m2 + s.memory_weight_3 * s.z_m3
+    elements = [getattr(s, f"z_m{i + 1}") for i in range(len(_RATIOS))]
+    first, bend = s.memory_threshold * s.u_rated, s.memory_asymmetry / s.u_rated
+    total = sum(
+        weight * z * (1.0 + bend * (2.0 * s.u - z))
+        for weight, z in zip(_weights(s), elements, strict=True)
+    )
     return Equations(
         der={
-            name: stop_rate(s, z, ratio * first)
-            for (name, z), ratio in zip(elements.items(), _RATIOS, strict=True)
+            f"z_m{i + 1}": stop_rate(s, z, ratio * first)
+            for i, (z, ratio) in enumerate(zip(elements, _RATIOS, strict=True))
         },
-        add={"free_force": s.k_L * s.memory_gain * weighted},
+        add={"free_force": s.k_L * s.memory_gain * total},
     )
 
 
@@ -51,45 +62,45 @@ def _stop_scale(p: Values) -> float:
     return 0.1 * voltage_scale(p)
 
 
-def _weight(index: int, value: float) -> Parameter:
-    return Parameter(
-        f"memory_weight_{index}",
-        value,
-        "1",
-        (-100.0, 100.0),
-        f"weight of element {index} over that of the first",
-        scale=1.0,
-    )
+def _shape(name: str, bound: float, text: str) -> Parameter:
+    return Parameter(f"memory_{name}", 0.0, "1", (-bound, bound), text, scale=1.0)
 
 
 HYSTERESIS_MEMORY = Component(
     name="hysteresis_memory",
-    description="further hysteresis elements with thresholds of their own",
-    source="stop operators in parallel (Prandtl-Ishlinskii, Visintin 1994) in smooth Bouc-Wen form",
+    description="a spectrum of further hysteresis elements, symmetric or not",
+    source=(
+        "generalised Prandtl-Ishlinskii: plays and their squares (Al Janaideh, Rakheja and Su,"
+        " IEEE/ASME Trans. Mechatronics 16 (2011) 734), as stops in smooth Bouc-Wen form"
+    ),
     gain="memory_gain",
     equation_text=(
-        "f = k_L memory_gain (z_1 + weight_2 z_2 + weight_3 z_3),  "
-        "z_i' = u' - (|u'| sgn(z_i) + u')/2 (|z_i|/w_i)^4,  "
-        "w_1 = threshold u_rated,  w_2 = 2 w_1,  w_3 = 4 w_1"
+        "f = k_L memory_gain sum_i w_i z_i (1 + asymmetry (2 u - z_i)/u_rated),  "
+        "z_i' = u' - (|u'| sgn(z_i) + u')/2 (|z_i|/r_i)^4,  "
+        "r_i = threshold u_rated (1, 2.5, 6, 15),  "
+        "w_i = 1 + slope cos(pi (i - 1/2)/4) + bend cos(2 pi (i - 1/2)/4)"
     ),
     parameters=(
         Parameter(
-            "memory_gain", 0.0, "1", (-2.0, 2.0), "first element's force over k_L", scale=0.02
+            "memory_gain", 0.0, "1", (-2.0, 2.0), "elements' mean force over k_L", scale=0.02
         ),
         Parameter(
             "memory_threshold",
-            0.04,
+            0.03,
             "1",
             (_NARROWEST, 1.0),
             "first threshold over rated voltage",
             log=True,
         ),
-        _weight(2, 2.0),
-        _weight(3, 2.0),
+        _shape("slope", 100.0, "weights of narrow elements more than of wide ones, over the mean"),
+        _shape(
+            "bend", 100.0, "weights of the outer elements more than of the inner, over the mean"
+        ),
+        _shape("asymmetry", 10.0, "squares of the plays, over the plays, at rated voltage"),
     ),
-    states=(_state(1), _state(2), _state(3)),
+    states=tuple(_state(i + 1) for i in range(len(_RATIOS))),
     equations=_equations,
-    probe={"memory_threshold": (0.03, 0.1), "memory_weight_2": (0.0, 2.0)},
+    probe={"memory_threshold": (0.02, 0.06), "memory_asymmetry": (-0.5, 0.0, 0.5)},
     looks_like=(
         "the residual changes with the distance from past reversal points; minor loops do not nest"
     ),

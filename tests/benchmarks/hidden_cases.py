@@ -26,6 +26,7 @@ from tests.plants.designs import DesignKind
 from tests.plants.excitations import ExcitationKind, PoorKind
 from tests.plants.make import Truth, make_record
 from tests.plants.noise import NoiseKind
+from tests.plants.table import called
 
 Kind = Literal[
     "known", "weak", "clean", "left out", "foreign", "two", "poor", "design", "ringing",
@@ -62,9 +63,14 @@ class Case:
     records: int = 1
 
     @property
+    def right(self) -> str | None:
+        """What the project's table calls the hidden effect."""
+        return None if self.effect is None else called(self.effect)
+
+    @property
     def hidden(self) -> tuple[str, ...]:
-        """Names of all that is hidden."""
-        return (*((self.effect,) if self.effect else ()), *self.more)
+        """What it calls all that is hidden."""
+        return tuple(called(e) for e in (*((self.effect,) if self.effect else ()), *self.more))
 
 
 @dataclass(frozen=True)
@@ -107,7 +113,7 @@ class Found:
     @property
     def right_alone(self) -> bool:
         """Whether the hidden effect is the one name, with no other as likely."""
-        return self.named == (self.case.effect,) == self.within
+        return self.named == (self.case.right,) == self.within
 
 
 def records_of(case: Case, folder: Path) -> tuple[Truth, list[Record]]:
@@ -137,7 +143,7 @@ def run_case(case: Case, method: Method | None = None) -> Found:
     """Make the records of a case, diagnose the files, and compare."""
     with tempfile.TemporaryDirectory() as folder:
         truth, records = records_of(case, Path(folder))
-    table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.effect]
+    table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.right]
     begin = time.process_time()
     d = diagnose(records, effects=table, method=method)
     return _found(case, d, truth, time.process_time() - begin)

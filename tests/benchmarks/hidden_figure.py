@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
 from tests.benchmarks.hidden_cases import Found
+from tests.plants.table import called
 
 _NONE = ("unexplained", "adequate")
 #: Classes of stated probability: above the one, up to the next.
@@ -42,7 +43,7 @@ def in_class(
     is as visible as was asked for.
     """
     return [
-        (p, effect == f.case.effect)
+        (p, effect == f.case.right)
         for f in found
         if f.named and f.reached and f.case.kind in kinds
         for effect, p in f.probability.items()
@@ -54,7 +55,8 @@ def _confusion(
     axes: Axes, found: Sequence[Found], known: Sequence[str], foreign: Sequence[str]
 ) -> None:
     """Draw the shares of each row; the first cause counts."""
-    rows, columns = (*known, *foreign, "nothing"), (*known, *_NONE)
+    rows = (*known, *foreign, "nothing")
+    columns = (*dict.fromkeys(called(name) for name in known), *_NONE)
     shares = np.zeros((len(rows), len(columns)))
     for f in found:
         if f.case.kind in ("known", "weak", "clean", "foreign"):

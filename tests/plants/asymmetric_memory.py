@@ -1,10 +1,11 @@
-"""Foreign: a generalised Prandtl-Ishlinskii loop of a unipolar drive, plays with their squares.
+"""More memory, asymmetric: a generalised Prandtl-Ishlinskii loop, plays with their squares.
 
     F = g k_L sum_j w_j (p_j - u + b (p_j^2 - u^2)/u_rated),   sum_j w_j = 1
 
 p_j: play operators of the voltage u with thresholds over 4 to 18 % of the span
 (hysteresis_memory.py). Rising and falling branches differ more the higher the voltage, so that no
-symmetric memory forms the loop. Source: M. Al Janaideh, S. Rakheja, C.-Y. Su, "An analytical
+symmetric memory forms the loop. Not the project's form: hard operators, and every one of them has
+an envelope of its own. Source: M. Al Janaideh, S. Rakheja, C.-Y. Su, "An analytical
 generalized Prandtl-Ishlinskii model inversion for hysteresis compensation in micropositioning
 control", IEEE/ASME Trans. Mechatronics 16 (2011) 734: envelope functions of the play; here 1 + b u.
 """
@@ -35,5 +36,12 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 ASYMMETRIC_MEMORY = HiddenEffect(
-    "asymmetric_memory", "g", "1", draw, contribution, (0.01, 0.6), linear=True, foreign=True
+    "asymmetric_memory",
+    "g",
+    "1",
+    draw,
+    contribution,
+    (0.01, 0.6),
+    linear=True,
+    called="hysteresis_memory",
 )

@@ -22,7 +22,8 @@ class HiddenEffect:
     linear: the contribution is proportional to the gain. room: (times, secondary parameters) ->
     temperature at the samples, (N,) [degC], where the effect needs a thermometer in the record.
     refit: the base swallows it far beyond its linearisation (a lag: R_s C_p and tau take it over),
-    so its visible ratio is that of a base fitted again.
+    so its visible ratio is that of a base fitted again. called: its name in the project's table,
+    where that is another one.
     """
 
     name: str
@@ -35,3 +36,4 @@ class HiddenEffect:
     foreign: bool = False
     room: Callable[[FloatArray, Parameters], FloatArray] | None = None
     refit: bool = False
+    called: str = ""

@@ -39,6 +39,7 @@ HIDDEN_EFFECTS: dict[str, HiddenEffect] = {
         SLOW_CREEP,
         RATE_DEPENDENT_HYSTERESIS,
         HYSTERESIS_MEMORY,
+        ASYMMETRIC_MEMORY,
         RATE_INDEPENDENT_ASYMMETRY,
         FIELD_DEPENDENT_GAIN,
         SATURATION_OF_STRAIN,
@@ -55,18 +56,17 @@ HIDDEN_EFFECTS: dict[str, HiddenEffect] = {
         SENSOR_DELAY,
         SENSOR_LAG,
         SENSOR_NONLINEARITY,
+        ENCODER_RIPPLE,
         OFFSET_DRIFT,
         MAINS_HUM,
         TEMPERATURE,
         DRY_FRICTION,
-        ENCODER_RIPPLE,
         FLOOR_VIBRATION,
         GUIDE_STIFFNESS,
         DEAD_ZONE_HYSTERESIS,
         CROSS_AXIS,
         RANGE_SWITCH,
         SOURCE_POWER,
-        ASYMMETRIC_MEMORY,
     )
 }
 """In the project's table, then the foreign ones. Reciprocal coupling has a plant of its own
@@ -75,6 +75,11 @@ here sees.
 """
 
 KNOWN = tuple(name for name, effect in HIDDEN_EFFECTS.items() if not effect.foreign)
-"""Names that the project's table has."""
+"""Those that the project's table has."""
 FOREIGN = tuple(name for name, effect in HIDDEN_EFFECTS.items() if effect.foreign)
-"""Names that it has not: the right verdict is that the cause is not in the table."""
+"""Those that it has not: the right verdict is that the cause is not in the table."""
+
+
+def called(name: str) -> str:
+    """Return what the project's table calls a hidden effect."""
+    return HIDDEN_EFFECTS[name].called or name

@@ -1,13 +1,13 @@
 """Trial directions: what each effect would add to the prediction at its trial values."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import RECORD_DURATION, SPECTRAL_PEAKS, Component
+from psa_casadi.component import DISPLACEMENT_PEAKS, RECORD_DURATION, SPECTRAL_PEAKS, Component
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured, predict_record
@@ -22,6 +22,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
 _PEAKS, _FINER = 4, 8
+#: Bins of the displacement; periods between so many of them over the range are tried.
+_BINS, _FEWEST_PERIODS, _MOST_PERIODS = 2048, 4, 256
 _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
 
 
@@ -55,7 +57,9 @@ def directions(
     Without `finite_steps` only derivatives are taken, which some effects have not at their null.
     They are simulated side by side.
     """
-    peaks = residual_peaks(fit, experiments)
+    peaks = {SPECTRAL_PEAKS: residual_peaks(fit, experiments)}
+    if any(DISPLACEMENT_PEAKS in e.probe.values() for e in effects):
+        peaks[DISPLACEMENT_PEAKS] = residual_periods(fit, experiments)
     tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
@@ -87,18 +91,39 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     )
 
 
+def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Periods [m] with which the first record's residual repeats over the displacement.
+
+    Of the mean residual in bins of the predicted displacement, under a Hann window.
+    """
+    experiment = experiments[0]
+    used = experiment.used[: experiment.stop]
+    residual = fit.residuals[: int(used.sum())]
+    x = measured(experiment.record)[: experiment.stop][used] - residual
+    span = float(np.ptp(x))
+    if span <= 0.0:
+        return ()
+    places = np.minimum((_BINS * (x - x.min()) / span).astype(np.int64), _BINS - 1)
+    count = np.bincount(places, minlength=_BINS)
+    mean = np.bincount(places, residual - np.mean(residual), _BINS) / np.maximum(count, 1)
+    power = np.abs(np.fft.rfft(mean * np.hanning(_BINS), _FINER * _BINS)) ** 2
+    first = _FINER * _FEWEST_PERIODS
+    order = highest_peaks(power[first : _FINER * _MOST_PERIODS], 3 * _FINER, _PEAKS) + first
+    return tuple(float(p) for p in np.sort(span * _FINER / order))
+
+
 def _probe_values(
-    effect: Component, experiments: Sequence[Experiment], peaks: tuple[float, ...]
+    effect: Component, experiments: Sequence[Experiment], peaks: Mapping[str, tuple[float, ...]]
 ) -> Iterator[dict[str, float]]:
     longest = max(e.record.duration for e in experiments)
     grids: list[tuple[float, ...]] = []
     for name, grid in effect.probe.items():
-        if grid == SPECTRAL_PEAKS:
-            low, high = next(p.bounds for p in effect.parameters if p.name == name)
-            grids.append(tuple(f for f in peaks if low < f < high))
-        elif grid == RECORD_DURATION:
+        if grid == RECORD_DURATION:
             grids.append((longest,))
-        elif isinstance(grid, tuple):
+        elif isinstance(grid, str):
+            low, high = next(p.bounds for p in effect.parameters if p.name == name)
+            grids.append(tuple(f for f in peaks[grid] if low < f < high))
+        else:
             grids.append(grid)
     for point in product(*grids):
         yield dict(zip(effect.probe, point, strict=True))

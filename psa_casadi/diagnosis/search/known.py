@@ -8,7 +8,7 @@ from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.search.fits import to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of
 from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import confirmed, in_character
+from psa_casadi.diagnosis.search.worth import confirmed, in_character, shows_memory
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
@@ -56,6 +56,7 @@ class Known:
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
         self.closed: set[Names] = set()
+        self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
 
     @property
     def root(self) -> Hypothesis:
@@ -152,6 +153,8 @@ class Known:
                 return False
             if before.causes and "form" not in out and h.share(before, root) <= thresholds().form:
                 return False
+            if not self.remembers(h, before, cause):
+                return False
             if "held out" in out:
                 continue
             seen = self.views.get(before.names)
@@ -159,6 +162,14 @@ class Known:
             if not confirmed(h, before, experiments, self.scale.colour, alarm=alarm):
                 return False
         return True
+
+    def remembers(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
+        """Whether a cause with a memory that stays adds more than a static curve."""
+        if not any(s.memory and not s.settles for s in cause.states):
+            return True
+        if (h, before) not in self.memories:
+            self.memories[h, before] = shows_memory(h, before, self.task.experiments)
+        return self.memories[h, before]
 
     def gained(self, before: Hypothesis, after: Hypothesis) -> bool:
         """Whether a fit has more evidence than an earlier one by the price of a cause."""

@@ -102,7 +102,7 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     table = [e for e in task.table if e not in fit.model.components]
     kept = [d for d in known if d.effect in table]
     if known:
-        lines = [e for e in table if e.tone is not None]  # the residual's lines are new ones
+        lines = [e for e in table if e.from_residual]  # this residual's peaks are other ones
         kept = [d for d in kept if d.effect not in lines] + _directions(fit, task, lines)
     else:
         kept = _directions(fit, task, table)

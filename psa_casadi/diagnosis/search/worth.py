@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
@@ -14,6 +15,9 @@ from psa_casadi.records.drive import among_harmonics
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
+
+#: Terms of a static curve.
+_CURVE = 8
 
 
 def confirmed(
@@ -44,6 +48,28 @@ def confirmed(
         return bool(gained > thresholds().held_out)
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2
     return bool(gained > min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise))))
+
+
+def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
+    """Whether what a cause adds to another hypothesis is more than a static curve.
+
+    Of the power that the other's parameters cannot follow, `form` must be no curve of the voltage,
+    nor one of the displacement. Elements that are wider than the voltage's way are such a curve.
+    """
+    pairs = zip(of.predicted, before.predicted, experiments, strict=True)
+    added = np.concatenate([(new - old)[e.used] for new, old, e in pairs])
+    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    moved = np.concatenate([p[e.used] for p, e in zip(before.predicted, experiments, strict=True)])
+    basis = independent(before.fit.jacobian)
+    target = without(added, basis)
+    most = 1.0 - thresholds().form
+    static = [independent(without(_curves(q), basis)).T @ target for q in (voltage, moved)]
+    return all(float(s @ s) < most * float(target @ target) for s in static)
+
+
+def _curves(values: FloatArray) -> FloatArray:
+    place = (values - values.min()) / max(float(np.ptp(values)), 1e-300)
+    return np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
 
 
 def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
