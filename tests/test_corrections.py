@@ -148,6 +148,12 @@ def test_a_correction_takes_names_away_only_where_it_clearly_explains_more(
     assert beaten(700.0, 0.8, own_kind) is None
     assert beaten(700.0, 0.3, own_kind) is own_kind[0]
     assert Weighed(700.0, 1, 0.8, (first,), [-0.1]).beaten_by() is None
+    # held-out data know of no more that it explains, whatever its evidence: by 5 % at least
+    assert beaten(700.0, 0.87, (first, second)) is None
+    # two that can add nearly all that the names add: both only have more freedom
+    both = tuple(replace(c, evidence=900.0, copies=s) for c, s in ((first, 0.96), (second, 0.99)))
+    assert beaten(500.0, 0.7, both) is None
+    assert beaten(500.0, 0.4, both) is both[0]
     assert Weighed(0.0, 0, 0.0, (), ()).beaten_by() is None
 
 

@@ -14,6 +14,7 @@ from psa_casadi.effects.drive_lag import DRIVE_LAG
 from psa_casadi.effects.mains_hum import MAINS_HUM
 from psa_casadi.effects.sensor_lag import SENSOR_LAG
 from psa_casadi.effects.sensor_nonlinearity import SENSOR_NONLINEARITY
+from psa_casadi.effects.sensor_ripple import SENSOR_RIPPLE
 from psa_casadi.effects.temperature import TEMPERATURE
 from psa_casadi.effects.voltage_saturation import VOLTAGE_SATURATION
 from psa_casadi.identification.fitting.unknowns import static_compliance
@@ -188,6 +189,28 @@ def test_a_bent_sensor_reads_a_function_of_the_displacement_alone(
         for branch in (rising & (t < 0.5), ~rising & (t < 0.5))
     ]
     assert np.abs(apart[0] - apart[1]).max() > 50 * np.abs(apart[2] - apart[3]).max()
+
+
+def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
+    """Its first harmonic has the gain as amplitude, the second what its two shares say."""
+    period = 1.3e-6
+    model = with_effect(
+        SENSOR_RIPPLE, ripple_gain=2e-8, ripple_period=period, ripple_phase=0.7,
+        ripple_second_cosine=0.3, ripple_second_sine=-0.4,
+    )  # fmt: skip
+    t = np.linspace(0.0, 2.0, 4001)
+    found = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
+    x = found["displacement"]
+    residual = found["measured_displacement"] - x
+    assert residual[0] == 0.0
+    for branch in (np.gradient(x) > 0, np.gradient(x) < 0):
+        angle = 2 * np.pi * x[branch] / period
+        columns = [np.ones_like(angle), *(f(k * angle) for k in (1, 2) for f in (np.sin, np.cos))]
+        fitted, left, *_ = np.linalg.lstsq(np.column_stack(columns), residual[branch], rcond=None)
+        _, sine, cosine, second_sine, second_cosine = fitted / 2e-8
+        assert (sine, cosine) == pytest.approx((np.cos(0.7), np.sin(0.7)), rel=1e-6)
+        assert (second_cosine, second_sine) == pytest.approx((0.3, -0.4), rel=1e-6)
+        assert left[0] < 1e-12 * np.sum(residual**2)
 
 
 def test_hum_is_a_sine_that_keeps_amplitude_and_phase_for_a_thousand_periods() -> None:

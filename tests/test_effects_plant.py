@@ -9,11 +9,13 @@ from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects.ageing import AGEING
 from psa_casadi.effects.backlash import BACKLASH
 from psa_casadi.effects.field_dependent_gain import FIELD_DEPENDENT_GAIN
+from psa_casadi.effects.hysteresis_memory import HYSTERESIS_MEMORY
 from psa_casadi.effects.load_stiffness import LOAD_STIFFNESS
 from psa_casadi.effects.preload_loss import PRELOAD_LOSS
 from psa_casadi.effects.rate_dependent_hysteresis import RATE_DEPENDENT_HYSTERESIS
 from psa_casadi.effects.saturation_of_strain import SATURATION_OF_STRAIN
 from psa_casadi.effects.self_heating import SELF_HEATING
+from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.scales import stiffness_scale, stroke_scale
 from psa_casadi.simulation.simulate import simulate
 from tests.effect_runs import (
@@ -23,6 +25,7 @@ from tests.effect_runs import (
     third_harmonic,
     triangle,
 )
+from tests.plants.hysteresis_memory import play
 from tests.stack_models import stack
 
 FloatArray = NDArray[np.float64]
@@ -140,6 +143,27 @@ def test_contact_kinks_the_curve_at_one_displacement(base: tuple[Component, ...]
         assert lines[1][0] == pytest.approx(k / (k + 0.25 * k_s), abs=2e-3)
         meeting = (lines[1][1] - lines[0][1]) / (lines[0][0] - lines[1][0])
         assert meeting == pytest.approx(x_c, rel=0.01)
+
+
+@pytest.mark.parametrize("asymmetry", [0.0, 1.0, -0.7])
+def test_memory_is_a_sum_of_plays_and_their_squares(asymmetry: float) -> None:
+    """Of ideal plays with the same weights and thresholds, to the roundness of its stops."""
+    weights = 1.0 + 0.5 * np.cos(np.pi * (np.arange(4) + 0.5) / 4)
+    model = linear(
+        HYSTERESIS_MEMORY, 0.05, memory_threshold=0.02, memory_slope=0.5,
+        memory_asymmetry=asymmetry,
+    )  # fmt: skip
+    t = np.linspace(0.0, 60.0, 6001)
+    voltage = 60.0 * (1.0 - np.cos(2 * np.pi * t / 20.0)) * (1.0 - t / 90.0)
+    plain = linear(HYSTERESIS_MEMORY, 0.0)
+    shown = driven(model, t, voltage).y[:, -1] - driven(plain, t, voltage).y[:, -1]
+    rated, expected = model.values["u_rated"], np.zeros_like(t)
+    for weight, ratio in zip(weights, (1.0, 2.5, 6.0, 15.0), strict=True):
+        p = play(voltage, 0.02 * ratio * rated)
+        squares = asymmetry * (voltage**2 - p**2) / rated
+        expected += 0.05 * weight * (voltage - p + squares)
+    expected *= model.values["k_L"] * static_compliance(model.values)
+    assert np.sqrt(np.mean((shown - expected) ** 2)) < 0.05 * np.ptp(expected)
 
 
 @pytest.mark.parametrize("peak", [30.0, 120.0])

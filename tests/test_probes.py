@@ -1,16 +1,21 @@
 """The trial sizes at which effects are looked for stand close enough to find every size."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.screening.probes import directions
+from psa_casadi.diagnosis.screening.probes import directions, residual_periods
+from psa_casadi.diagnosis.search.hypothesis import root_of
+from psa_casadi.diagnosis.search.worth import shows_memory
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import compose
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
 from tests.tiers import slow_but
 
 
@@ -35,3 +40,41 @@ def test_a_current_limit_of_any_height_is_near_one_that_is_tried(share: float, s
     tried = [d.column for d in directions(base, experiments, [effect])]
     alike = [c @ added / np.sqrt((c @ c) * (added @ added)) for c in tried]
     assert max(alike) > 0.95
+
+
+def _loops() -> tuple[FloatArray, FloatArray]:
+    t = np.linspace(0.0, 4.0, 4001)
+    return t, 50.0 - 40.0 * np.cos(2 * np.pi * t) * (1.0 - 0.15 * t)
+
+
+@pytest.mark.parametrize("period", [0.2e-6, 0.7e-6, 1.6e-6])
+def test_the_period_of_a_ripple_is_read_off_the_residual(period: float) -> None:
+    """Under noise as large as the ripple, to a quarter of a period over the range."""
+    model = compose(BASE)
+    t, voltage = _loops()
+    x = simulate(model, t, voltage).displacement
+    noise = 2e-8 * np.random.default_rng(4).standard_normal(t.size)
+    reading = x + 2e-8 * np.sqrt(2.0) * np.sin(2 * np.pi * x / period + 0.4) + noise
+    experiments = (whole(Record("r", t, voltage, reading)),)
+    found = residual_periods(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
+    count = float(np.ptp(x)) / period
+    assert min(abs(np.ptp(x) / p - count) for p in found) < 0.25
+
+
+def test_a_memory_that_adds_a_static_curve_shows_none() -> None:
+    model = compose(BASE)
+    t, voltage = _loops()
+    x = simulate(model, t, voltage).displacement
+    experiments = (whole(Record("r", t, voltage, x)),)
+    before = root_of(fit(model, experiments, ["k_L", "A", "beta"], sigma=[1e-8]), experiments)
+
+    def shown(added: FloatArray) -> bool:
+        of = replace(before, predicted=(before.predicted[0] + added,))
+        return shows_memory(of, before, experiments)
+
+    over = voltage / 120.0
+    assert not shown(1e-7 * over**2)
+    assert not shown(1e-7 * np.sin(3.0 * x / x.max()))
+    loop = 1e-7 * np.gradient(voltage) / np.abs(np.gradient(voltage)).max()
+    assert shown(loop * over)
+    assert shown(1e-7 * over**2 + loop)

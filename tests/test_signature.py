@@ -31,6 +31,7 @@ TOLD = {
     "sensor_delay": {"rate"},
     "sensor_lag": {"rate"},
     "sensor_nonlinearity": {"displacement"},
+    "sensor_ripple": {"displacement"},
     "offset_drift": {"time"},
     "ageing": {"time"},
     "mains_hum": {"spectrum"},

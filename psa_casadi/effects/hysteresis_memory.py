@@ -12,7 +12,7 @@ _SHARPNESS = 4.0
 #: Narrowest first threshold, over rated voltage. The memory of a ferroelectric is spread over the
 #: loop; a dwell much narrower than the loop is friction or backlash and not this effect.
 _NARROWEST = 0.0125
-#: Thresholds of the elements over the first one: a decade and a half of the loop.
+#: Thresholds of the elements over the first one: more than a decade.
 _RATIOS = (1.0, 2.5, 6.0, 15.0)
 
 
@@ -86,7 +86,7 @@ HYSTERESIS_MEMORY = Component(
         ),
         Parameter(
             "memory_threshold",
-            0.03,
+            0.02,
             "1",
             (_NARROWEST, 1.0),
             "first threshold over rated voltage",
