@@ -57,6 +57,11 @@ BENCHES: dict[str, Bench] = {
             "the diagnosis of data changed by 1 % of their noise: verdicts and names that stay",
         ),
         _later(
+            "added",
+            "added",
+            "an effect of an independent plant added to a measured record: what is named on top",
+        ),
+        _later(
             "method_pictures",
             "method",
             "the picture of docs/method.md: the hypotheses of one search, and its error budget",
