@@ -62,8 +62,8 @@ def _stop_scale(p: Values) -> float:
     return 0.1 * voltage_scale(p)
 
 
-def _shape(name: str, bound: float, text: str) -> Parameter:
-    return Parameter(f"memory_{name}", 0.0, "1", (-bound, bound), text, scale=1.0)
+def _shape(name: str, bound: float, text: str, value: float = 0.0) -> Parameter:
+    return Parameter(f"memory_{name}", value, "1", (-bound, bound), text, scale=1.0)
 
 
 HYSTERESIS_MEMORY = Component(
@@ -86,13 +86,13 @@ HYSTERESIS_MEMORY = Component(
         ),
         Parameter(
             "memory_threshold",
-            0.02,
+            0.03,
             "1",
             (_NARROWEST, 1.0),
             "first threshold over rated voltage",
             log=True,
         ),
-        _shape("slope", 100.0, "weights of narrow elements more than of wide ones, over the mean"),
+        _shape("slope", 100.0, "weights of narrow elements over those of wide ones", 0.5),
         _shape(
             "bend", 100.0, "weights of the outer elements more than of the inner, over the mean"
         ),

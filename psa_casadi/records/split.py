@@ -31,6 +31,11 @@ class Experiment:
     held_out: BoolArray
 
     @property
+    def held_out_whole(self) -> bool:
+        """Whether the record is held out, but for a beginning that finds its offset."""
+        return bool(np.count_nonzero(self.held_out) > np.count_nonzero(self.used))
+
+    @property
     def stop(self) -> int:
         """One past the last used sample: a fit need not simulate further."""
         return int(np.flatnonzero(self.used)[-1]) + 1

@@ -118,10 +118,11 @@ def difference(record: Record, effect: str, seed: int, size: float) -> FloatArra
     rng = np.random.default_rng(seed)
     stack = draw_stack(rng)
     v, step = record.voltage, record.sample_time
-    command = stack.u_rated * (v - v.min()) / np.ptp(v)
+    command = stack.u_rated * (v - v.min()) / float(np.ptp(v))
     lead = command[0] * 0.5 * (1.0 - np.cos(np.pi * np.arange(_LEAD) / _LEAD))
-    played = np.concatenate([lead, command])
-    run = simulate_base(stack, step * np.arange(played.size), played)
+    played: FloatArray = np.concatenate([lead, command])
+    times: FloatArray = step * np.arange(played.size, dtype=np.float64)
+    run = simulate_base(stack, times, played)
     scale = record.range_m / float(np.ptp(run.displacement[_LEAD:]))
     hidden = hide(
         HIDDEN_EFFECTS[effect], run, rng, base_directions(run), size / scale, 1.0, visible=1.0

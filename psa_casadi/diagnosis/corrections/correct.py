@@ -18,7 +18,6 @@ from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.linear_part import linear_part
 
@@ -61,9 +60,7 @@ def corrections(
     `named` are the predictions [m] of whole records with named causes, for `Correction.copies`.
     """
     try:
-        full = predict(
-            fit.model, experiments, fit.unknowns, fit.theta, way=fit.way, everything=True
-        )
+        full = fit.predictions(experiments)
         signals = Signals(experiments, [p.displacement for p in full], _responses(fit, experiments))
     except PsaError:
         return ()

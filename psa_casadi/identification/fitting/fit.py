@@ -9,12 +9,14 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum, minimise
 from psa_casadi.identification.fitting.prediction import (
+    Prediction,
     Simulated,
     measured,
     motions_of,
     predict,
     simulated,
 )
+from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
@@ -84,10 +86,21 @@ class Fit:
 
     def predicted(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict whole records [m], held-out samples included."""
-        full = predict(
-            self.model, experiments, self.unknowns, self.theta, way=self.way, everything=True
-        )
-        return [p.displacement for p in full]
+        return [p.displacement for p in self.predictions(experiments)]
+
+    def predictions(self, experiments: Sequence[Experiment]) -> list[Prediction]:
+        """Predict whole records with their derivatives by theta.
+
+        A record that is held out as a whole begins as the fitted ones do (`shared_starts`); what
+        finds its offset are the samples that it may use.
+        """
+        theta, shared = shared_starts(self.model, self.unknowns, self.theta, experiments)
+        full = predict(self.model, experiments, self.unknowns, theta, way=self.way, everything=True)
+        for k in shared:
+            own, x = experiments[k], full[k].displacement
+            offset = float(np.mean((measured(own.record) - x)[own.used]))
+            full[k] = replace(full[k], displacement=x + offset)
+        return full
 
 
 def fit(
@@ -216,12 +229,11 @@ def objective(
             return None
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
         j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
-        if not np.isfinite(np.sum(y) + np.sum(j)):
-            return None
-        return (
-            np.concatenate([(y - target) / weights, theta * prior]),
-            np.vstack([j / weights[:, None], np.diag(prior)]),
-        )
+        residual = np.concatenate([(y - target) / weights, theta * prior])
+        jacobian = np.vstack([j / weights[:, None], np.diag(prior)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = np.isfinite(residual @ residual + np.sum(jacobian**2))
+        return (residual, jacobian) if finite else None
 
     return evaluate
 
