@@ -1,5 +1,6 @@
 """The parts of a fit: its coordinates, exact derivatives, and the samples that count."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +10,15 @@ from numpy.typing import NDArray
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.fitting.prediction import predict
+from psa_casadi.identification.fitting.fit import Fit, fit, objective
+from psa_casadi.identification.fitting.prediction import Prediction, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.search.multistart import free_parameters
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
-from psa_casadi.records.split import Experiment, whole
+from psa_casadi.records.split import Experiment, divided, whole
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import Way
 
@@ -144,7 +145,7 @@ def test_identify_takes_a_record_with_gaps() -> None:
     assert np.std(predicted - whole_record) == pytest.approx(SIGMA, rel=0.15)
 
 
-def fitted(model: Model, experiments: list[Experiment]) -> Fit:
+def fitted(model: Model, experiments: Sequence[Experiment]) -> Fit:
     start = {"k_L": 1.05 * model.values["k_L"], "tau": 1.5 * model.values["tau"]}
     free = free_parameters(model)
     return fit(model, experiments, free, sigma=[SIGMA] * len(experiments), start=start)
@@ -170,6 +171,67 @@ def test_the_parts_of_a_fit_belong_together() -> None:
     assert np.all(np.abs(pushed) < 0.1 * size)  # within a tenth of a standard deviation
     assert found.offset(1) - found.offset(0) == pytest.approx(1e-6, abs=SIGMA)
     assert abs(found.start(0)["f_H"]) < 3.0
+
+
+def _after_a_history(model: Model, peak: float, seed: int) -> Record:
+    """A record that begins at 20 V, where the stack has come down to from a peak."""
+    time = time_grid(4.0, 2e-3)
+    before = time < 2.0
+    down = np.interp(time, [0.0, 1.0, 2.0], [0.0, peak, 20.0])
+    again = 20.0 + 25.0 * (1.0 - np.cos(2.0 * np.pi * (time - 2.0))) * (time / 4.0)
+    voltage = np.where(before, down, again)
+    x = simulate(model, time, voltage).displacement
+    noise = SIGMA * np.random.default_rng(seed).standard_normal(time.size)
+    return Record(
+        f"h{seed}", time[~before] - time[~before][0], voltage[~before], (x + noise)[~before]
+    )
+
+
+def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> None:
+    """Also where its own first tenth tells another memory, by an error that the model has there."""
+    model = model_with()
+    records = [_after_a_history(model, 90.0, seed) for seed in (1, 2, 3)]
+    held = records[2]
+    wrong = np.asarray(held.displacement).copy()
+    lead = np.arange(held.n) < held.n // 10
+    wrong[lead] += 40.0 * SIGMA * np.linspace(-1.0, 1.0, int(lead.sum()))
+    experiments = divided(records[:2], [replace(held, displacement=wrong)])
+    found = fitted(model, experiments)
+    shared = found.predicted(experiments)[2]
+    own = predict(
+        found.model, experiments, found.unknowns, found.theta, way=found.way, everything=True
+    )[2].displacement
+    truth = np.asarray(held.displacement)[~lead]
+    errors = [float(np.std(x[~lead] - truth)) for x in (shared, own)]
+    assert errors[0] < 1.1 * SIGMA < 2.0 * SIGMA < errors[1]
+    # one that begins at another voltage has its own start
+    other = record_of(model, 5)
+    apart = divided(records[:2], [replace(other, voltage=other.voltage + 5.0)])
+    elsewhere = fitted(model, apart)
+    plain = predict(
+        elsewhere.model, apart, elsewhere.unknowns, elsewhere.theta, way=elsewhere.way,
+        everything=True,
+    )  # fmt: skip
+    np.testing.assert_array_equal(elsewhere.predicted(apart)[2], plain[2].displacement)
+
+
+def test_a_trial_whose_numbers_overflow_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finite numbers whose squares are not: no step could be computed from them."""
+    model = model_with()
+    experiments = [whole(record_of(model, 1))]
+    found = fitted(model, experiments)
+    weights = np.full(experiments[0].record.n, SIGMA)
+    evaluate = objective(model, experiments, found.unknowns, weights, found.way)
+    assert evaluate(found.theta) is not None
+
+    size = found.unknowns.size
+
+    def huge(*given: object, **more: object) -> list[Prediction]:
+        one = Prediction(np.full(len(weights), 1.0), np.full((len(weights), size), 1e160), "exact")
+        return [one]
+
+    monkeypatch.setattr("psa_casadi.identification.fitting.fit.predict", huge)
+    assert evaluate(found.theta) is None
 
 
 def test_a_fit_without_samples_is_refused() -> None:
