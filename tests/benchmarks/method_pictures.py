@@ -71,7 +71,7 @@ def _scores(axes: Axes, found: Searched) -> None:
     axes.barh(names, [max(found.scale.score(h), 0.0) for h in rows], color=colours)
     axes.set_xlabel("score [ln units]")
     axes.set_title("Blue: the answer; orange: may be it;\n"
-                   "grey: removes too little, or held-out data object",
+                   "grey: fails a rule",
                    loc="left", fontsize=10)  # fmt: skip
     axes.tick_params(labelsize=8)
 
@@ -90,7 +90,7 @@ def _shares(axes: Axes, d: Diagnosis) -> None:
     left = 100.0 * (b.remains_rms_m / max(b.excess_rms_m, 1e-300)) ** 2
     axes.bar(["remains"], [left], color=_GREY)
     scale = length_scale(b.excess_rms_m)
-    axes.set_ylabel("share of the held-out error's power [%]")
+    axes.set_ylabel("share of the excess [%]")
     title = f"Of {scale.text(b.excess_rms_m)} above the noise of {scale.text(b.noise_rms_m)}"
     axes.set_title(title, loc="left", fontsize=10)
     axes.tick_params(labelsize=8)

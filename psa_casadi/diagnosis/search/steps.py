@@ -26,17 +26,18 @@ FloatArray = npt.NDArray[np.float64]
 class Step:
     """A hypothesis on the way to the best one, and the cause that comes next.
 
-    `fitted` are the hypotheses with one more effect; `evidence` is ln B of every effect over this
-    hypothesis, or over all other causes where there are later ones, and of effects that bend the
-    same curve the best one's; `probability` that of being the cause, given that one effect of the
-    table is. `chosen` is the hypothesis with the next cause, None of the last step; `without` the
-    one with all causes but this.
+    `fitted` are the hypotheses with one more effect; `alone` is ln B of every effect over this
+    hypothesis, `evidence` over all other causes where there are later ones, and of effects that
+    bend the same curve the best one's; `probability` that of being the cause, given that one effect
+    of the table is. `chosen` is the hypothesis with the next cause, None of the last step;
+    `without` the one with all causes but this.
     """
 
     view: View
     fitted: Mapping[str, Hypothesis] = field(default_factory=dict)
     chosen: Hypothesis | None = None
     without: Hypothesis | None = None
+    alone: Mapping[str, float] = field(default_factory=dict)
     evidence: Mapping[str, float] = field(default_factory=dict)
     probability: Mapping[str, float] = field(default_factory=dict)
 
@@ -86,7 +87,7 @@ def steps_of(found: Searched, task: Task) -> list[Step]:
 def unsearched(base: Fit, task: Task) -> list[Step]:
     """Return the one step of a base fit that is not worth a search."""
     view = examine(root_of(base, task.experiments), task)
-    return [Step(view, evidence=view.estimated())]
+    return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
 
 def _way(found: Searched, task: Task, count: int) -> Hypothesis:
@@ -129,6 +130,7 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
         for name in _promising(evidence, fitted, chosen.causes[-1].name):
             more = with_cause(before, task.experiments, view.starts_of(name))
             evidence[name] = -np.inf if more is None else scale.evidence(more) - own
+    alone, alike = evidence, task.alike(before.fit)
     good = {n for n, c in fitted.items() if c.names in found.worth}
     unfit: set[str] = set()
     if chosen is not None:
@@ -136,9 +138,9 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
         evidence, beside = _beside(found, evidence, cause.name, best)
         rest = best.names - {cause.name}
         unfit = {n for n in beside if n != cause.name and rest | {n} not in found.worth}
-        unfit |= {n for g in task.alike(before.fit) if unfit & set(g) for n in g} - {cause.name}
+        unfit |= {n for g in alike if unfit & set(g) for n in g}
+        unfit -= {cause.name, *(n for g in alike if cause.name in g for n in g)}
         good = (good | beside | {cause.name}) - unfit
-    alike = task.alike(before.fit)
     fit = {n for n, c in fitted.items() if in_character(c.fit, _named(c, n), task.experiments)}
     same = {n for group in alike if good & set(group) for n in group if n in fit}
     refused = (set(fitted) - good - same) | unfit
@@ -146,7 +148,7 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
         refused |= best.names - {chosen.causes[-1].name}
     evidence = levelled(evidence, alike, good)
     chances = probabilities({n: v for n, v in evidence.items() if n not in refused})
-    return Step(view, fitted, chosen, None, evidence, chances)
+    return Step(view, fitted, chosen, None, alone, evidence, chances)
 
 
 def _promising(
