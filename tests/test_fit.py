@@ -11,7 +11,7 @@ from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit, objective
-from psa_casadi.identification.fitting.prediction import Prediction, predict
+from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.search.multistart import free_parameters
@@ -242,3 +242,11 @@ def test_a_fit_without_samples_is_refused() -> None:
     bare = replace(record, displacement=None)
     with pytest.raises(InputError, match="has no displacement"):
         fit(compose(BASE), [Experiment(bare, ~none, none)], ["k_L"], sigma=[SIGMA])
+
+
+def test_a_stack_that_never_settles_leaves_no_start_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial point may be undamped: there is no time after which its start is forgotten."""
+    monkeypatch.setattr(
+        "psa_casadi.identification.fitting.prediction.settling_time", lambda model: np.inf
+    )
+    assert motions_of(model_with(), record_of(model_with(), 1), SIGMA) == {}

@@ -81,7 +81,7 @@ def ablation_table(
     note = (
         f"{len(whole)} cases. Right: hidden effects of the table, weak ones and pairs too. Wrong"
         " alone: `cause_named` without the cause, foreign and left out ones too. The patch's share"
-        " is the median over foreign and left out causes that are not named."
+        " is the median over foreign and left out causes that are unexplained."
     )
     return TitledTable(title, Table(head, tuple(rows)), note)
 
@@ -90,7 +90,8 @@ def figures(found: Sequence[Found]) -> tuple[str, ...]:
     """Return the figures of one method."""
     hidden = [f for f in found if f.case.kind in ("known", "weak", "two") and f.reached]
     clean = [f for f in found if f.case.kind in ("clean", "ringing")]
-    open_ones = [f for f in found if f.case.kind in ("foreign", "left out") and not f.named]
+    open_ones = [f for f in found if f.case.kind in ("foreign", "left out")]
+    open_ones = [f for f in open_ones if f.verdict == "unexplained"]
     wrong = [f for f in found if f.alone and f.alone not in f.case.hidden]
     patched = float(np.median([f.patched for f in open_ones])) if open_ones else 0.0
     return (

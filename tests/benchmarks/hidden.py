@@ -79,7 +79,8 @@ def _summary(found: Sequence[Found]) -> TitledTable:
     poor, ringing = ([f for f in found if f.case.kind == k] for k in ("poor", "ringing"))
     design = of_kind(found, "design")
     told = [f for f in known if f.named]
-    absent = [f for f in found if f.case.kind in ("foreign", "left out") and not f.named]
+    absent = [f for f in found if f.case.kind in ("foreign", "left out")]
+    absent = [f for f in absent if f.verdict == "unexplained"]
     patched = np.array([f.patched for f in absent]) if absent else np.array([np.nan])
     ratios = np.array([f.ratio for f in known if f.case.right in f.named] or [np.nan])
     sizes = [float(len(f.within)) for f in told if len(f.named) == 1] or [np.nan]
@@ -108,7 +109,7 @@ def _summary(found: Sequence[Found]) -> TitledTable:
                 lambda f: f.alone is None)),
         ("foreign plants: not named alone", "97 %",
          _share(of_kind(found, "foreign"), lambda f: f.alone is None)),
-        ("foreign or left out and not named: share that the unnamed correction removes, median",
+        ("foreign or left out and unexplained: share that the unnamed correction removes, median",
          "70 %", f"{100.0 * np.median(patched):.0f} % of {len(absent)}"),
         ("two causes: both named, no third", "90 %",
          _share(two, lambda f: set(f.named) == set(f.case.hidden))),

@@ -120,7 +120,7 @@ def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
     u = record_inputs(model, record, record.n)
     v, column = record.voltage, model.input_names.index("voltage")
     settling = settling_time(model)
-    lag = int(settling / record.sample_time)
+    lag = int(min(settling / record.sample_time, record.n))  # an undamped one never settles
     if lag < 2 or 2 * lag >= record.n or initial_slope(record.time, v) == 0.0:
         return {}
     bend = v[2 * lag :] - 2.0 * v[lag:-lag] + v[: -2 * lag]
