@@ -20,6 +20,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, divided, whole
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way
 
 FloatArray = NDArray[np.float64]
@@ -250,3 +251,13 @@ def test_a_stack_that_never_settles_leaves_no_start_open(monkeypatch: pytest.Mon
         "psa_casadi.identification.fitting.prediction.settling_time", lambda model: np.inf
     )
     assert motions_of(model_with(), record_of(model_with(), 1), SIGMA) == {}
+
+
+def test_numbers_that_overflow_are_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What tries a fit tries the next one then."""
+    monkeypatch.setattr(
+        "psa_casadi.identification.fitting.fit.motions_of", lambda *given: {"f": 1 / 0.0}
+    )
+    record = record_of(model_with(), 1)
+    with pytest.raises(SimulationError, match="numbers of the fit overflow"):
+        fit(model_with(), [whole(record)], ["k_L"], sigma=[SIGMA])

@@ -1,6 +1,7 @@
 """Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,6 +104,17 @@ class Fit:
         return full
 
 
+@contextmanager
+def _overflow_is_told() -> Iterator[None]:
+    try:
+        yield
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise SimulationError(
+            f"The numbers of the fit overflow ({error}); start from other values."
+        ) from error
+
+
+@_overflow_is_told()
 def fit(
     model: Model,
     experiments: Sequence[Experiment],
@@ -122,7 +134,7 @@ def fit(
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
     those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
     cost will stay above the `goal`. Raises InputError when no sample can be used, SimulationError
-    when the start cannot be simulated.
+    when the start cannot be simulated or its numbers overflow.
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
