@@ -76,7 +76,7 @@ def _confusion(
     axes.set_yticks(range(len(rows)), names)
     axes.tick_params(labelsize=8)
     axes.axhline(len(known) - 0.5, color="0.5", linewidth=0.8)
-    axes.axvline(len(known) - 0.5, color="0.5", linewidth=0.8)
+    axes.axvline(len(columns) - len(_NONE) - 0.5, color="0.5", linewidth=0.8)
     axes.set_xlabel("named first")
     axes.set_ylabel("hidden in the record (cases)")
     axes.set_title("What was hidden and what was named, percent of each row's cases")
