@@ -69,8 +69,8 @@ def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArr
 
 
 def _curved(shown: FloatArray) -> FloatArray:
-    """A reading with a ripple that no effect of the table forms."""
-    return shown + 1e-7 * np.sin(4.0 * shown / 1e-6)
+    """A reading with a ripple that narrows over the travel, which no effect of the table forms."""
+    return shown + 1e-7 * np.sin(0.25 * (shown / 1e-6) ** 2)
 
 
 @slow

@@ -52,7 +52,7 @@ SENSOR_RIPPLE = Component(
         " + second_cosine cos(2 a) + second_sine sin(2 a)"
     ),
     parameters=(
-        Parameter("ripple_gain", 0.0, "m", (-1e-4, 1e-4), "size of the ripple", "um", scale=_scale),
+        Parameter("ripple_gain", 0.0, "m", (-1e-3, 1e-3), "size of the ripple", "um", scale=_scale),
         Parameter(
             "ripple_period", 2e-6, "m", (1e-9, 1e-2), "displacement of one period", "um", log=True
         ),
