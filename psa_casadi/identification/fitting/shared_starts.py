@@ -26,7 +26,7 @@ def shared_starts(
     """Return theta with shared starts, and the records that have one.
 
     A record that is held out as a whole has the mean start, in the coordinates of the fit, of the
-    fitted records whose voltage begins alike. States of sensor and environment stay its own.
+    fitted records whose voltage begins alike. States of drive, sensor and environment stay its own.
     """
     ranges = [float(np.ptp(e.record.voltage)) for e in experiments]
     own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
