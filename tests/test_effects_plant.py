@@ -145,12 +145,18 @@ def test_contact_kinks_the_curve_at_one_displacement(base: tuple[Component, ...]
         assert meeting == pytest.approx(x_c, rel=0.01)
 
 
-@pytest.mark.parametrize("asymmetry", [0.0, 1.0, -0.7])
-def test_memory_is_a_sum_of_plays_and_their_squares(asymmetry: float) -> None:
+@pytest.mark.parametrize("asymmetry", [0.0, 0.8, -0.6, 0.5 * np.pi])
+@pytest.mark.parametrize(("angle", "bend"), [(0.34, 0.0), (1.7, -0.4)])
+def test_memory_is_a_sum_of_plays_and_their_squares(
+    asymmetry: float, angle: float, bend: float
+) -> None:
     """Of ideal plays with the same weights and thresholds, to the roundness of its stops."""
-    weights = 1.0 + 0.5 * np.cos(np.pi * (np.arange(4) + 0.5) / 4)
+    place = np.pi * (np.arange(4) + 0.5) / 4
+    waves = np.array([np.ones(4), np.sqrt(2) * np.cos(place), np.sqrt(2) * np.cos(2 * place)])
+    assert waves @ waves.T == pytest.approx(4.0 * np.eye(3), abs=1e-12)
+    weights = np.array([np.cos(angle), np.sin(angle), bend]) @ waves
     model = linear(
-        HYSTERESIS_MEMORY, 0.05, memory_threshold=0.02, memory_slope=0.5,
+        HYSTERESIS_MEMORY, 0.05, memory_threshold=0.02, memory_angle=angle, memory_bend=bend,
         memory_asymmetry=asymmetry,
     )  # fmt: skip
     t = np.linspace(0.0, 60.0, 6001)
@@ -160,8 +166,8 @@ def test_memory_is_a_sum_of_plays_and_their_squares(asymmetry: float) -> None:
     rated, expected = model.values["u_rated"], np.zeros_like(t)
     for weight, ratio in zip(weights, (1.0, 2.5, 6.0, 15.0), strict=True):
         p = play(voltage, 0.02 * ratio * rated)
-        squares = asymmetry * (voltage**2 - p**2) / rated
-        expected += 0.05 * weight * (voltage - p + squares)
+        plays, squares = voltage - p, (voltage**2 - p**2) / rated
+        expected += 0.05 * weight * (np.cos(asymmetry) * plays + np.sin(asymmetry) * squares)
     expected *= model.values["k_L"] * static_compliance(model.values)
     assert np.sqrt(np.mean((shown - expected) ** 2)) < 0.05 * np.ptp(expected)
 

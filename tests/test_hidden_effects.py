@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from tests.benchmarks.hidden_cases import Case, run_case
+from psa_casadi.diagnosis.task import Method
+from tests.benchmarks.hidden_cases import Case, records_of, run_case
 from tests.plants.make import Truth, make_record
 from tests.plants.table import FOREIGN, KNOWN, called
 from tests.tiers import slow, slow_but
@@ -76,6 +77,21 @@ def test_clean_data_leave_the_diagnosis_silent(seed: int, tmp_path: Path) -> Non
     assert found.causes == ()
     assert found.remaining.white
     assert found.base_errors.holdout_rms_m == pytest.approx(truth.sigma, rel=0.1)
+
+
+@slow
+def test_two_causes_are_found_where_neither_explains_most(tmp_path: Path) -> None:
+    """Looked for one by one, a third effect takes the place of both."""
+    other = ("rate_independent_asymmetry",)
+    case = Case("two", "saturation_of_strain", 163299, (1.0, 3.0), other)
+    truth, records = records_of(case, tmp_path)
+    found = psa.diagnose(records)
+    assert set(case.hidden) <= within(found)
+    assert len(found.causes) == 2
+    assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
+    one_by_one = psa.diagnose(records, method=Method(frozenset({"several at once"})))
+    assert one_by_one.extended_errors.holdout_rms_m > 1.1 * truth.sigma
+    assert not set(case.hidden) <= within(one_by_one)
 
 
 @slow

@@ -23,10 +23,16 @@ def rows() -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in cells}
 
 
-def percent(cell: str) -> float:
-    found = re.match(r"([0-9.]+) %", cell)
+def percents(cell: str) -> tuple[float, float]:
+    """Smallest and largest figure of a cell."""
+    found = re.match(r"([0-9.]+)(?: to ([0-9.]+))? %", cell)
     assert found is not None, cell
-    return float(found[1])
+    return float(found[1]), float(found[2] or found[1])
+
+
+def within(value: float, cell: str) -> bool:
+    low, high = percents(cell)
+    return low - 0.01 <= value <= high + 0.01
 
 
 @pytest.mark.slow
@@ -41,10 +47,13 @@ def test_the_measured_row_is_played_again(given: str, measured_data: Path) -> No
     assert said.startswith(f"`{d.verdict}`")
     named = {n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)}
     written = set(re.findall(r"`([a-z_]+)`", said)) & set(EFFECTS)
-    assert {c.effect for c in d.causes} <= written <= named
+    assert written <= named
+    if "third effect" not in said:
+        assert {c.effect for c in d.causes} <= written
     assert not named & {b.effect for b in d.blind_to}
     withdrawn = [n for n in d.notes if "not named, because" in n]
     assert bool(withdrawn) == (d.verdict == "unexplained")
-    assert d.base_errors.holdout_nrmse_percent == pytest.approx(percent(base), abs=0.01)
-    after = percent(base) if extended == "the same" else percent(extended)
-    assert d.extended_errors.holdout_nrmse_percent == pytest.approx(after, abs=0.01)
+    assert within(d.base_errors.holdout_nrmse_percent, base)
+    assert within(
+        d.extended_errors.holdout_nrmse_percent, base if extended == "the same" else extended
+    )

@@ -2,6 +2,8 @@
 
 import math
 
+import casadi as ca
+
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.scales import voltage_scale
 from psa_casadi.smooth import magnitude_power, rate_magnitude, signed_power
@@ -26,16 +28,23 @@ def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
 
 
 def _weights(s: Symbols) -> list[Expression]:
-    """Weights over the mean one: a smooth curve over the elements, two cosines."""
+    """Weights: a smooth curve over the elements, of a form that a fit can turn without a stop.
+
+    The first three cosines over the elements, each of the same sum of squares. The base has an
+    element of its own, so that the mean weight may be anything: as an angle it may pass through 0.
+    """
     places = [math.pi * (i + 0.5) / len(_RATIOS) for i in range(len(_RATIOS))]
-    return [1.0 + s.memory_slope * math.cos(x) + s.memory_bend * math.cos(2.0 * x) for x in places]
+    even, slope = ca.cos(s.memory_angle), math.sqrt(2.0) * ca.sin(s.memory_angle)
+    bend = math.sqrt(2.0) * s.memory_bend
+    return [even + slope * math.cos(x) + bend * math.cos(2.0 * x) for x in places]
 
 
 def _equations(s: Symbols) -> Equations:
     elements = [getattr(s, f"z_m{i + 1}") for i in range(len(_RATIOS))]
-    first, bend = s.memory_threshold * s.u_rated, s.memory_asymmetry / s.u_rated
+    first = s.memory_threshold * s.u_rated
+    plain, squares = ca.cos(s.memory_asymmetry), ca.sin(s.memory_asymmetry) / s.u_rated
     total = sum(
-        weight * z * (1.0 + bend * (2.0 * s.u - z))
+        weight * z * (plain + squares * (2.0 * s.u - z))
         for weight, z in zip(_weights(s), elements, strict=True)
     )
     return Equations(
@@ -62,8 +71,10 @@ def _stop_scale(p: Values) -> float:
     return 0.1 * voltage_scale(p)
 
 
-def _shape(name: str, bound: float, text: str, value: float = 0.0) -> Parameter:
-    return Parameter(f"memory_{name}", value, "1", (-bound, bound), text, scale=1.0)
+def _angle(name: str, value: float, text: str) -> Parameter:
+    return Parameter(
+        f"memory_{name}", value, "rad", (-2.0 * math.pi, 2.0 * math.pi), text, scale=0.3
+    )
 
 
 HYSTERESIS_MEMORY = Component(
@@ -75,15 +86,15 @@ HYSTERESIS_MEMORY = Component(
     ),
     gain="memory_gain",
     equation_text=(
-        "f = k_L memory_gain sum_i w_i z_i (1 + asymmetry (2 u - z_i)/u_rated),  "
+        "f = k_L memory_gain sum_i w_i z_i (cos(asymmetry)"
+        " + sin(asymmetry) (2 u - z_i)/u_rated),  "
         "z_i' = u' - (|u'| sgn(z_i) + u')/2 (|z_i|/r_i)^4,  "
         "r_i = threshold u_rated (1, 2.5, 6, 15),  "
-        "w_i = 1 + slope cos(pi (i - 1/2)/4) + bend cos(2 pi (i - 1/2)/4)"
+        "w_i = cos(angle) + sin(angle) sqrt(2) cos(pi (i - 1/2)/4)"
+        " + bend sqrt(2) cos(2 pi (i - 1/2)/4)"
     ),
     parameters=(
-        Parameter(
-            "memory_gain", 0.0, "1", (-2.0, 2.0), "elements' mean force over k_L", scale=0.02
-        ),
+        Parameter("memory_gain", 0.0, "1", (-2.0, 2.0), "elements' force over k_L", scale=0.02),
         Parameter(
             "memory_threshold",
             0.03,
@@ -92,15 +103,23 @@ HYSTERESIS_MEMORY = Component(
             "first threshold over rated voltage",
             log=True,
         ),
-        _shape("slope", 100.0, "weights of narrow elements over those of wide ones", 0.5),
-        _shape(
-            "bend", 100.0, "weights of the outer elements more than of the inner, over the mean"
+        _angle("angle", 0.34, "form of the weights: 0 equal, pi/2 narrow against wide elements"),
+        Parameter(
+            "memory_bend",
+            0.0,
+            "1",
+            (-20.0, 20.0),
+            "weights of the outer elements more than of the inner",
+            scale=1.0,
         ),
-        _shape("asymmetry", 10.0, "squares of the plays, over the plays, at rated voltage"),
+        _angle("asymmetry", 0.0, "0: plays, as of a symmetric loop; pi/2: their squares alone"),
     ),
     states=tuple(_state(i + 1) for i in range(len(_RATIOS))),
     equations=_equations,
-    probe={"memory_threshold": (0.02, 0.06), "memory_asymmetry": (-0.5, 0.0, 0.5)},
+    probe={
+        "memory_threshold": (0.03, 0.06),
+        "memory_asymmetry": (-0.25 * math.pi, 0.0, 0.25 * math.pi),
+    },
     looks_like=(
         "the residual changes with the distance from past reversal points; minor loops do not nest"
     ),

@@ -2,12 +2,10 @@
 
 Every set of causes has one hypothesis, the best fit of it that was found. The best hypothesis is
 looked at: is anything left in its residual? Then its neighbours are fitted: the base with
-resonances that it has missed; with one more cause; with one less (which fits the base again from
-where the cause has led); with one cause in another's place. That goes on while one of them is
-better; where much is left, from another base and with all effects.
+resonances that it has missed; with one more cause; with several at once; with one less (which fits
+the base again from where the cause has led); with one cause in another's place. That goes on while
+one of them is better; where much is left, from another base and with all effects.
 """
-
-import numpy as np
 
 from psa_casadi.diagnosis.base_fit.ringing import ringing
 from psa_casadi.diagnosis.base_fit.variants import (
@@ -19,18 +17,17 @@ from psa_casadi.diagnosis.base_fit.variants import (
     rings,
 )
 from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.screening.screen import Copy, copies
+from psa_casadi.diagnosis.search.exchange import exchange
 from psa_casadi.diagnosis.search.fits import (
     afresh,
     any_afresh,
-    in_place,
-    like,
     together,
     with_cause,
     without,
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.known import NEAR, NONE, Known, Names, Searched, is_left
+from psa_casadi.diagnosis.search.known import NONE, Known, Names, Searched, is_left
+from psa_casadi.diagnosis.search.several import fit_sets
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -61,6 +58,7 @@ class _Search:
         self.task, self.known = task, Known(base, task)
         self.expanded: dict[Names, Hypothesis] = {}
         self.done: set[tuple[str, Names]] = set()
+        self.sets_of: Hypothesis | None = None
 
     def run(self) -> None:
         for _ in range(_VISITS):
@@ -91,7 +89,8 @@ class _Search:
         if any(self.explains(own) for own in way[:-1] if own is not None):
             return self.next()
         if best.causes and self.once("exchange", best.names):
-            self.exchange(best)
+            if "exchange" not in self.task.method.without:
+                exchange(best, self.known, self.task)
             return self.next()
         if self.known.is_open(best) and self.otherwise():
             return self.next()
@@ -137,6 +136,8 @@ class _Search:
             return
         self.expanded[h.names] = h
         if view.shows and len(h.causes) < thresholds().most_causes:
+            if h.causes:
+                self.several_at_once()
             self.add_causes(h, view)
 
     def once(self, what: str, names: Names) -> bool:
@@ -160,6 +161,13 @@ class _Search:
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
         self.known.finish([c for c in self.known.leaders(h) if not c.final][:_FINALISTS])
+
+    def several_at_once(self) -> None:
+        """Fit sets of causes at once, again where the base without causes has become another."""
+        if "several at once" in self.task.method.without or self.sets_of is self.known.root:
+            return
+        self.sets_of = self.known.root
+        fit_sets(self.known, self.task)
 
     @stage("fits afresh")
     def fit_afresh(self, h: Hypothesis, view: View) -> None:
@@ -235,69 +243,6 @@ class _Search:
         fitted = from_resonances(root.fit, task.experiments, task.progress)
         self.known.note(hypothesis((), fitted, task.experiments, final=True))
         return self.known.root is not root
-
-    @stage("causes judged again")
-    def exchange(self, h: Hypothesis) -> None:
-        """Fit what was nearly as likely in a cause's step in its place, beside the later ones."""
-        if "exchange" in self.task.method.without:
-            return
-        for k, cause in enumerate(h.causes):
-            before = self.known.get(h.names_upto(k))
-            less = self.known.get(h.names - {cause.name})
-            if before is None or less is None:
-                continue
-            if len(h.causes) > 1:
-                for rival in self.rivals(before, h):
-                    self.task.progress(f"{rival.causes[-1].name} in the place of {cause.name}")
-                    self.put_in_place(h, less, rival)
-            for copy in self.copies(h, less):
-                name = copy.direction.effect.name
-                self.task.progress(f"{name}, which could copy {cause.name}")
-                self.known.note(like(h, less, copy, self.task.experiments))
-                self.known.remember(before, name)
-
-    def put_in_place(self, h: Hypothesis, less: Hypothesis, rival: Hypothesis) -> None:
-        """Fit a rival's last cause beside those of `less`, to the end where that is near."""
-        effect, own = rival.causes[-1], self.known.scale.evidence(h)
-        names = less.names | {effect.name}
-        for reached in (h.fit, rival.fit):
-            found = in_place(h, less, reached, rival.fit, effect, self.task.experiments)
-            self.known.note(found)
-            if found is not None and self.known.scale.evidence(found) > own:
-                break
-        best = self.known.get(names)
-        if best is not None and self.known.scale.evidence(best) > own - NEAR:
-            self.known.finish([best])
-
-    def copies(self, h: Hypothesis, less: Hypothesis) -> list[Copy]:
-        """Return effects that could add what the cause not in `less` adds, but were not fitted so.
-
-        A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is
-        below `NEAR` might explain the data as well; a fit much worse than its copy was lost.
-        """
-        pairs = zip(h.predicted, less.predicted, self.task.experiments, strict=True)
-        added = np.concatenate([(p - q)[e.used] for p, q, e in pairs])
-        table = [e for e in self.task.table if e.name not in h.names]
-        trials = [
-            d
-            for d in self.known.trials
-            if d.effect in table and self.known.different(d.effect, less)
-        ]
-        power, found = copies(less.fit, added, trials, self.known.scale.colour)
-        own = self.known.scale.evidence(h)
-        lost: dict[str, float] = {}
-        for name, copy in found.items():
-            left = 0.5 * power * (1.0 - copy.share)
-            known = self.known.get(less.names | {name})
-            reached = -np.inf if known is None else self.known.scale.evidence(known)
-            if left < NEAR and reached < own - left - NEAR:
-                lost[name] = left
-        return [found[n] for n in sorted(lost, key=lambda n: lost[n])[:_FINALISTS]]
-
-    def rivals(self, before: Hypothesis, h: Hypothesis) -> list[Hypothesis]:
-        """Return the fitted neighbours that were nearly as likely as a cause, the best first."""
-        near = self.known.leaders(before)
-        return [c for c in near if c.causes[-1].name not in h.names][:_FINALISTS]
 
     def tell(self, h: Hypothesis, what: str) -> None:
         self.task.progress(f"cause {len(h.causes) + 1}: {what}")

@@ -5,8 +5,16 @@ from dataclasses import replace
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.screening.screen import Copy, Score
+from psa_casadi.diagnosis.screening.sets import Together
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis
-from psa_casadi.diagnosis.search.quick_fits import QUICK, Start, continued, fit_from, quick_fit
+from psa_casadi.diagnosis.search.quick_fits import (
+    QUICK,
+    Start,
+    continued,
+    fit_from,
+    fit_with_all,
+    quick_fit,
+)
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.search.refitting import quick_rtol, refit
@@ -30,6 +38,23 @@ def with_cause(
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
     quick = quick_fit(before.fit, experiments, effect, starts, {})
     return hypothesis((*before.causes, effect), quick, experiments)
+
+
+def with_causes(
+    before: Hypothesis, experiments: Sequence[Experiment], start: Together
+) -> Hypothesis | None:
+    """Fit quickly with several more causes at once; None if that fails."""
+    added = [
+        (d.effect, d.values, d.unit_gain if d.finite else gain)
+        for d, gain in zip(start.directions, start.gains, strict=True)
+    ]
+    memory = tuple(
+        {k: v for d in start.directions for k, v in d.memory[r].items()} | own
+        for r, own in enumerate(before.fit.starts())
+    )
+    quick = fit_with_all(before.fit, experiments, added, memory, {}, _AFRESH)
+    causes = (*before.causes, *(d.effect for d in start.directions))
+    return hypothesis(causes, quick, experiments)
 
 
 def afresh(

@@ -3,8 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
+from psa_casadi.diagnosis.screening.evidence import temperature
+from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.search.fits import to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of
 from psa_casadi.diagnosis.search.view import View, examine
@@ -16,7 +20,7 @@ from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Neighbours are nearly as likely as the best one if their evidence is this share of its, or within
 #: so many nats of it.
-_SHARE, NEAR = 0.8, 30.0
+SHARE, NEAR = 0.8, 30.0
 #: Effects far behind in the screening are fitted afresh where less than this share of the excess
 #: power is explained.
 _EXPLAINED = 0.8
@@ -29,7 +33,8 @@ NONE: Names = frozenset()
 class Searched:
     """What a search has found: every hypothesis by its causes, and the best of them.
 
-    `views` are of hypotheses whose residual was looked at, `fitted` the effects fitted beside each.
+    `views` are of hypotheses whose residual was looked at, `fitted` the effects fitted beside each,
+    `trials` what effects would add to the base.
     """
 
     best: Hypothesis
@@ -38,6 +43,7 @@ class Searched:
     fitted: dict[Names, tuple[str, ...]]
     worth: frozenset[Names]
     scale: Scale
+    trials: tuple[Direction, ...]
 
 
 class Known:
@@ -69,10 +75,56 @@ class Known:
 
     def result(self) -> Searched:
         """Return what was found, the best hypothesis looked at."""
-        best = self.best()
+        self.view(self.best())
+        best = self.in_order(self.answer())
         self.view(best)
         worth = frozenset(n for n, h in self.found.items() if self.worth(h))
-        return Searched(best, self.found, self.views, self.fitted, worth, self.scale)
+        return Searched(best, self.found, self.views, self.fitted, worth, self.scale, self.trials)
+
+    def answer(self) -> Hypothesis:
+        """Return the best hypothesis; where that removes too little, one that is nearly as likely.
+
+        Too little of the held-out error, so that its causes would not be named.
+        """
+        best = self.best()
+        if not self.removes_little(best):
+            return best
+        own = self.scale.evidence(best)
+        least = self.scale.score(best) - thresholds().clearly * temperature(own)
+        near = [h for h in self.ranked() if h.causes and self.scale.score(h) > least]
+        self.finish([h for h in near if not h.final])
+        enough = [
+            h
+            for h in self.ranked()
+            if h.causes and self.scale.score(h) > least
+            if h.final and self.worth(h) and not self.removes_little(h)
+        ]
+        return next(iter(enough), best)
+
+    def removes_little(self, h: Hypothesis) -> bool:
+        """Whether structure remains and the causes remove too little to be named."""
+        root, noise = self.root.holdout_rms, self.scale.colour.rms
+        if not h.causes or root <= noise:
+            return False
+        share = (root**2 - h.holdout_rms**2) / (root**2 - noise**2)
+        return share < thresholds().partly and self.view(h).test.alarm
+
+    def in_order(self, h: Hypothesis) -> Hypothesis:
+        """Return a hypothesis with its causes in the order in which they explain most.
+
+        Those that bend the same curve as another effect, which are never named alone, come last.
+        """
+        shared = {n for group in self.task.alike(self.root.fit) for n in group}
+        left: list[Component] = list(h.causes)
+        causes: list[Component] = []
+        while left:
+            names = frozenset(c.name for c in causes)
+            known = [self.found.get(names | {c.name}) for c in left]
+            gains = [-np.inf if k is None else self.scale.evidence(k) for k in known]
+            own = [c.name not in shared for c in left]
+            causes.append(left.pop(max(range(len(left)), key=lambda k: (own[k], gains[k]))))
+        self.found[h.names] = ordered = replace(h, causes=tuple(causes))
+        return ordered
 
     def note(self, found: Hypothesis | None) -> None:
         """Keep a hypothesis if it is the best of its causes."""
@@ -86,7 +138,7 @@ class Known:
     def view(self, h: Hypothesis) -> View:
         """Look at what a hypothesis leaves; the noise of all others is told from the best one."""
         old = self.views.get(h.names)
-        if old is None or old.of is not h:
+        if old is None or old.of.fit is not h.fit:
             known = self.trials if h.causes else ()
             self.views[h.names] = old = examine(h, self.task, known)
         if h is self.best():
@@ -104,7 +156,7 @@ class Known:
         """Return those of the children that are nearly as likely as the best one, best first."""
         own, children = self.scale.evidence(h), self.children(h)
         gains = [self.scale.evidence(c) - own for c in children]
-        least = min(_SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
+        least = min(SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
         return [c for c, gained in zip(children, gains, strict=True) if gained > least]
 
     def remember(self, h: Hypothesis, *names: str) -> None:
@@ -151,7 +203,11 @@ class Known:
                 continue
             if h.removes(before) <= knowable**2:
                 return False
-            if before.causes and "form" not in out and h.share(before, root) <= thresholds().form:
+            if (
+                before.causes
+                and "form" not in out
+                and h.share(before, root) <= thresholds().further
+            ):
                 return False
             if not self.remembers(h, before, cause):
                 return False

@@ -50,14 +50,30 @@ def fit_from(
 ) -> Fit | None:
     """Fit with one more effect from a start, the other values `reset`; None if that fails."""
     values, gain, memory = start
+    added = [(effect, values, gain)]
+    return fit_with_all(before, experiments, added, memory, reset, evaluations)
+
+
+def fit_with_all(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    added: Sequence[tuple[Component, dict[str, float], float]],
+    memory: tuple[dict[str, float], ...],
+    reset: dict[str, float],
+    evaluations: int,
+) -> Fit | None:
+    """Fit with more effects, each from its values and its gain; None if that fails."""
     names = list(before.unknowns.names)
-    names += [n for n in effect.fitted if n not in names]
-    low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
+    names += [n for effect, _, _ in added for n in effect.fitted if n not in names]
     for share in (1.0, 0.3):
-        value = float(np.clip(share * gain, 0.9 * low, 0.9 * high))
+        model = before.model
+        for effect, values, gain in added:
+            low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
+            value = float(np.clip(share * gain, 0.9 * low, 0.9 * high))
+            model = model.with_effect(effect, {**values, **reset, effect.gain or "": value})
         try:
             return fit(
-                before.model.with_effect(effect, {**values, **reset, effect.gain or "": value}),
+                model,
                 experiments,
                 names,
                 sigma=before.sigma,

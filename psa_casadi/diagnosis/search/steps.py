@@ -77,10 +77,7 @@ def steps_of(found: Searched, task: Task) -> list[Step]:
     steps = []
     for k, view in enumerate(views):
         chosen = ways[k + 1] if k + 1 < len(ways) else None
-        step = _step(found, task, view, chosen)
-        if chosen is not None:
-            step = replace(step, without=_without(found, task, step.cause))
-        steps.append(step)
+        steps.append(_step(found, task, view, chosen))
     return steps
 
 
@@ -95,7 +92,7 @@ def _way(found: Searched, task: Task, count: int) -> Hypothesis:
     best = found.best
     own = found.known.get(best.names_upto(count))
     if own is not None:
-        return own
+        return replace(own, causes=best.causes[:count])
     for cause in best.causes[: count - 1 : -1]:
         less = without(best, cause, task.experiments)
         best = best if less is None else less
@@ -109,46 +106,68 @@ def _without(found: Searched, task: Task, cause: Component) -> Hypothesis | None
 
 
 def _view(found: Searched, h: Hypothesis, task: Task) -> View:
+    """Look at a hypothesis; what effects would add is known from where the search began."""
     own = found.views.get(h.names)
-    if own is not None and own.of is h:
-        return own
-    return examine(h, task, found.views[frozenset()].trials if h.causes else ())
+    if own is None or own.of.fit is not h.fit:
+        found.views[h.names] = own = examine(h, task, found.trials)
+    return own if own.of is h else replace(own, of=h)
 
 
 def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) -> Step:
-    before, scale, best = view.of, found.scale, found.best
-    own = scale.evidence(before)
-    fitted = {}
-    for name in found.fitted.get(before.names, ()):
-        child = found.known.get(before.names | {name})
-        if child is not None:
-            fitted[name] = child
+    fitted = _fitted(found, view.of)
     if chosen is not None:
         fitted[chosen.causes[-1].name] = chosen
-    evidence = {**view.estimated(), **{n: scale.evidence(c) - own for n, c in fitted.items()}}
-    if chosen is not None:
-        for name in _promising(evidence, fitted, chosen.causes[-1].name):
-            more = with_cause(before, task.experiments, view.starts_of(name))
-            evidence[name] = -np.inf if more is None else scale.evidence(more) - own
-    alone, alike = evidence, task.alike(before.fit)
-    good = {n for n, c in fitted.items() if c.names in found.worth}
-    unfit: set[str] = set()
-    if chosen is not None:
-        cause = chosen.causes[-1]
-        evidence, beside = _beside(found, evidence, cause.name, best)
-        rest = best.names - {cause.name}
-        unfit = {n for n in beside if n != cause.name and rest | {n} not in found.worth}
-        unfit |= {n for g in alike if unfit & set(g) for n in g}
-        unfit -= {cause.name, *(n for g in alike if cause.name in g for n in g)}
-        good = (good | beside | {cause.name}) - unfit
+    own = found.scale.evidence(view.of)
+    alone = {**view.estimated(), **{n: found.scale.evidence(c) - own for n, c in fitted.items()}}
+    if chosen is None:
+        refused = {n for n, c in fitted.items() if c.names not in found.worth}
+        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, task)
+    cause = chosen.causes[-1]
+    less = _without(found, task, cause)
+    if less is None:  # it cannot be fitted; the effects as they are without the later causes
+        return _judged(Step(view, fitted, chosen, None, alone), alone, fitted, set(), task)
+    there = _view(found, less, task)
+    beside = {**_fitted(found, less), cause.name: found.best}
+    own = found.scale.evidence(less)
+    evidence = {
+        **there.estimated(),
+        **{n: found.scale.evidence(c) - own for n, c in beside.items()},
+    }
+    for name in _promising(evidence, beside, cause.name):
+        more = with_cause(less, task.experiments, there.starts_of(name))
+        evidence[name] = -np.inf if more is None else found.scale.evidence(more) - own
+    refused = {n for n, c in beside.items() if c.names not in found.worth} - {cause.name}
+    return _judged(Step(view, fitted, chosen, less, alone), evidence, beside, refused, task)
+
+
+def _fitted(found: Searched, h: Hypothesis) -> dict[str, Hypothesis]:
+    """Return the hypotheses with one more effect, by its name."""
+    every = {n: found.known.get(h.names | {n}) for n in found.fitted.get(h.names, ())}
+    return {n: child for n, child in every.items() if child is not None}
+
+
+def _judged(
+    step: Step,
+    evidence: Mapping[str, float],
+    fitted: Mapping[str, Hypothesis],
+    refused: set[str],
+    task: Task,
+) -> Step:
+    """Return a step with evidence and probability; `refused` effects may not be the answer.
+
+    Effects that bend the same curve are refused together, and share what the best of them has.
+    """
+    alike = task.alike(step.fit)
+    good = set(fitted) - refused
     fit = {n for n, c in fitted.items() if in_character(c.fit, _named(c, n), task.experiments)}
-    same = {n for group in alike if good & set(group) for n in group if n in fit}
-    refused = (set(fitted) - good - same) | unfit
-    if chosen is not None:  # beside the other causes
-        refused |= best.names - {chosen.causes[-1].name}
-    evidence = levelled(evidence, alike, good)
-    chances = probabilities({n: v for n, v in evidence.items() if n not in refused})
-    return Step(view, fitted, chosen, None, alone, evidence, chances)
+    for group in alike:
+        if good & set(group):
+            refused = refused - (set(group) & fit)
+        elif refused & set(group):
+            refused = refused | set(group)
+    shared = levelled(evidence, alike, good)
+    chances = probabilities({n: v for n, v in shared.items() if n not in refused})
+    return replace(step, evidence=shared, probability=chances)
 
 
 def _promising(
@@ -157,26 +176,6 @@ def _promising(
     """Return effects of which only an estimate says that they are as likely as the cause."""
     least = evidence[cause] - thresholds().clearly * temperature(evidence[cause])
     return [n for n, e in evidence.items() if n not in fitted and e > least]
-
-
-def _beside(
-    found: Searched, evidence: Mapping[str, float], cause: str, best: Hypothesis
-) -> tuple[dict[str, float], set[str]]:
-    """Return the evidence beside all other causes, and the effects that were fitted there.
-
-    What was not keeps its distance to the cause, but is not before it: it was not tried there.
-    """
-    rest = best.names - {cause}
-    less = found.known.get(rest)
-    if not rest or less is None:
-        return dict(evidence), set()
-    own = found.scale.evidence(less)
-    most = found.scale.evidence(best) - own
-    shift = most - evidence[cause]
-    moved = {n: min(v + shift, most) for n, v in evidence.items()}
-    there = {n: found.known.get(rest | {n}) for n in evidence if n not in rest}
-    known = {n: found.scale.evidence(h) - own for n, h in there.items() if h is not None}
-    return {**moved, **known}, set(known)
 
 
 def _named(h: Hypothesis, name: str) -> Component:

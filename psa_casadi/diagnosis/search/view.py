@@ -74,7 +74,8 @@ class View:
     def starts_of(self, name: str) -> list[Score]:
         """Return the best directions of one effect, from which its fits start.
 
-        Of an effect that has two forms, between which no fit moves, each form gets a start.
+        Of an effect that has two forms, between which no fit moves, each form gets a start; a
+        further start differs from the best one in as many trial values as it can.
         """
         own = [s for s in self.screening.scores if s.direction.effect.name == name]
         near = [s for s in own if s.decrease >= 0.3 * own[0].decrease]
@@ -82,7 +83,7 @@ class View:
         for score in near:
             if all(_form(score) != _form(s) for s in starts):
                 starts.append(score)
-        for score in near:
+        for score in sorted(near, key=lambda s: -_differing(s, near[0])):
             known = [s.direction.values for s in starts]
             new = score.direction.values not in known or score.direction.finite
             if new and score not in starts and len(starts) < _STARTS:
@@ -124,6 +125,10 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
 def _form(score: Score) -> dict[str, float]:
     direction = score.direction
     return {n: v for n, v in direction.values.items() if n not in direction.effect.fitted}
+
+
+def _differing(score: Score, other: Score) -> int:
+    return sum(v != other.direction.values[n] for n, v in score.direction.values.items())
 
 
 def _directions(fit: Fit, task: Task, effects: Sequence[Component]) -> list[Direction]:

@@ -51,25 +51,20 @@ def confirmed(
 
 
 def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
-    """Whether what a cause adds to another hypothesis is more than a static curve.
+    """Whether what a cause adds to another hypothesis is more than a curve of the voltage.
 
-    Of the power that the other's parameters cannot follow, `form` must be no curve of the voltage,
-    nor one of the displacement. Elements that are wider than the voltage's way are such a curve.
+    At most `static` of the power that the other's parameters cannot follow may be one. Elements
+    that are wider than the voltage's way are such a curve.
     """
     pairs = zip(of.predicted, before.predicted, experiments, strict=True)
     added = np.concatenate([(new - old)[e.used] for new, old, e in pairs])
     voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
-    moved = np.concatenate([p[e.used] for p, e in zip(before.predicted, experiments, strict=True)])
     basis = independent(before.fit.jacobian)
     target = without(added, basis)
-    most = 1.0 - thresholds().form
-    static = [independent(without(_curves(q), basis)).T @ target for q in (voltage, moved)]
-    return all(float(s @ s) < most * float(target @ target) for s in static)
-
-
-def _curves(values: FloatArray) -> FloatArray:
-    place = (values - values.min()) / max(float(np.ptp(values)), 1e-300)
-    return np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
+    place = (voltage - voltage.min()) / max(float(np.ptp(voltage)), 1e-300)
+    curves = np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
+    static = independent(without(curves, basis)).T @ target
+    return float(static @ static) < thresholds().static * float(target @ target)
 
 
 def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
