@@ -68,6 +68,20 @@ def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArr
         diagnose([Record("r", TIME, VOLTAGE, 1e6 * shown)], effects=TABLE)
 
 
+def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: FloatArray) -> None:
+    rest = np.full(TIME.size, 1e-6)
+    with pytest.raises(InputError, match="The voltage is 40 V throughout"):
+        diagnose([Record("r", TIME, np.full(TIME.size, 40.0), shown)], effects=TABLE)
+    with pytest.raises(InputError, match="The displacement is one value throughout"):
+        diagnose([Record("r", TIME, VOLTAGE, rest)], effects=TABLE)
+
+
+def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArray) -> None:
+    hold = Record("hold", TIME, np.full(TIME.size, VOLTAGE[0]), np.full(TIME.size, shown[0]))
+    found = diagnose([Record("r", TIME, VOLTAGE, shown), hold], effects=TABLE)
+    assert np.isfinite(found.base_errors.holdout_nrmse_percent)
+
+
 def _curved(shown: FloatArray) -> FloatArray:
     """A reading with a ripple that narrows over the travel, which no effect of the table forms."""
     return shown + 1e-7 * np.sin(0.25 * (shown / 1e-6) ** 2)

@@ -1,5 +1,7 @@
 """The stepper: accuracy, order, stability, cost, independence of the samples; starts and errors."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -202,16 +204,21 @@ def test_bad_samples_are_named() -> None:
         assert words in str(caught.value)
 
 
-def test_a_library_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    compile_it = compiler.run_compiler
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Commands that the compiler is called with; the cache is empty."""
+    made, run_it = [], compiler.run_compiler
 
     def counted(command: list[str], directory: Path) -> None:
-        calls.append(command)
-        compile_it(command, directory)
+        made.append(command)
+        run_it(command, directory)
 
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
     monkeypatch.setattr(compiler, "run_compiler", counted)
+    return made
+
+
+def test_a_library_is_compiled_once(tmp_path: Path, calls: list[list[str]]) -> None:
     first, second = (
         compiler.shared_library(generate_c(compose(p).structure, sensitivities=True), SOURCES)
         for p in (BASE, BASE)
@@ -222,6 +229,19 @@ def test_a_library_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert compiler.shared_library(other, SOURCES) != first
     assert len(calls) == 2
     assert len(list((tmp_path / "models").iterdir())) == 2
+
+
+def test_threads_that_want_one_model_compile_it_once(calls: list[list[str]]) -> None:
+    both, text = threading.Barrier(2), generate_c(compose(BASE).structure, sensitivities=True)
+
+    def wanted() -> Path:
+        both.wait()
+        return compiler.shared_library(text, SOURCES)
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = (job.result() for job in [pool.submit(wanted) for _ in range(2)])
+    assert first == second
+    assert len(calls) == 1
 
 
 def test_a_broken_compiler_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

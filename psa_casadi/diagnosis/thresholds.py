@@ -52,7 +52,8 @@ class Thresholds:
     * `credible`: probability that the set of effects that cannot be told apart holds the cause.
     * `clearly`: tempered odds [nats] at which an unnamed correction takes names away: 20 to 1.
     * `as_much`: one of their own kind does so where they remove less than this share of what it
-      does: it has more freedom than they have.
+      does: it has more freedom than they have. Right names removed 83 % of it and more (46 cases of
+      the study, seven measured records); all that removed 52 % and less were wrong.
     * `partly`: share of the held-out excess that named causes must remove where structure remains.
     * `follows`, `falling`: share of the displacement's variance that the voltage must explain; and
       correlation with it below which the other sign is tried.
@@ -77,7 +78,7 @@ class Thresholds:
     temperature_share: float = 0.004
     credible: float = 0.95
     clearly: float = 3.0
-    as_much: float = 0.5
+    as_much: float = 0.67
     partly: float = 0.2
     follows: float = 0.5
     falling: float = -0.5

@@ -10,6 +10,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -115,10 +117,21 @@ def generated_library(
         digest.update(path.name.encode() + path.read_bytes())
     suffix = {"Windows": ".dll", "Darwin": ".dylib"}.get(platform.system(), ".so")
     target = cache_directory() / "models" / (digest.hexdigest()[:32] + suffix)
-    if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _compile(target, generate(), [str(folder / s) for s in sources], flags)
+    with _turn_of(target):
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _compile(target, generate(), [str(folder / s) for s in sources], flags)
     return target
+
+
+_TURNS: defaultdict[Path, threading.Lock] = defaultdict(threading.Lock)
+_TURNS_LOCK = threading.Lock()
+
+
+def _turn_of(target: Path) -> threading.Lock:
+    """Return the lock of a library: of threads that want the same one, the first makes it."""
+    with _TURNS_LOCK:
+        return _TURNS[target]
 
 
 def _compile(

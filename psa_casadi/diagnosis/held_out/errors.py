@@ -63,18 +63,22 @@ def whole_residuals(
 
 
 def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> Errors:
-    """Return the errors of a model's predictions of whole records."""
+    """Return the errors of a model's predictions of whole records.
+
+    A record whose displacement rests counts over the largest range of all.
+    """
+    largest = max(e.record.range_m for e in experiments)
     train = np.concatenate(
         [(measured(e.record) - y)[e.used] for e, y in zip(experiments, predicted, strict=True)]
     )
     held = np.concatenate(held_out_residuals(experiments, predicted))
     squares = shares = 0.0
     for e, part in zip(experiments, held_out_residuals(experiments, predicted), strict=True):
-        squares += float(np.sum((part / e.record.range_m) ** 2))
+        squares += float(np.sum((part / (e.record.range_m or largest)) ** 2))
         shares += len(part)
     if not len(held):
         held = train
-        squares, shares = float(np.mean(train**2)) / experiments[0].record.range_m ** 2, 1.0
+        squares, shares = float(np.mean(train**2)) / largest**2, 1.0
     return Errors(
         train_rms_m=rms(train),
         holdout_rms_m=rms(held),

@@ -51,6 +51,8 @@ _BEGUN, _QUICK, _ENDED, _REPEATS = 3, 15, 2, 4
 _MISSED, _BETTER = 1.01, 20.0
 #: Share of the rms that is taken for noise at least.
 _FLOOR = 0.1
+#: Error of the simulated force over its range: far below the noise of what it is fitted to.
+_FORCE_RTOL = 1e-5
 _FREE = ("m_P", "m_B", "k_P")
 _FORCES = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
 
@@ -159,9 +161,11 @@ def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
 def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
     """Return a record's simulated force, linear part and hysteresis (samples,) [N].
 
-    `number` is the record's place in the fit. Raises PsaError where it cannot be simulated.
+    `number` is the record's place in the fit; the error is far below what sensors see. Raises
+    PsaError where it cannot be simulated.
     """
-    states = simulate_record(fit.model, record, memory=fit.start(number)).states
+    start = fit.start(number)
+    states = simulate_record(fit.model, record, memory=start, rtol=_FORCE_RTOL).states
     force: FloatArray = fit.model.values["k_L"] * states["u"] + states["f_H"]
     return force
 

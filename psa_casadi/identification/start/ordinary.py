@@ -23,6 +23,14 @@ _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
 _HYSTERESIS_SHARE = 0.1
 
+_CONSTANT = (
+    "The voltage is {:g} V throughout: a stack shows itself only where its voltage changes. Give a"
+    " record in which it does, or name its column (--columns voltage=...)."
+)
+_STUCK = (
+    "The displacement is one value throughout: the sensor is stuck or out of its range, or another"
+    " column holds its readings (--columns displacement=...)."
+)
 #: Shapes of loop to start from: A, beta, gamma over k_L, and n.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
     {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
@@ -38,12 +46,16 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     sheet measures is k_B; it is `ASSUMED_STIFFNESS` where none is given, since voltage and
     displacement do not determine forces. k_P = 5 k_B is assumed; k_L (1/k_P + 1/k_B) is the
     regression slope of displacement on voltage (paper, eq. 14). Raises InputError where that is
-    far from what any stack does.
+    far from what any stack does, or where no voltage or no displacement changes.
     """
     doubt = doubtful_unit(records)
     k_b = stiffness or ASSUMED_STIFFNESS
     k_p = _WAFER_RATIO * k_b
     span = max(float(np.ptp(r.voltage)) for r in records)
+    if span == 0.0:
+        raise InputError([_CONSTANT.format(records[0].voltage[0])])
+    if not any(r.range_m > 0.0 for r in records):
+        raise InputError([_STUCK])
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     sample_time = min(r.sample_time for r in records)
     k_l = max(abs(static_slope(records)), 1e-12) / (1.0 / k_p + 1.0 / k_b)
