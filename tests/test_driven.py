@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from psa_casadi.cli.diagnose import _write_patch
 from psa_casadi.diagnosis.diagnose import diagnose
@@ -68,12 +69,32 @@ def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArr
         diagnose([Record("r", TIME, VOLTAGE, 1e6 * shown)], effects=TABLE)
 
 
+def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
+    """Five light modes of either sign behind a delay, sampled too slowly for a stack's own."""
+    time: FloatArray = np.arange(2000) / 500.0
+    voltage = 50.0 + 20.0 * np.sin(2 * np.pi * (2.0 * time + 18.5 * time**2))
+    y = np.zeros(time.size)
+    for frequency, size in ((9.0, 1.0), (24.0, -1.0), (43.0, 1.0), (70.0, -1.0), (110.0, 1.0)):
+        pole = np.exp(2 * np.pi * frequency / 500.0 * (-0.03 + 1j))
+        late = np.concatenate([np.zeros(5), voltage[:-5] - 50.0])
+        y += lfilter([size * (1.0 - abs(pole))], [1.0, -2 * pole.real, abs(pole) ** 2], late)
+    y *= 1e-5 / np.std(y)
+    y += 1e-7 * np.random.default_rng(3).standard_normal(time.size)
+    found = diagnose([Record("r", time, voltage, y)], effects=TABLE)
+    assert found.verdict == "unexplained"
+    assert any("A linear filter of the voltage explains" in n for n in found.notes)
+    assert not any("of the same device" in n for n in found.notes)
+
+
 def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: FloatArray) -> None:
     rest = np.full(TIME.size, 1e-6)
     with pytest.raises(InputError, match="The voltage is 40 V throughout"):
         diagnose([Record("r", TIME, np.full(TIME.size, 40.0), shown)], effects=TABLE)
-    with pytest.raises(InputError, match="The displacement is one value throughout"):
+    with pytest.raises(InputError, match="The displacement that counts is one value"):
         diagnose([Record("r", TIME, VOLTAGE, rest)], effects=TABLE)
+    bit: FloatArray = np.where(shown > np.mean(shown), 1e-5, 0.0)
+    with pytest.raises(InputError, match="The displacement that counts is one value"):
+        diagnose([Record("r", TIME, VOLTAGE, bit)], effects=TABLE)
 
 
 def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArray) -> None:

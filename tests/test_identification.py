@@ -10,10 +10,13 @@ from psa_casadi.components import BASE
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.identify import identify
+from psa_casadi.identification.search import refitting
+from psa_casadi.identification.search.refitting import continued
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, multisine, read_record, time_grid
 from psa_casadi.records.split import whole
+from psa_casadi.simulation.stepper import SimulationError
 from tests.identified_plants import (
     FloatArray,
     combinations,
@@ -173,6 +176,18 @@ def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("psa_casadi.identification.search.refinement._LAST", 1)
     found = identify([record])
     assert found.warnings[0].startswith("The fit was cut off before it converged")
+
+
+def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise SimulationError("the step size became too small")
+
+    found = identified(2)
+    first = found.fit
+    monkeypatch.setattr(refitting, "fit", fails)
+    assert continued(first, found.experiments, first.unknowns.names, first.sigma) is first
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,12 @@ from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, split
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import simulate
-from tests.benchmarks.ablation import ablation_table, moved_constants, without_steps
+from tests.benchmarks.ablation import (
+    ablation_table,
+    moved_constants,
+    several_table,
+    without_steps,
+)
 from tests.benchmarks.hidden_cases import Case, Found
 
 NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
@@ -162,6 +167,20 @@ def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
             assert rows[f"without {step}"] == (*right, "0 of 4")
     wrong = ("0 of 3", "0 of 3", "3 of 4", "0 of 0", "75 % of 1", "1.0", "3 of 4")
     assert rows["without finite steps"] == wrong
+
+
+def test_what_sets_of_causes_are_good_for_shows_in_the_ablation() -> None:
+    """Cases that do not show their causes do not count."""
+    case = Case("two", NAMES[0], 1, (1.0, 3.0), (NAMES[1],))
+    both = replace(_found(NAMES[0], NAMES[:2]), case=case, rho=2.0)
+    one = replace(both, named=NAMES[:1], within=NAMES[:1], ratio=2.0)
+
+    def diagnosed(_: Sequence[Case], method: Method) -> list[Found]:
+        return [both, one if method.without else both, replace(both, rho=0.5, ratio=9.0)]
+
+    rows = [row[1:] for row in several_table([], diagnosed).table.rows]
+    every = ("100 % (2 of 2)", "100 % (2 of 2)", "1.000, 1.00", "1")
+    assert rows == [every, ("50 % (1 of 2)", "50 % (1 of 2)", "1.500, 2.00", "1")]
 
 
 def test_every_constant_is_moved_and_a_diagnosis_uses_them() -> None:

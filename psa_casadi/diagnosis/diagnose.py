@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
-from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.identification.start.ordinary import chosen_start, refuse_stuck
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
 from psa_casadi.records.quality.suspects import cleaned
@@ -67,17 +67,20 @@ def _diagnose(
         records, holdout = in_one_order(records), in_one_order(holdout)
         experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
         start, scale_given = chosen_start(records, model, stiffness)
+        refuse_stuck([e.record for e in experiments])
         start = start.without(c.name for c in table if c.gain is not None)
         there = {c.name for c in start.components}
         table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
     base = fit_base(start, experiments, progress=progress)
     experiments, stuck = without_stuck_readings(experiments, base)
     if stuck:
+        refuse_stuck([e.record for e in experiments])
         base = fit_base(start, experiments, progress=progress)
     task = Task(experiments, tuple(table), method, progress)
     seen = driven(base, start, experiments, progress)
     if not seen.follows:
-        found = conclude(unsearched(base, task), experiments, table, scale_given, driven=False)
+        steps = unsearched(base, task)
+        found = conclude(steps, experiments, table, scale_given, driven=seen.filtered)
         return replace(found, notes=(*found.notes, *seen.notes))
     steps = _search(base, task)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)

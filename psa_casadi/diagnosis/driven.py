@@ -22,14 +22,27 @@ FloatArray = npt.NDArray[np.float64]
 
 #: A voltage with less of its variance about a parabola over time is not told from a drift.
 _TREND = 0.05
+#: Samples that a linear filter of the voltage looks back, and that it needs for each of them.
+_TAPS, _EACH = 128, 8
+
+
+_FILTERED = (
+    "A linear filter of the voltage explains {:.0f} % of the displacement's variance, the base"
+    " model {:.0f} %: the two belong together, but with dynamics that the base model does not have"
+    " (several resonances, a delay, perhaps the other sign). No causes were sought."
+)
 
 
 @dataclass(frozen=True)
 class Driven:
-    """Whether a displacement follows the voltage, and what of sign and unit is wrong, in words."""
+    """Whether a displacement follows the voltage, and what of sign and unit is wrong, in words.
+
+    `filtered` says that it does not follow by the base model, but by another linear one.
+    """
 
     follows: bool
     notes: tuple[str, ...]
+    filtered: bool = False
 
 
 def driven(
@@ -56,6 +69,13 @@ def driven(
         )
         return Driven(follows=False, notes=(*said, *notes))
     if share < thresholds().follows:
+        linear = filtered(experiments)
+        if linear > thresholds().follows:
+            return Driven(
+                follows=False,
+                notes=(_FILTERED.format(100 * linear, 100 * max(share, 0.0)), *notes),
+                filtered=True,
+            )
         said = (
             f"The voltage explains {100 * max(share, 0.0):.0f} % of the displacement's variance,"
             " and no more with the other sign: check that both columns are of the same device and"
@@ -101,6 +121,27 @@ def _about_trend(time: FloatArray, signal: FloatArray) -> FloatArray:
     columns = np.column_stack([np.ones_like(t), t, t**2])
     found: FloatArray = signal - columns @ np.linalg.lstsq(columns, signal, rcond=None)[0]
     return found
+
+
+def filtered(experiments: Sequence[Experiment]) -> float:
+    """Share of the displacements' variance that linear filters of the voltage explain.
+
+    A finite impulse response for each record beside a parabola over time; variances per degree of
+    freedom, so that a filter of what has nothing to do with the voltage explains nothing.
+    """
+    left = total = 0.0
+    for e in experiments:
+        record, y = e.record, measured(e.record)
+        taps = max(1, min(_TAPS, record.n // _EACH))
+        past = np.concatenate([np.full(taps - 1, record.voltage[0]), record.voltage])
+        lagged = np.lib.stride_tricks.sliding_window_view(past, taps)
+        t = np.linspace(0.0, 1.0, record.n)
+        columns = np.column_stack([np.ones_like(t), t, t**2, lagged])[record.mask]
+        about_trend = _about_trend(record.time[record.mask], y[record.mask])
+        rest = about_trend - columns @ np.linalg.lstsq(columns, about_trend, rcond=None)[0]
+        left += record.n * float(np.sum(rest**2)) / max(rest.size - columns.shape[1], 1)
+        total += record.n * float(np.sum(about_trend**2)) / max(rest.size - 3, 1)
+    return 1.0 - left / total if total > 0 else 0.0
 
 
 def _flipped(model: Model, experiments: Sequence[Experiment]) -> float:

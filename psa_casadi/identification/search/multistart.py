@@ -1,6 +1,7 @@
 """The search for a fit: several starts, the best ones to the end, then what can be told besides."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +11,11 @@ from psa_casadi.identification.search.force_start import retuned
 from psa_casadi.identification.search.refinement import exchanged, with_fast, without_blur
 from psa_casadi.identification.search.refitting import (
     Progress,
+    continued,
     differing,
     equal,
     noise_levels,
     quick_rtol,
-    refit,
     residual_noise,
     same_place,
 )
@@ -108,7 +109,7 @@ def search(
         if polished and not thorough and same_place(found[0][1], quick, experiments):
             continue
         progress(f"base fit, {name} to the end")
-        ended = quick if quick.interrupted else refit(quick, experiments, free, sigma=sigma)
+        ended = quick if quick.interrupted else continued(quick, experiments, free, sigma)
         polished.append(ended)
     best = min(polished, key=lambda f: f.cost)
     outcomes, not_unique = _outcomes(found, polished, best, experiments)
@@ -178,10 +179,12 @@ def _quick_fits(
             break
         progress(f"base fit from {name}, continued")
         states = quick.starts()
-        further = fit(
-            quick.model, experiments, free, start_states=states, evaluations=rounds[1], **quickly
-        )
-        found[k] = (name, further)
+        with suppress(PsaError):  # where it leads to what cannot be simulated, the first one stays
+            further = fit(
+                quick.model, experiments, free, start_states=states, evaluations=rounds[1],
+                **quickly,
+            )  # fmt: skip
+            found[k] = (name, further)
     if not found:
         raise PsaError(
             "The base model could not be simulated from any start; the voltage's unit or the"

@@ -11,7 +11,13 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.identification.search.exchanges import exchanges
-from psa_casadi.identification.search.refitting import Progress, differing, equal, quick_from, refit
+from psa_casadi.identification.search.refitting import (
+    Progress,
+    continued,
+    differing,
+    equal,
+    quick_from,
+)
 from psa_casadi.records.split import Experiment
 
 #: Parameters that only fast records determine: each is freed when the data can tell it.
@@ -48,7 +54,7 @@ def without_blur(best: Fit, experiments: Sequence[Experiment]) -> Fit:
     k = names.index("k_P")
     if np.sqrt(covariance_of(best, experiments)[k, k]) < _SHARP:
         return best
-    return refit(best, experiments, [n for n in names if n != "k_P"], sigma=best.sigma)
+    return continued(best, experiments, [n for n in names if n != "k_P"], best.sigma)
 
 
 def exchanged(

@@ -97,6 +97,16 @@ def refit(
     )
 
 
+def continued(
+    previous: Fit, experiments: Sequence[Experiment], free: Sequence[str], sigma: Sequence[float]
+) -> Fit:
+    """Return the `refit`, or the previous fit where that leads to what cannot be simulated."""
+    try:
+        return refit(previous, experiments, free, sigma=sigma)
+    except PsaError:
+        return previous
+
+
 def quick_from(
     previous: Fit,
     model: Model,

@@ -28,7 +28,7 @@ _CONSTANT = (
     " record in which it does, or name its column (--columns voltage=...)."
 )
 _STUCK = (
-    "The displacement is one value throughout: the sensor is stuck or out of its range, or another"
+    "The displacement that counts is one value: the sensor is stuck or out of its range, or another"
     " column holds its readings (--columns displacement=...)."
 )
 #: Shapes of loop to start from: A, beta, gamma over k_L, and n.
@@ -54,8 +54,7 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     span = max(float(np.ptp(r.voltage)) for r in records)
     if span == 0.0:
         raise InputError([_CONSTANT.format(records[0].voltage[0])])
-    if not any(r.range_m > 0.0 for r in records):
-        raise InputError([_STUCK])
+    refuse_stuck(records)
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     sample_time = min(r.sample_time for r in records)
     k_l = max(abs(static_slope(records)), 1e-12) / (1.0 / k_p + 1.0 / k_b)
@@ -74,6 +73,12 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         return compose(BASE, {**values, **_lags(values, sample_time)})
     except InputError as error:
         raise InputError([doubt]) if doubt else error from None
+
+
+def refuse_stuck(records: Sequence[Record]) -> None:
+    """Raise InputError where no displacement that counts changes."""
+    if not any(r.range_m > 0.0 for r in records):
+        raise InputError([_STUCK])
 
 
 def chosen_start(
