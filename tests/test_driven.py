@@ -90,10 +90,10 @@ def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: Float
     rest = np.full(TIME.size, 1e-6)
     with pytest.raises(InputError, match="The voltage is 40 V throughout"):
         diagnose([Record("r", TIME, np.full(TIME.size, 40.0), shown)], effects=TABLE)
-    with pytest.raises(InputError, match="The displacement that counts is one value"):
+    with pytest.raises(InputError, match="But for stuck readings, the displacement is one value"):
         diagnose([Record("r", TIME, VOLTAGE, rest)], effects=TABLE)
     bit: FloatArray = np.where(shown > np.mean(shown), 1e-5, 0.0)
-    with pytest.raises(InputError, match="The displacement that counts is one value"):
+    with pytest.raises(InputError, match="But for stuck readings, the displacement is one value"):
         diagnose([Record("r", TIME, VOLTAGE, bit)], effects=TABLE)
 
 

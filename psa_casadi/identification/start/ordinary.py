@@ -28,8 +28,8 @@ _CONSTANT = (
     " record in which it does, or name its column (--columns voltage=...)."
 )
 _STUCK = (
-    "The displacement that counts is one value: the sensor is stuck or out of its range, or another"
-    " column holds its readings (--columns displacement=...)."
+    "But for stuck readings, the displacement is one value: the sensor is out of its range, or"
+    " another column holds its readings (--columns displacement=...)."
 )
 #: Shapes of loop to start from: A, beta, gamma over k_L, and n.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
