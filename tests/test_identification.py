@@ -11,7 +11,7 @@ from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.search import refitting
-from psa_casadi.identification.search.refitting import continued
+from psa_casadi.identification.search.refitting import refit_or_keep
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, multisine, read_record, time_grid
@@ -187,7 +187,7 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     found = identified(2)
     first = found.fit
     monkeypatch.setattr(refitting, "fit", fails)
-    assert continued(first, found.experiments, first.unknowns.names, first.sigma) is first
+    assert refit_or_keep(first, found.experiments, first.unknowns.names, first.sigma) is first
 
 
 @pytest.mark.parametrize(

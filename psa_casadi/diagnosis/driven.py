@@ -134,13 +134,12 @@ def filtered(experiments: Sequence[Experiment]) -> float:
         record, y = e.record, measured(e.record)
         taps = max(1, min(_TAPS, record.n // _EACH))
         past = np.concatenate([np.full(taps - 1, record.voltage[0]), record.voltage])
-        lagged = np.lib.stride_tricks.sliding_window_view(past, taps)
-        t = np.linspace(0.0, 1.0, record.n)
-        columns = np.column_stack([np.ones_like(t), t, t**2, lagged])[record.mask]
-        about_trend = _about_trend(record.time[record.mask], y[record.mask])
-        rest = about_trend - columns @ np.linalg.lstsq(columns, about_trend, rcond=None)[0]
-        left += record.n * float(np.sum(rest**2)) / max(rest.size - columns.shape[1], 1)
-        total += record.n * float(np.sum(about_trend**2)) / max(rest.size - 3, 1)
+        lagged = np.lib.stride_tricks.sliding_window_view(past, taps)[record.mask]
+        time = record.time[record.mask]
+        shown, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
+        rest = shown - columns @ np.linalg.lstsq(columns, shown, rcond=None)[0]
+        left += record.n * float(np.sum(rest**2)) / max(rest.size - taps - 3, 1)
+        total += record.n * float(np.sum(shown**2)) / max(rest.size - 3, 1)
     return 1.0 - left / total if total > 0 else 0.0
 
 

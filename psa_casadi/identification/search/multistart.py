@@ -11,11 +11,11 @@ from psa_casadi.identification.search.force_start import retuned
 from psa_casadi.identification.search.refinement import exchanged, with_fast, without_blur
 from psa_casadi.identification.search.refitting import (
     Progress,
-    continued,
     differing,
     equal,
     noise_levels,
     quick_rtol,
+    refit_or_keep,
     residual_noise,
     same_place,
 )
@@ -109,7 +109,7 @@ def search(
         if polished and not thorough and same_place(found[0][1], quick, experiments):
             continue
         progress(f"base fit, {name} to the end")
-        ended = quick if quick.interrupted else continued(quick, experiments, free, sigma)
+        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, free, sigma)
         polished.append(ended)
     best = min(polished, key=lambda f: f.cost)
     outcomes, not_unique = _outcomes(found, polished, best, experiments)

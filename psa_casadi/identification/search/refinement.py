@@ -13,10 +13,10 @@ from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.identification.search.exchanges import exchanges
 from psa_casadi.identification.search.refitting import (
     Progress,
-    continued,
     differing,
     equal,
     quick_from,
+    refit_or_keep,
 )
 from psa_casadi.records.split import Experiment
 
@@ -54,7 +54,7 @@ def without_blur(best: Fit, experiments: Sequence[Experiment]) -> Fit:
     k = names.index("k_P")
     if np.sqrt(covariance_of(best, experiments)[k, k]) < _SHARP:
         return best
-    return continued(best, experiments, [n for n in names if n != "k_P"], best.sigma)
+    return refit_or_keep(best, experiments, [n for n in names if n != "k_P"], best.sigma)
 
 
 def exchanged(

@@ -97,7 +97,7 @@ def refit(
     )
 
 
-def continued(
+def refit_or_keep(
     previous: Fit, experiments: Sequence[Experiment], free: Sequence[str], sigma: Sequence[float]
 ) -> Fit:
     """Return the `refit`, or the previous fit where that leads to what cannot be simulated."""
