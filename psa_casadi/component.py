@@ -18,8 +18,14 @@ Expression = Any
 SPECTRAL_PEAKS = "spectral_peaks"
 #: The same for the periods with which the residual repeats over the displacement, in m.
 DISPLACEMENT_PEAKS = "displacement_peaks"
+#: The same for the places at which the residual jumps over the displacement, and for the distance
+#: within which it does, in m.
+DISPLACEMENT_STEPS = "displacement_steps"
+DISPLACEMENT_STEP_WIDTH = "displacement_step_width"
 #: Probe value that stands for the duration of the longest record, in s.
 RECORD_DURATION = "record_duration"
+#: Those that are read off a residual.
+READ_OFF = (SPECTRAL_PEAKS, DISPLACEMENT_PEAKS, DISPLACEMENT_STEPS, DISPLACEMENT_STEP_WIDTH)
 
 
 @dataclass(frozen=True)
@@ -133,7 +139,7 @@ class Component:
     @property
     def from_residual(self) -> bool:
         """Whether trial values are read off a residual, so that another one has other ones."""
-        return any(grid in (SPECTRAL_PEAKS, DISPLACEMENT_PEAKS) for grid in self.probe.values())
+        return any(grid in READ_OFF for grid in self.probe.values())
 
     @property
     def fitted(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.component import DISPLACEMENT_PEAKS, RECORD_DURATION, SPECTRAL_PEAKS, Component
+from psa_casadi.component import READ_OFF, RECORD_DURATION, Component
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
@@ -181,7 +181,7 @@ def test_declaration_is_complete(effect: Component) -> None:
         assert name != effect.gain
         low, high = next(p.bounds for p in effect.parameters if p.name == name)
         if isinstance(values, str):
-            assert values in (SPECTRAL_PEAKS, DISPLACEMENT_PEAKS, RECORD_DURATION)
+            assert values in (*READ_OFF, RECORD_DURATION)
         else:
             assert values
             assert all(low <= v <= high for v in values)

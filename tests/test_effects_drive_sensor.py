@@ -12,6 +12,7 @@ from psa_casadi.components import SIMPLIFIED
 from psa_casadi.effects.charge_leakage import CHARGE_LEAKAGE
 from psa_casadi.effects.drive_lag import DRIVE_LAG
 from psa_casadi.effects.mains_hum import MAINS_HUM
+from psa_casadi.effects.sensor_jump import SENSOR_JUMP
 from psa_casadi.effects.sensor_lag import SENSOR_LAG
 from psa_casadi.effects.sensor_nonlinearity import SENSOR_NONLINEARITY
 from psa_casadi.effects.sensor_ripple import SENSOR_RIPPLE
@@ -211,6 +212,23 @@ def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
         assert (sine, cosine) == pytest.approx((np.cos(0.7), np.sin(0.7)), rel=1e-6)
         assert (second_cosine, second_sine) == pytest.approx((0.3, -0.4), rel=1e-6)
         assert left[0] < 1e-12 * np.sum(residual**2)
+
+
+def test_a_jump_is_a_step_of_the_reading_at_one_displacement_on_both_branches() -> None:
+    place, width = 4e-6, 5e-8
+    model = with_effect(SENSOR_JUMP, jump_gain=3e-8, jump_place=place, jump_width=width)
+    t = np.linspace(0.0, 2.0, 4001)
+    found = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
+    x = found["displacement"]
+    residual = found["measured_displacement"] - x
+    assert residual[0] == 0.0
+    far = np.abs(x - place) > 10 * width
+    np.testing.assert_allclose(residual[far], 3e-8 * (x[far] > place), rtol=0, atol=1e-15)
+    for branch in (np.gradient(x) > 0, np.gradient(x) < 0):
+        near = branch & (np.abs(x - place) < width)
+        assert near.sum() > 5
+        slope = np.polyfit(x[near] - place, residual[near], 1)[0]
+        assert slope == pytest.approx(0.5 * 3e-8 / width, rel=0.3)
 
 
 def test_hum_is_a_sine_that_keeps_amplitude_and_phase_for_a_thousand_periods() -> None:

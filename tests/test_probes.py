@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.screening.probes import directions, residual_periods
+from psa_casadi.diagnosis.screening.probes import directions, residual_jumps, residual_periods
 from psa_casadi.diagnosis.search.hypothesis import root_of
 from psa_casadi.diagnosis.search.worth import shows_memory
 from psa_casadi.effects import EFFECTS
@@ -59,6 +59,21 @@ def test_the_period_of_a_ripple_is_read_off_the_residual(period: float) -> None:
     found = residual_periods(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
     count = float(np.ptp(x)) / period
     assert min(abs(np.ptp(x) / p - count) for p in found) < 0.25
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.85])
+def test_the_place_of_a_jump_is_read_off_the_residual(share: float) -> None:
+    """Under noise as large as half the jump; in the model's displacement, whatever the offset."""
+    model = compose(BASE)
+    t, voltage = _loops()
+    x = simulate(model, t, voltage).displacement
+    noise = 1e-8 * np.random.default_rng(4).standard_normal(t.size)
+    place = float(x.min() + share * np.ptp(x))
+    reading = x + 2e-8 * (x > place) + noise + 3e-6
+    experiments = (whole(Record("r", t, voltage, reading)),)
+    places, width = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
+    assert min(abs(p - place) for p in places) < 0.01 * np.ptp(x)
+    assert 0.001 * np.ptp(x) < width < 0.02 * np.ptp(x)
 
 
 def test_a_memory_that_adds_a_static_curve_shows_none() -> None:

@@ -32,6 +32,7 @@ TOLD = {
     "sensor_lag": {"rate"},
     "sensor_nonlinearity": {"displacement"},
     "sensor_ripple": {"displacement"},
+    "sensor_jump": {"displacement"},
     "offset_drift": {"time"},
     "ageing": {"time"},
     "mains_hum": {"spectrum"},

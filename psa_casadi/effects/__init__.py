@@ -18,6 +18,7 @@ from psa_casadi.effects.reciprocal_coupling import RECIPROCAL_COUPLING
 from psa_casadi.effects.saturation_of_strain import SATURATION_OF_STRAIN
 from psa_casadi.effects.self_heating import SELF_HEATING
 from psa_casadi.effects.sensor_delay import SENSOR_DELAY
+from psa_casadi.effects.sensor_jump import SENSOR_JUMP
 from psa_casadi.effects.sensor_lag import SENSOR_LAG
 from psa_casadi.effects.sensor_nonlinearity import SENSOR_NONLINEARITY
 from psa_casadi.effects.sensor_ripple import SENSOR_RIPPLE
@@ -50,6 +51,7 @@ EFFECTS: dict[str, Component] = {
         SENSOR_LAG,
         SENSOR_NONLINEARITY,
         SENSOR_RIPPLE,
+        SENSOR_JUMP,
         OFFSET_DRIFT,
         MAINS_HUM,
         TEMPERATURE,

@@ -4,6 +4,7 @@ from tests.plants.ageing import AGEING
 from tests.plants.asymmetric_memory import ASYMMETRIC_MEMORY
 from tests.plants.backlash import BACKLASH
 from tests.plants.charge_leakage import CHARGE_LEAKAGE
+from tests.plants.converter_step import CONVERTER_STEP
 from tests.plants.cross_axis import CROSS_AXIS
 from tests.plants.current_limit import CURRENT_LIMIT
 from tests.plants.dead_zone_hysteresis import DEAD_ZONE_HYSTERESIS
@@ -57,6 +58,7 @@ HIDDEN_EFFECTS: dict[str, HiddenEffect] = {
         SENSOR_LAG,
         SENSOR_NONLINEARITY,
         ENCODER_RIPPLE,
+        CONVERTER_STEP,
         OFFSET_DRIFT,
         MAINS_HUM,
         TEMPERATURE,

@@ -7,7 +7,14 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import DISPLACEMENT_PEAKS, RECORD_DURATION, SPECTRAL_PEAKS, Component
+from psa_casadi.component import (
+    DISPLACEMENT_PEAKS,
+    DISPLACEMENT_STEP_WIDTH,
+    DISPLACEMENT_STEPS,
+    RECORD_DURATION,
+    SPECTRAL_PEAKS,
+    Component,
+)
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured, predict_record
@@ -24,6 +31,9 @@ FloatArray = npt.NDArray[np.float64]
 _PEAKS, _FINER = 4, 8
 #: Bins of the displacement; periods between so many of them over the range are tried.
 _BINS, _FEWEST_PERIODS, _MOST_PERIODS = 2048, 4, 256
+#: A jump is the difference of the means over so many bins on either side; it is tried within a
+#: quarter of these.
+_SIDE = 64
 _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
 
 
@@ -60,6 +70,9 @@ def directions(
     peaks = {SPECTRAL_PEAKS: residual_peaks(fit, experiments)}
     if any(DISPLACEMENT_PEAKS in e.probe.values() for e in effects):
         peaks[DISPLACEMENT_PEAKS] = residual_periods(fit, experiments)
+    if any(DISPLACEMENT_STEPS in e.probe.values() for e in effects):
+        places, width = residual_jumps(fit, experiments)
+        peaks |= {DISPLACEMENT_STEPS: places, DISPLACEMENT_STEP_WIDTH: (width,)}
     tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
@@ -96,20 +109,53 @@ def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
 
     Of the mean residual in bins of the predicted displacement, under a Hann window.
     """
-    experiment = experiments[0]
-    used = experiment.used[: experiment.stop]
-    residual = fit.residuals[: int(used.sum())]
-    x = measured(experiment.record)[: experiment.stop][used] - residual
-    span = float(np.ptp(x))
-    if span <= 0.0:
+    binned = _binned(fit, experiments[0])
+    if binned is None:
         return ()
-    places = np.minimum((_BINS * (x - x.min()) / span).astype(np.int64), _BINS - 1)
-    count = np.bincount(places, minlength=_BINS)
-    mean = np.bincount(places, residual - np.mean(residual), _BINS) / np.maximum(count, 1)
+    _, span, count, total = binned
+    mean = total / np.maximum(count, 1)
     power = np.abs(np.fft.rfft(mean * np.hanning(_BINS), _FINER * _BINS)) ** 2
     first = _FINER * _FEWEST_PERIODS
     order = highest_peaks(power[first : _FINER * _MOST_PERIODS], 3 * _FINER, _PEAKS) + first
     return tuple(float(p) for p in np.sort(span * _FINER / order))
+
+
+def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[tuple[float, ...], float]:
+    """Places [m] at which the first record's residual jumps over the displacement, and how near.
+
+    Where the difference of its means on either side is largest over what equal noise would make of
+    it; places are displacements of the model, without the record's offset.
+    """
+    binned = _binned(fit, experiments[0])
+    if binned is None:
+        return (), 1.0
+    low, span, count, total = binned
+    below, sums = (np.append(0.0, np.cumsum(q)) for q in (count, total))
+    edges = np.arange(_SIDE, _BINS - _SIDE + 1)
+    left, right = (below[edges + k] - below[edges + k - _SIDE] for k in (0, _SIDE))
+    before, after = (sums[edges + k] - sums[edges + k - _SIDE] for k in (0, _SIDE))
+    seen = np.minimum(left, right) > 0
+    jump = after / np.maximum(right, 1) - before / np.maximum(left, 1)
+    power = np.where(seen, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
+    places = edges[highest_peaks(power, _SIDE, _PEAKS)]
+    found = low - fit.offset(0) + span * np.sort(places) / _BINS
+    return tuple(float(x) for x in found), span * _SIDE / (4 * _BINS)
+
+
+def _binned(fit: Fit, experiment: Experiment) -> tuple[float, float, FloatArray, FloatArray] | None:
+    """Return lowest prediction and range [m]; samples and sum of the residual in bins of it.
+
+    The residual is about its mean. None where the prediction stands still.
+    """
+    used = experiment.used[: experiment.stop]
+    residual = fit.residuals[: int(used.sum())]
+    x = measured(experiment.record)[: experiment.stop][used] - residual
+    low, span = float(x.min()), float(np.ptp(x))
+    if span <= 0.0:
+        return None
+    places = np.minimum((_BINS * (x - low) / span).astype(np.int64), _BINS - 1)
+    count = np.bincount(places, minlength=_BINS).astype(float)
+    return low, span, count, np.bincount(places, residual - np.mean(residual), _BINS)
 
 
 def _probe_values(

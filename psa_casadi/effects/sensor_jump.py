@@ -1,0 +1,58 @@
+"""Sensor jump: the reading jumps where the displacement passes one place, on both branches."""
+
+import casadi as ca
+
+from psa_casadi.component import (
+    DISPLACEMENT_STEP_WIDTH,
+    DISPLACEMENT_STEPS,
+    Component,
+    Equations,
+    Expression,
+    Symbols,
+)
+from psa_casadi.scales import stroke_scale
+from psa_casadi.variables import Parameter, Values
+
+
+def _equations(s: Symbols) -> Equations:
+    def side(x: Expression) -> Expression:
+        return ca.tanh((x - s.jump_place) / s.jump_width)
+
+    jump = 0.5 * s.jump_gain * (side(s.displacement) - side(ca.SX(0)))
+    return Equations(add={"measured_displacement": jump})
+
+
+def _scale(p: Values) -> float:
+    return 1e-3 * stroke_scale(p)
+
+
+def _place_scale(p: Values) -> float:
+    return 1e-2 * stroke_scale(p)
+
+
+SENSOR_JUMP = Component(
+    name="sensor_jump",
+    description="the reading jumps where the displacement passes one place",
+    source=(
+        "wide code or missing code of a converter (IEEE Std 1241), stitching error of a scale, lost"
+        " count of an interferometer: a static step of the reading"
+    ),
+    belongs_to="sensor",
+    gain="jump_gain",
+    equation_text=(
+        "x_m = x + jump_gain/2 (tanh((x - jump_place)/jump_width) + tanh(jump_place/jump_width))"
+    ),
+    parameters=(
+        Parameter("jump_gain", 0.0, "m", (-1e-3, 1e-3), "size of the jump", "um", scale=_scale),
+        Parameter(
+            "jump_place", 5e-6, "m", (-1e-2, 1e-2), "displacement of it", "um", scale=_place_scale
+        ),
+        Parameter(
+            "jump_width", 1e-7, "m", (1e-10, 1e-3), "displacement over which it rises", "um",
+            log=True,
+        ),
+    ),
+    equations=_equations,
+    probe={"jump_place": DISPLACEMENT_STEPS, "jump_width": DISPLACEMENT_STEP_WIDTH},
+    looks_like="the residual jumps at one displacement, the same on both branches",
+)  # fmt: skip
