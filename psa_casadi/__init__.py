@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.report.plots.figure import save_figure
     from psa_casadi.report.words.text import story
+    from psa_casadi.simulation.history import memory_after, settled_at
     from psa_casadi.simulation.many import simulate_many
     from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
     from psa_casadi.simulation.stepper import run
@@ -134,6 +135,7 @@ _HOMES = {
         "load_model",
         "save_model",
     ),
+    "psa_casadi.simulation.history": ("memory_after", "settled_at"),
     "psa_casadi.simulation.many": ("simulate_many",),
     "psa_casadi.simulation.stepper": ("run",),
     "psa_casadi.simulation.timings": (
@@ -207,6 +209,8 @@ __all__ = [
     "simulate",
     "simulate_record",
     "simulate_many",
+    "memory_after",
+    "settled_at",
     "run",
     "Identification",
     "identify",

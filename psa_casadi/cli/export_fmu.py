@@ -8,9 +8,13 @@ import typer
 
 from psa_casadi.cli.screen import (
     EffectsOption,
+    HistoryOption,
     PartOption,
     Quiet,
+    RestOption,
     StackOption,
+    StartVoltageOption,
+    SweepOption,
     show,
     tell_written,
     working,
@@ -39,6 +43,10 @@ def fmu(
     include_sensor: Annotated[
         bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
     ] = False,
+    start_voltage: StartVoltageOption = None,
+    history: HistoryOption = None,
+    sweep: SweepOption = 1.0,
+    rest: RestOption = 0.0,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -52,6 +60,7 @@ def fmu(
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     given.check()
     if chosen is None or targets is None:
         return

@@ -7,9 +7,13 @@ import typer
 
 from psa_casadi.cli.screen import (
     EffectsOption,
+    HistoryOption,
     PartOption,
     Quiet,
+    RestOption,
     StackOption,
+    StartVoltageOption,
+    SweepOption,
     show,
     tell_written,
 )
@@ -24,6 +28,10 @@ def modelica(
     include_sensor: Annotated[
         bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
     ] = False,
+    start_voltage: StartVoltageOption = None,
+    history: HistoryOption = None,
+    sweep: SweepOption = 1.0,
+    rest: RestOption = 0.0,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -34,6 +42,7 @@ def modelica(
     given = Given(effects)
     given.outputs({"--output": output}, [model])
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     given.check()
     if chosen is None:
         return

@@ -15,6 +15,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.column_map import parse_columns
 from psa_casadi.records.read.columns import ColumnMap
+from psa_casadi.simulation.history import settled_at
 
 T = TypeVar("T")
 
@@ -134,6 +135,25 @@ class Given:
         if any_model:
             return self.attempt(lambda: load_model(path, self.effects))
         return self.model(path)
+
+    def numbers(self, text: str | None, option: str, what: str) -> tuple[float, ...]:
+        """Return the numbers of a list with commas; none where it is not given."""
+        try:
+            return tuple(float(part) for part in text.split(",")) if text is not None else ()
+        except ValueError:
+            self.add(f"{option} is '{text}'; give {what} with commas between, such as 150,0.")
+            return ()
+
+    def started(
+        self, model: Model | None, voltage: float | None, history: str | None, **durations: float
+    ) -> Model | None:
+        """Return a model that starts settled at a voltage after a history; as it is without one."""
+        turns = self.numbers(history, "--history", "voltages in V")
+        if history is not None and voltage is None:
+            self.add("--history needs --start-voltage, the voltage at which it ends.")
+        if model is None or voltage is None or self._problems:
+            return model
+        return self.attempt(lambda: settled_at(model, voltage, turns, **durations))
 
     def stiffness(self, value: float | None) -> None:
         """Demand a positive stiffness, if one is given."""

@@ -51,6 +51,30 @@ ColumnsOption = Annotated[
 ]
 
 
+HistoryOption = Annotated[
+    str | None,
+    typer.Option(
+        "--history",
+        help="Voltages before [V], such as 120,0,120: swept through in turn from a relaxed 0 V.",
+    ),
+]
+
+SweepOption = Annotated[
+    float, typer.Option("--sweep", help="Duration of each sweep of the history [s].")
+]
+
+RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history [s].")]
+
+StartVoltageOption = Annotated[
+    float | None,
+    typer.Option(
+        "--start-voltage",
+        help="Voltage [V] that holds the stack when it starts, settled, with the memory that"
+        " --history leaves; by default it starts relaxed at 0 V.",
+    ),
+]
+
+
 class Origin(StrEnum):
     """What the records are."""
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.errors import InputError
 from psa_casadi.model.structure import Structure, structure_of
-from psa_casadi.variables import Parameter, Provenance, nominal_value
+from psa_casadi.variables import Input, Parameter, Provenance, State, nominal_value
 
 __all__ = ["Model", "Structure", "compose"]
 
@@ -86,10 +86,44 @@ class Model:
         return replace(self, values=merged, **changes)  # type: ignore[arg-type]
 
     def with_components(self, components: Iterable[Component]) -> "Model":
-        """Return a model of other components that keeps the values the two have in common."""
+        """Return a model of other components that keeps what the two have in common.
+
+        Values of parameters, and starts that are not the declared ones.
+        """
         structure = structure_of(tuple(components))
         values = {p.name: self.values.get(p.name, p.value) for p in structure.parameters}
-        return replace(self, structure=structure, values=values)
+        there = {v.name for v in _starting(structure)}
+        kept = {n: v for n, v in self.own_starts().items() if n in there}
+        return replace(self, structure=structure, values=values).with_starts(kept)
+
+    def own_starts(self) -> dict[str, float]:
+        """Return the starts of states and inputs that are not those their components declare."""
+        declared = {v.name: v.start for c in self.components for v in _starting(c)}
+        every = _starting(self.structure)
+        return {v.name: v.start for v in every if v.start != declared.get(v.name, v.start)}
+
+    def with_starts(self, starts: Mapping[str, float]) -> "Model":
+        """Return the model with other start values of states and inputs (SI units).
+
+        They are what an exported model starts from; `simulate` begins where its samples put it.
+        Raises InputError for a name that is neither, or a value that is not finite.
+        """
+        if not starts:
+            return self
+        s = self.structure
+        known = {v.name for v in _starting(s)}
+        problems = [
+            f"The model has no state or input '{n}' to start from; it has {sorted(known)}."
+            if n not in known
+            else f"The start of '{n}' is {v}; give a finite number."
+            for n, v in starts.items()
+            if n not in known or not np.isfinite(v)
+        ]
+        if problems:
+            raise InputError(problems)
+        states = tuple(replace(q, start=float(starts.get(q.name, q.start))) for q in s.states)
+        inputs = tuple(replace(q, start=float(starts.get(q.name, q.start))) for q in s.inputs)
+        return replace(self, structure=replace(s, states=states, inputs=inputs))
 
     def with_effect(self, effect: Component, values: Mapping[str, float] | None = None) -> "Model":
         """Return the model with one more effect, at its default gain of 0 unless given."""
@@ -107,6 +141,10 @@ class Model:
         return self.without(
             c.name for c in self.components if c.belongs_to in ("sensor", "environment")
         )
+
+
+def _starting(of: Structure | Component) -> tuple[State | Input, ...]:
+    return (*of.states, *of.inputs)
 
 
 def compose(

@@ -43,6 +43,7 @@ def dumps(model: Model) -> str:
             "interval": [interval.low, interval.high] if interval else None,
             "free": p.name in origin.free,
         }
+    starts = model.own_starts()
     content = {
         "format": FORMAT,
         "name": model.name,
@@ -50,6 +51,7 @@ def dumps(model: Model) -> str:
         "components": [c.name for c in model.components if c.gain is None],
         "effects": [_reference(c) for c in model.effects],
         "parameters": parameters,
+        **({"starts": starts} if starts else {}),
         "force_scale": origin.force_scale,
         "notes": list(origin.notes),
         "identified_from": [{"record": n, "sha256": h} for n, h in origin.identified_from],
@@ -95,7 +97,7 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
             {n: e["value"] for n, e in given.items()},
             name=content.get("name", "psa"),
             description=content.get("description", ""),
-        )
+        ).with_starts(content.get("starts", {}))
     except InputError as error:
         raise InputError([f"{source}: {problem}" for problem in error.problems]) from error
     return model.with_values({}, provenance=_provenance(content, given))
@@ -199,6 +201,11 @@ def _origin_problems(content: dict[str, Any], given: Any, source: str) -> list[s
         for r in records
     ):
         problems.append(f"{source}: 'identified_from' must list a record and its sha256 each.")
+    starts = content.get("starts", {})
+    if not isinstance(starts, dict) or not all(
+        isinstance(v, int | float) and not isinstance(v, bool) for v in starts.values()
+    ):
+        problems.append(f"{source}: 'starts' is {starts!r}; it must map names to numbers.")
     entries = given if isinstance(given, dict) else {}
     intervals = {
         n: e["interval"] for n, e in entries.items() if isinstance(e, dict) and "interval" in e

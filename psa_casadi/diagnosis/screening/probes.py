@@ -155,7 +155,8 @@ def _binned(fit: Fit, experiment: Experiment) -> tuple[float, float, FloatArray,
         return None
     places = np.minimum((_BINS * (x - low) / span).astype(np.int64), _BINS - 1)
     count = np.bincount(places, minlength=_BINS).astype(float)
-    return low, span, count, np.bincount(places, residual - np.mean(residual), _BINS)
+    total = np.bincount(places, residual - np.mean(residual), _BINS).astype(float)
+    return low, span, count, total
 
 
 def _probe_values(

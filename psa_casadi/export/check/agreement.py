@@ -75,6 +75,7 @@ def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatA
         signals["voltage"],
         times,
         load_force=signals["load_force"],
+        initial={s.name: s.start for s in model.structure.states},
         breakpoints=list(inputs.times),
         mechanics="cascade" if cascade else "single_mass",
         rtol=_TOLERANCE,

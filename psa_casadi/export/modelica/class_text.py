@@ -87,10 +87,10 @@ def size_text(size: float, name: str) -> str:
 def _components(model: Model, equations: ModelEquations, ports: Ports) -> list[str]:
     """Return parameters, states and sampled states under a comment that names their component."""
     lines = []
+    names, states = equations.names, {s.name: s for s in model.structure.states}
     for component in model.components:
-        names = equations.names
         own = [_parameter(model, p, names[p.name], ports) for p in component.parameters]
-        own += [_state(model, s, names[s.name]) for s in component.states]
+        own += [_state(model, states[s.name], names[s.name]) for s in component.states]
         own += [_state(model, s, names[s.name], "discrete Real") for s in component.sampled]
         if own:
             lines += ["  " + comment(f"{component.name}: {component.description}"), *own]

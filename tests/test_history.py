@@ -1,0 +1,151 @@
+"""A virtual history: the memory that a voltage before a record leaves."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi import reference
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import read_record, write_record
+from psa_casadi.simulation.history import memory_after, settled_at
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+
+STACK = stack_model("P-885.51")
+
+
+def _falling() -> tuple[FloatArray, FloatArray]:
+    t = np.linspace(0.0, 1.0, 1001)
+    return t, 60.0 + 60.0 * np.cos(np.pi * t)
+
+
+def test_a_record_that_begins_at_the_top_follows_the_reference_played_from_zero() -> None:
+    """Independent: the reference integrates the way up and the record in one piece."""
+    t, voltage = _falling()
+    whole_t = np.concatenate([np.linspace(0.0, 1.0, 501), 1.0 + t[1:]])
+    whole_v = np.concatenate([np.linspace(0.0, 120.0, 501), voltage[1:]])
+    expected = reference.simulate(
+        STACK.values, lambda time: float(np.interp(time, whole_t, whole_v)), whole_t,
+        mechanics="cascade", breakpoints=[1.0],
+    ).states["x"][500:]  # fmt: skip
+    span = float(np.ptp(expected))
+    memory = memory_after(STACK, [], at=120.0)
+    after = simulate(STACK, t, voltage, memory=memory).displacement
+    relaxed = simulate(STACK, t, voltage).displacement
+    # the reference comes to the first sample in motion, the record begins at rest
+    assert np.abs(after - expected)[1:].max() < 2e-5 * span
+    assert np.abs(relaxed - expected).max() > 0.05 * span
+
+
+def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
+    creeping = STACK.with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02, "creep_time": 0.1})
+    model = creeping.with_effect(EFFECTS["hysteresis_memory"], {"memory_gain": 0.05})
+    turns, sweep, rest = [0.0, 100.0, 20.0, 80.0, 50.0], 0.7, 2.0
+    corners = np.append(sweep * np.arange(len(turns)), sweep * (len(turns) - 1) + rest)
+    t = np.linspace(0.0, 1.0, 501)
+    voltage = 50.0 + 30.0 * np.sin(2 * np.pi * t)
+    before = np.linspace(0.0, corners[-1], 2401)
+    played = np.interp(before, corners, [*turns, turns[-1]])
+    whole = simulate(
+        model, np.append(before, corners[-1] + t[1:]), np.append(played, voltage[1:])
+    ).displacement[2400:]
+    memory = memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
+    # the record begins in motion: the fast states start there, as `start_state` has it
+    found = simulate(model, t, voltage, memory=memory).displacement
+    assert np.abs(found - whole)[50:].max() < 1e-4 * np.ptp(whole)
+
+
+def test_no_history_is_the_relaxed_start() -> None:
+    assert set(memory_after(STACK, [], at=0.0).values()) == {0.0}
+
+
+def test_an_exported_model_starts_settled_and_stays_while_its_voltage_does(tmp_path: Path) -> None:
+    """By fmpy: no transient at 60 V, where the way up and back down has left the hysteresis."""
+    fmpy = pytest.importorskip("fmpy")
+    settled = settled_at(STACK, 60.0, [120.0])
+    path = psa.export_fmu(settled, tmp_path / "held.fmu", name="held")
+    t = np.linspace(0.0, 0.02, 201)
+    played = np.array([(0.0, 60.0), (0.02, 60.0)], dtype=[("time", float), ("voltage", float)])
+    found = fmpy.simulate_fmu(
+        str(path), stop_time=0.02, output_interval=1e-4, input=played, output=["displacement"]
+    )["displacement"]
+    down = np.concatenate([np.linspace(0.0, 120.0, 401), np.linspace(120.0, 60.0, 201)[1:]])
+    way = np.linspace(0.0, 3.0, down.size)
+    expected = reference.simulate(
+        STACK.values, lambda time: float(np.interp(time, way, down)), way,
+        mechanics="cascade", breakpoints=[2.0],
+    ).states["x"]  # fmt: skip
+    span = float(np.ptp(expected))
+    assert len(found) == len(t)
+    assert np.ptp(found) < 1e-7 * span
+    # the reference comes down at 60 V/s, a lag of microseconds behind
+    assert found[0] == pytest.approx(expected[-1], abs=1e-3 * span)
+    assert abs(found[0] - simulate(STACK, t, np.full(t.size, 60.0)).displacement[0]) > 0.01 * span
+
+
+def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> None:
+    settled = settled_at(STACK, 60.0, [120.0])
+    assert settled.own_starts()["voltage"] == 60.0
+    extended = settled.with_effect(EFFECTS["sensor_lag"], {"sensor_lag_time": 1e-4})
+    assert loads(dumps(extended)).own_starts() == extended.own_starts()
+    assert extended.plant().own_starts() == settled.own_starts()
+    assert STACK.own_starts() == {}
+    assert "starts" not in dumps(STACK)
+    with pytest.raises(InputError, match="no state or input 'q'"):
+        STACK.with_starts({"q": 1.0})
+    with pytest.raises(InputError, match="finite"):
+        STACK.with_starts({"u": np.inf})
+    broken = dumps(extended).replace('"voltage": 60.0', '"voltage": "high"')
+    with pytest.raises(InputError, match="'starts' is"):
+        loads(broken)
+
+
+def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
+    path = tmp_path / "PiezoStack.mo"
+    command = ["export", "modelica", "--stack", "P-885.51", "-o", str(path)]
+    done = CliRunner().invoke(app, [*command, "--start-voltage", "60", "--history", "120"])
+    assert done.exit_code == 0, done.output
+    text = path.read_text()
+    starts = settled_at(STACK, 60.0, [120.0]).own_starts()
+    assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
+    assert 'input Real voltage(unit="V", start=60.0' in text
+    refused = CliRunner().invoke(app, [*command, "--history", "120"])
+    assert refused.exit_code == 2
+    assert "--start-voltage" in refused.output
+
+
+@pytest.mark.parametrize(
+    ("turns", "options", "said"),
+    [
+        ([np.nan], {}, "not finite"),
+        ([10.0], {"sweep": 0.0}, "above 0"),
+        ([10.0], {"rest": -1.0}, "0 or more"),
+    ],
+)
+def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        memory_after(STACK, turns, at=5.0, **options)
+
+
+def test_the_command_takes_a_history(tmp_path: Path) -> None:
+    t, voltage = _falling()
+    given, out = tmp_path / "v.csv", tmp_path / "out.csv"
+    write_record(given, {"time [s]": t, "voltage [V]": voltage})
+    command = ["simulate", "--stack", "P-885.51", "--input", str(given), "-o", str(out)]
+    done = CliRunner().invoke(app, [*command, "--history", "120,0,120", "--rest", "3"])
+    assert done.exit_code == 0, done.output
+    memory = memory_after(STACK, [120.0, 0.0, 120.0], at=120.0, rest=3.0)
+    expected = simulate(STACK, t, voltage, memory=memory).displacement
+    written = read_record(out).displacement
+    assert written is not None
+    np.testing.assert_allclose(written, expected, rtol=0, atol=1e-9)
+    refused = CliRunner().invoke(app, [*command, "--history", "high"])
+    assert refused.exit_code == 2
+    assert "--history is 'high'" in refused.output
