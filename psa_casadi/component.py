@@ -18,14 +18,12 @@ Expression = Any
 SPECTRAL_PEAKS = "spectral_peaks"
 #: The same for the periods with which the residual repeats over the displacement, in m.
 DISPLACEMENT_PEAKS = "displacement_peaks"
-#: The same for the places at which the residual jumps over the displacement, and for the distance
-#: within which it does, in m.
+#: The same for the places at which the residual jumps over the displacement, in m.
 DISPLACEMENT_STEPS = "displacement_steps"
-DISPLACEMENT_STEP_WIDTH = "displacement_step_width"
 #: Probe value that stands for the duration of the longest record, in s.
 RECORD_DURATION = "record_duration"
 #: Those that are read off a residual.
-READ_OFF = (SPECTRAL_PEAKS, DISPLACEMENT_PEAKS, DISPLACEMENT_STEPS, DISPLACEMENT_STEP_WIDTH)
+READ_OFF = (SPECTRAL_PEAKS, DISPLACEMENT_PEAKS, DISPLACEMENT_STEPS)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from psa_casadi.effects.temperature import TEMPERATURE
 from psa_casadi.effects.voltage_saturation import VOLTAGE_SATURATION
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.scales import stroke_scale
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import run
 from tests.stack_models import LINEAR, stack
@@ -215,8 +216,9 @@ def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
 
 
 def test_a_jump_is_a_step_of_the_reading_at_one_displacement_on_both_branches() -> None:
-    place, width = 4e-6, 5e-8
-    model = with_effect(SENSOR_JUMP, jump_gain=3e-8, jump_place=place, jump_width=width)
+    place = 4e-6
+    model = with_effect(SENSOR_JUMP, jump_gain=3e-8, jump_place=place, jump_width=0.003)
+    width = 0.003 * stroke_scale(model.values)
     t = np.linspace(0.0, 2.0, 4001)
     found = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
     x = found["displacement"]

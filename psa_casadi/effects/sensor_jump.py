@@ -1,22 +1,21 @@
-"""Sensor jump: the reading jumps where the displacement passes one place, on both branches."""
+"""Sensor jump: the reading jumps where the displacement passes one place, on both branches.
+
+It is narrow: a wide one would be a bent sensor.
+"""
 
 import casadi as ca
 
-from psa_casadi.component import (
-    DISPLACEMENT_STEP_WIDTH,
-    DISPLACEMENT_STEPS,
-    Component,
-    Equations,
-    Expression,
-    Symbols,
-)
+from psa_casadi.component import DISPLACEMENT_STEPS, Component, Equations, Expression, Symbols
+from psa_casadi.effects.sizes import stroke
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, Values
 
 
 def _equations(s: Symbols) -> Equations:
+    width = s.jump_width * stroke(s)
+
     def side(x: Expression) -> Expression:
-        return ca.tanh((x - s.jump_place) / s.jump_width)
+        return ca.tanh((x - s.jump_place) / width)
 
     jump = 0.5 * s.jump_gain * (side(s.displacement) - side(ca.SX(0)))
     return Equations(add={"measured_displacement": jump})
@@ -40,7 +39,8 @@ SENSOR_JUMP = Component(
     belongs_to="sensor",
     gain="jump_gain",
     equation_text=(
-        "x_m = x + jump_gain/2 (tanh((x - jump_place)/jump_width) + tanh(jump_place/jump_width))"
+        "x_m = x + jump_gain/2 (tanh((x - jump_place)/w) + tanh(jump_place/w)),"
+        "  w = jump_width x_s,  x_s = k_L u_rated / k_s,  k_s = k_P k_B/(k_P + k_B) or k"
     ),
     parameters=(
         Parameter("jump_gain", 0.0, "m", (-1e-3, 1e-3), "size of the jump", "um", scale=_scale),
@@ -48,11 +48,10 @@ SENSOR_JUMP = Component(
             "jump_place", 5e-6, "m", (-1e-2, 1e-2), "displacement of it", "um", scale=_place_scale
         ),
         Parameter(
-            "jump_width", 1e-7, "m", (1e-10, 1e-3), "displacement over which it rises", "um",
-            log=True,
+            "jump_width", 0.01, "1", (1e-6, 0.05), "half its rise over the stroke", log=True
         ),
     ),
     equations=_equations,
-    probe={"jump_place": DISPLACEMENT_STEPS, "jump_width": DISPLACEMENT_STEP_WIDTH},
+    probe={"jump_place": DISPLACEMENT_STEPS, "jump_width": (0.003, 0.03)},
     looks_like="the residual jumps at one displacement, the same on both branches",
 )  # fmt: skip

@@ -9,7 +9,6 @@ import numpy.typing as npt
 
 from psa_casadi.component import (
     DISPLACEMENT_PEAKS,
-    DISPLACEMENT_STEP_WIDTH,
     DISPLACEMENT_STEPS,
     RECORD_DURATION,
     SPECTRAL_PEAKS,
@@ -31,8 +30,7 @@ FloatArray = npt.NDArray[np.float64]
 _PEAKS, _FINER = 4, 8
 #: Bins of the displacement; periods between so many of them over the range are tried.
 _BINS, _FEWEST_PERIODS, _MOST_PERIODS = 2048, 4, 256
-#: A jump is the difference of the means over so many bins on either side; it is tried within a
-#: quarter of these.
+#: A jump is the difference of the means over so many bins on either side.
 _SIDE = 64
 _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
 
@@ -71,8 +69,7 @@ def directions(
     if any(DISPLACEMENT_PEAKS in e.probe.values() for e in effects):
         peaks[DISPLACEMENT_PEAKS] = residual_periods(fit, experiments)
     if any(DISPLACEMENT_STEPS in e.probe.values() for e in effects):
-        places, width = residual_jumps(fit, experiments)
-        peaks |= {DISPLACEMENT_STEPS: places, DISPLACEMENT_STEP_WIDTH: (width,)}
+        peaks[DISPLACEMENT_STEPS] = residual_jumps(fit, experiments)
     tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
@@ -120,15 +117,15 @@ def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     return tuple(float(p) for p in np.sort(span * _FINER / order))
 
 
-def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[tuple[float, ...], float]:
-    """Places [m] at which the first record's residual jumps over the displacement, and how near.
+def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Places [m] at which the first record's residual jumps over the displacement.
 
     Where the difference of its means on either side is largest over what equal noise would make of
     it; places are displacements of the model, without the record's offset.
     """
     binned = _binned(fit, experiments[0])
     if binned is None:
-        return (), 1.0
+        return ()
     low, span, count, total = binned
     below, sums = (np.append(0.0, np.cumsum(q)) for q in (count, total))
     edges = np.arange(_SIDE, _BINS - _SIDE + 1)
@@ -139,7 +136,7 @@ def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[tuple[f
     power = np.where(seen, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
     places = edges[highest_peaks(power, _SIDE, _PEAKS)]
     found = low - fit.offset(0) + span * np.sort(places) / _BINS
-    return tuple(float(x) for x in found), span * _SIDE / (4 * _BINS)
+    return tuple(float(x) for x in found)
 
 
 def _binned(fit: Fit, experiment: Experiment) -> tuple[float, float, FloatArray, FloatArray] | None:
