@@ -21,7 +21,7 @@ from psa_casadi.cli.screen import (
 )
 
 if TYPE_CHECKING:
-    from psa_casadi.diagnosis.result import Diagnosis
+    from psa_casadi.diagnosis.result import Alternative, Diagnosis
 
 
 def diagnose(
@@ -124,8 +124,8 @@ def diagnose(
     show(told, quiet)
     written = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
     tell_written(*written, d.next_experiment.voltage_csv, quiet=quiet)
-    if output is not None and not d.causes:
-        show(f"nothing was added: {output} holds the base model", quiet)
+    for line in _models(d, output):
+        show(line, quiet)
     if unpatched:
         show(unpatched, quiet)
     if timings:
@@ -181,6 +181,24 @@ def _write_patch(d: "Diagnosis", path: Path | None, progress: Callable[[str], No
     return ""
 
 
+def _alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative, Path]]":
+    """Return the models with another cause, each with its file beside the extended model's."""
+    if output is None:
+        return []
+    return [(a, output.with_name(f"{output.stem}_{a.instead}.json")) for a in d.alternatives]
+
+
+def _models(d: "Diagnosis", output: Path | None) -> list[str]:
+    """Say what the model's file holds if nothing was added, and which files are beside it."""
+    lines = [
+        f"written: {path}, with {a.instead} instead of {a.cause}"
+        for a, path in _alternatives(d, output)
+    ]
+    if output is not None and not d.causes:
+        lines.append(f"nothing was added: {output} holds the base model")
+    return lines
+
+
 def _write(d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str) -> None:
     """Write what was asked for, each file whole or not at all."""
     import psa_casadi as psa
@@ -195,3 +213,5 @@ def _write(d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str) -> N
     for option, path in outputs.items():
         if path is not None:
             writers[option](path)
+    for a, path in _alternatives(d, outputs["--output"]):
+        psa.save_model(a.model, path)

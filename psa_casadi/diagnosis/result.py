@@ -105,6 +105,29 @@ class Contender:
 
 
 @dataclass(frozen=True, eq=False)
+class Alternative:
+    """The extended model with another effect `instead` of a `cause` that it cannot be told from.
+
+    One of the two belongs to the plant, the other to sensor or environment. `rms_ratio` is the
+    residual's rms over that of the extended model; the displacements of the two exported plants
+    differ on the records by at most `plant_differs_m`, in % of the largest range
+    `plant_differs_percent`.
+    """
+
+    cause: str
+    instead: str
+    model: Model
+    rms_ratio: float
+    plant_differs_m: float
+    plant_differs_percent: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry in DIAGNOSIS.json."""
+        names = ("cause", "instead", "rms_ratio", "plant_differs_m", "plant_differs_percent")
+        return {n: getattr(self, n) for n in names}
+
+
+@dataclass(frozen=True, eq=False)
 class Diagnosis:
     """A diagnosis: verdict, causes, the base and the extended model, errors, and what remains.
 
@@ -113,7 +136,8 @@ class Diagnosis:
     every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
     records with enough samples. `contenders` are the fitted rivals of an ambiguous verdict.
     `budget` says where the base's held-out error goes, `patch` the unnamed correction that would
-    remove most of what the named causes leave.
+    remove most of what the named causes leave. `alternatives` are models for causes of which the
+    records do not tell whether an exported plant holds them.
     """
 
     verdict: Verdict
@@ -139,6 +163,7 @@ class Diagnosis:
     contenders: tuple[Contender, ...] = ()
     budget: Budget | None = None
     patch: Patch | None = None
+    alternatives: tuple[Alternative, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of DIAGNOSIS.json."""
@@ -155,6 +180,7 @@ class Diagnosis:
             "gain": asdict(self.gain),
             "budget": None if self.budget is None else asdict(self.budget),
             "patch": None if self.patch is None else self.patch.to_dict(),
+            "alternatives": [a.to_dict() for a in self.alternatives],
             "blind_to": [asdict(b) for b in self.blind_to],
             "remaining": asdict(self.remaining),
             "next_experiment": asdict(self.next_experiment),

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.alternatives import alternatives
 from psa_casadi.diagnosis.budget import Budget, Removed, budget
 from psa_casadi.diagnosis.corrections.correct import Correction, corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
@@ -146,6 +147,9 @@ def conclude(
         contenders=contenders(first, experiments) if verdict == "ambiguous" else (),
         budget=spent,
         patch=patch,
+        alternatives=alternatives(
+            named, final.fit, experiments, table, stiffness_given=stiffness_given
+        ),
     )
 
 

@@ -30,13 +30,16 @@ class Step:
     hypothesis, `evidence` over all other causes where there are later ones, and of effects that
     bend the same curve the best one's; `probability` that of being the cause, given that one effect
     of the table is. `chosen` is the hypothesis with the next cause, None of the last step;
-    `without` the one with all causes but this.
+    `without` the one with all causes but this, `beside` what that one still shows, and `instead`
+    the hypotheses with other effects in this cause's place.
     """
 
     view: View
     fitted: Mapping[str, Hypothesis] = field(default_factory=dict)
     chosen: Hypothesis | None = None
     without: Hypothesis | None = None
+    beside: View | None = None
+    instead: Mapping[str, Hypothesis] = field(default_factory=dict)
     alone: Mapping[str, float] = field(default_factory=dict)
     evidence: Mapping[str, float] = field(default_factory=dict)
     probability: Mapping[str, float] = field(default_factory=dict)
@@ -125,7 +128,7 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
     cause = chosen.causes[-1]
     less = _without(found, task, cause)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
-        return _judged(Step(view, fitted, chosen, None, alone), alone, fitted, set(), task)
+        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), task)
     there = _view(found, less, task)
     beside = {**_fitted(found, less), cause.name: found.best}
     own = found.scale.evidence(less)
@@ -137,7 +140,8 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
         more = with_cause(less, task.experiments, there.starts_of(name))
         evidence[name] = -np.inf if more is None else found.scale.evidence(more) - own
     refused = {n for n, c in beside.items() if c.names not in found.worth} - {cause.name}
-    return _judged(Step(view, fitted, chosen, less, alone), evidence, beside, refused, task)
+    step = Step(view, fitted, chosen, less, there, beside, alone)
+    return _judged(step, evidence, beside, refused, task)
 
 
 def _fitted(found: Searched, h: Hypothesis) -> dict[str, Hypothesis]:

@@ -8,7 +8,13 @@ from psa_casadi.report.page.misfit_part import data_view, drawn
 from psa_casadi.report.plots.finding_plots import evidence_plot
 from psa_casadi.report.plots.signature_figure import size_sentence
 from psa_casadi.report.plots.view_plots import signature_plot, view_named
-from psa_casadi.report.words.phrases import cause_estimates, listing, percent, plain
+from psa_casadi.report.words.phrases import (
+    alternative_sentence,
+    cause_estimates,
+    listing,
+    percent,
+    plain,
+)
 
 #: Causes whose signatures are drawn.
 _DRAWN = 3
@@ -48,6 +54,10 @@ def add_causes(page: Document, d: Diagnosis) -> None:
         if cause.cannot_be_told_from:
             rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
             page.paragraph(f"On these data it cannot be told from {rivals}.")
+        for a in d.alternatives:
+            if a.cause == cause.effect:
+                said = alternative_sentence(d, a)
+                page.paragraph(f"{said[0].upper()}{said[1:]}.")
 
 
 def _signature(page: Document, d: Diagnosis, cause: Cause) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from psa_casadi.diagnosis.residual.misfit import Misfit
-from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
+from psa_casadi.diagnosis.result import Alternative, Candidate, Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.units import convert
 
@@ -197,6 +197,19 @@ def _unnamed(d: Diagnosis) -> str:
 
 def _cause(cause: Cause) -> str:
     return f"{plain(cause.effect)} ({cause.belongs_to}, confidence {percent(cause.confidence)})"
+
+
+def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
+    """Say which of two causes an exported plant holds, and what that makes of its displacement."""
+    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
+    apart = length_scale(a.plant_differs_m, counts=counts).text(a.plant_differs_m, 2)
+    inside = any(c.name == a.cause for c in d.model.plant().components)
+    holds = "holds" if inside else "leaves out"
+    return (
+        f"an exported plant {holds} the {plain(a.cause)}; with {plain(a.instead)} in its place its"
+        f" displacement differs by up to {apart} ({number(a.plant_differs_percent, 2)} % of range),"
+        " which these data do not decide"
+    )
 
 
 def cause_estimates(d: Diagnosis, cause: Cause) -> list[str]:

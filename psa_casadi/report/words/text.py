@@ -16,6 +16,7 @@ from psa_casadi.report.words.phrases import (
     VERDICTS,
     Scale,
     added,
+    alternative_sentence,
     cause_estimates,
     length_scale,
     listing,
@@ -57,6 +58,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
     for cause in d.causes:
         lines.append(("cause", _cause(d, cause)))
         lines.append(("rivals", _rivals(d, cause)))
+    lines.extend(("export", f"{alternative_sentence(d, a)}.") for a in d.alternatives)
     spent = budget_sentence(d, scale)
     if spent and d.verdict not in ("adequate", "not_driven"):
         lines.append(("budget", f"{spent}."))

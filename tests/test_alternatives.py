@@ -1,0 +1,75 @@
+"""A bend that may be the sensor's or the load's: both models, and what their plants differ by."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.diagnosis.alternatives import in_plant
+from psa_casadi.effects import EFFECTS
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.records.record import Record
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+
+NOISE = 5e-9
+TABLE = [EFFECTS[n] for n in ("sensor_nonlinearity", "load_stiffness", "slow_creep", "sensor_lag")]
+TIME = np.arange(3000) * 2e-3
+
+
+def _reading() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return voltage, the reading of a bent sensor, and the bend alone [m]."""
+    voltage = 55.0 - 35.0 * np.cos(2 * np.pi * TIME) - 15.0 * np.sin(2 * np.pi * 0.37 * TIME)
+    x = simulate(stack_model("P-885.51"), TIME, voltage).displacement
+    place = (x - x.min()) / np.ptp(x)
+    bend = 0.02 * np.ptp(x) * place * (1.0 - place)
+    noise = NOISE * np.random.default_rng(5).standard_normal(x.size)
+    return voltage, np.asarray(x + bend + noise, dtype=np.float64), bend
+
+
+def test_both_plants_are_offered_and_differ_by_the_bend() -> None:
+    """One plant has the bend, the other leaves it to the sensor: apart they are the bend itself."""
+    voltage, reading, bend = _reading()
+    d = psa.diagnose([Record("r", TIME, voltage, reading)], effects=TABLE)
+    assert d.verdict == "ambiguous"
+    (a,) = d.alternatives
+    assert {a.cause, a.instead} == {"sensor_nonlinearity", "load_stiffness"}
+    assert a.rms_ratio == pytest.approx(1.0, abs=0.05)
+    assert {c.name for c in a.model.components} >= {a.instead}
+    plants = [m.plant() for m in (d.model, a.model)]
+    assert sum("load_stiffness" in {c.name for c in p.components} for p in plants) == 1
+    # offset and slope of the bend are those of the base
+    columns = np.column_stack([np.ones(TIME.size), reading])
+    curved = bend - columns @ np.linalg.lstsq(columns, bend, rcond=None)[0]
+    span = float(np.ptp(reading))
+    assert a.plant_differs_m > 0.5 * float(np.abs(curved).max())
+    assert a.plant_differs_m < 0.2 * span
+    assert a.plant_differs_percent == pytest.approx(100.0 * a.plant_differs_m / span, rel=0.05)
+    assert json.loads(d.to_json())["alternatives"][0]["instead"] == a.instead
+    assert "which these data do not decide" in " ".join(psa.story(d).split())
+
+
+def test_the_command_writes_the_other_model_beside_the_extended_one(tmp_path: Path) -> None:
+    voltage, reading, _ = _reading()
+    record, out = tmp_path / "r.csv", tmp_path / "ext.json"
+    psa.write_record(
+        record, {"time [s]": TIME, "voltage [V]": voltage, "displacement [m]": reading}
+    )
+    done = CliRunner().invoke(app, ["diagnose", str(record), "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    (other,) = set(tmp_path.glob("ext_*.json"))
+    models = [psa.load_model(p) for p in (out, other)]
+    bends = [{c.name for c in m.effects} for m in models]
+    assert sorted(b.pop() for b in bends) == ["load_stiffness", "sensor_nonlinearity"]
+    assert f"written: {other}" in done.output.replace("\n", "")
+
+
+def test_sensor_and_environment_stay_out_of_a_plant() -> None:
+    assert not in_plant(EFFECTS["sensor_nonlinearity"])
+    assert not in_plant(EFFECTS["mains_hum"])
+    assert in_plant(EFFECTS["load_stiffness"])
+    assert in_plant(EFFECTS["drive_lag"])
