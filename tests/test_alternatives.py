@@ -18,7 +18,7 @@ from psa_casadi.units import FloatArray
 
 NOISE = 5e-9
 TABLE = [EFFECTS[n] for n in ("sensor_nonlinearity", "load_stiffness", "slow_creep", "sensor_lag")]
-TIME = np.arange(3000) * 2e-3
+TIME = np.linspace(0.0, 5.998, 3000)
 
 
 def _reading() -> tuple[FloatArray, FloatArray, FloatArray]:
