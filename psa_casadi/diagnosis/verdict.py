@@ -39,7 +39,7 @@ from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.identify import FORCE_NOTE, with_provenance
+from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
@@ -111,6 +111,9 @@ def conclude(
         None if patch is None else (patch.name, patch.predicted),
         floor,
     )
+    model = with_provenance(
+        final.fit.model, found, [e.record for e in experiments], stiffness_given
+    )
     causes = tuple(_cause(s, last.fit, found, spent) for s in named)
     return Diagnosis(
         verdict=verdict,
@@ -126,7 +129,7 @@ def conclude(
             causes, verdict, same_curves(experiments, table, first.fit)
         ),
         notes=(
-            *(() if stiffness_given else (FORCE_NOTE,)),
+            *model.provenance.notes,
             *(_withdrawn(steps, weighed, beaten) if verdict == "unexplained" else ()),
             *coverage_notes(experiments),
         ),
@@ -135,12 +138,7 @@ def conclude(
         extended_fit=final.fit,
         base=first.predicted,
         extended=final.predicted,
-        model=with_provenance(
-            final.fit.model,
-            found,
-            [e.record for e in experiments],
-            stiffness_given,
-        ),
+        model=model,
         noise=noise,
         misfit=missed,
         remainder=_misfits(experiments, errors, noise) if named else missed,

@@ -12,6 +12,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
 from psa_casadi.identification.search.refitting import Progress, record_rms, refit
+from psa_casadi.identification.start.electrical import drive_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
@@ -112,13 +113,18 @@ def with_provenance(
     model: Model, found: Determinacy, records: Sequence[Record], stiffness_given: bool
 ) -> Model:
     """Return a fitted model that says from which records it comes and how sure its values are."""
+    drive = drive_of(records)
+    told = {} if drive is None else drive.intervals(model.values)
     provenance = Provenance(
         identified_from=tuple((r.name, r.sha256) for r in records),
         package_version=__version__,
         free=found.names,
-        intervals=found.intervals,
+        intervals={**told, **found.intervals},
         force_scale="given" if stiffness_given else "assumed",
-        notes=() if stiffness_given else (FORCE_NOTE,),
+        notes=(
+            *(() if stiffness_given else (FORCE_NOTE,)),
+            *((drive.sentence,) if drive is not None else ()),
+        ),
     )
     return replace(model, provenance=provenance)
 
