@@ -62,6 +62,11 @@ BENCHES: dict[str, Bench] = {
             "an effect of an independent plant added to a measured record: what is named on top",
         ),
         _later(
+            "excerpts",
+            "excerpts",
+            "pieces of measured records, decimated, scaled, turned round: none may crash",
+        ),
+        _later(
             "method_pictures",
             "method",
             "the picture of docs/method.md: the hypotheses of one search, and its error budget",
