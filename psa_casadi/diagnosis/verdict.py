@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.alternatives import alternatives
+from psa_casadi.diagnosis.blind_spots import blind_spots, shown
 from psa_casadi.diagnosis.budget import Budget, Removed, budget
 from psa_casadi.diagnosis.corrections.correct import Correction, corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
@@ -22,7 +23,6 @@ from psa_casadi.diagnosis.judgement import Weighed, told_from, verdict_of
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
-    BlindSpot,
     Candidate,
     Cause,
     Diagnosis,
@@ -123,7 +123,7 @@ def conclude(
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain_of(experiments, first.predicted, final.predicted),
-        blind_to=_blind_spots(final, [e for e in table if e.name not in _shown(steps)]),
+        blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
         remaining=_remaining(final, Excess() if named else beyond),
         next_experiment=_next_experiment(
             causes, verdict, same_curves(experiments, table, first.fit)
@@ -163,16 +163,6 @@ def patched_model(d: Diagnosis) -> Model:
     given = d.model.provenance.force_scale == "given"
     told = determinacy(found, d.experiments)
     return with_provenance(found.model, told, [e.record for e in d.experiments], given)
-
-
-def _shown(steps: Sequence[Step]) -> set[str]:
-    """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
-
-    Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
-    """
-    price = thresholds().price
-    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > price}
-    return fitted.union(*(told_from(s) for s in steps))
 
 
 def _withdrawn(
@@ -252,34 +242,6 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
             )
         )
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
-
-
-def _blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
-    """Effects whose smallest detectable gain on these records exceeds their ordinary size."""
-    spots = []
-    present = {c.name for c in final.fit.model.components}
-    for effect in table:
-        if effect.name in present:
-            continue
-        scores = [s for s in final.screening.scores if s.direction.effect is effect]
-        gain = next(p for p in effect.parameters if p.name == effect.gain)
-        extended = final.fit.model.with_effect(effect, {gain.name: 0.0})
-        practical = gain.typical(extended.values)
-        factor = np.sqrt(final.screening.threshold)
-        smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
-        if smallest > practical:
-            unit = "" if gain.unit == "1" else f" {gain.unit}"
-            seen = f"only from {smallest:.3g}{unit} on" if np.isfinite(smallest) else "at no size"
-            spots.append(
-                BlindSpot(
-                    effect.name,
-                    float(min(smallest, 1e300)),
-                    gain.unit,
-                    f"These records show {effect.name} {seen} ({gain.name}), while"
-                    f" {practical:.3g}{unit} is an ordinary size.",
-                )
-            )
-    return tuple(spots)
 
 
 def _remaining(r: Step, beyond: Excess) -> Remaining:
