@@ -10,6 +10,7 @@ from psa_casadi import reference
 from psa_casadi.identification.start.electrical import drive_of
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
+from psa_casadi.report.words.tables import parameter_table
 from psa_casadi.units import FloatArray
 
 STACK = stack_model("P-885.51")
@@ -75,6 +76,7 @@ def test_a_current_that_is_not_the_stack_s_tells_nothing(fast: Record) -> None:
     assert drive_of([replace(fast, current=np.zeros(fast.n))]) is None
     assert drive_of([replace(fast, current=None)]) is None
     assert fast.current is not None
+    assert drive_of([replace(fast, current=1e6 * fast.current)]) is None
     clipped = np.clip(fast.current, -0.01, 0.01) * np.sign(np.sin(np.arange(fast.n)))
     assert drive_of([replace(fast, current=clipped)]) is None
 
@@ -88,6 +90,8 @@ def test_an_identified_model_has_the_measured_capacitance_and_its_current(fast: 
         assert interval.low < found.model.values[name] < interval.high
         assert interval.low * 0.9 < true < interval.high * 1.1
     assert "R_s" not in found.fit.unknowns.names
+    rows = {row[0]: row for row in parameter_table(found.model, found).rows}
+    assert [rows[n][4] for n in ("C_p", "R_s", "k_L")] == ["current", "current", "fit"]
     assert any("measured current" in n for n in found.model.provenance.notes)
     simulated = psa.simulate_record(found.model, fast).outputs["current"]
     assert fast.current is not None

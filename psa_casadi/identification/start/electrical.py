@@ -25,6 +25,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Lags that are tried first, over the sampling interval: shorter ones do not show.
 _LAGS, _ROUNDS = np.geomspace(0.1, 200.0, 25), 4
+#: Capacitances of stacks [F], with a wide margin: what lies outside is of another unit or thing.
+_ORDINARY = (1e-10, 1e-2)
 #: Least share of the current's variance that the drive must explain for its figures to count.
 _EXPLAINED = 0.9
 #: Standard errors of half a 95 % interval, and the largest one of ln(R_s C_p) that tells it.
@@ -99,7 +101,7 @@ def drive_of(records: Sequence[Record]) -> Drive | None:
         lags = np.geomspace(lags[max(k - 1, 0)], lags[min(k + 1, len(lags) - 1)], len(_LAGS))
     solution, rest, columns = _solved(own, best)
     explained = 1.0 - rest / total
-    if explained < _EXPLAINED or solution[0] <= 0.0:
+    if explained < _EXPLAINED or not _ORDINARY[0] < solution[0] < _ORDINARY[1]:
         return None
     slope = (_columns(own, best * 1.001)[:, 0] - columns[:, 0]) * solution[0] / 0.001
     both = np.column_stack([columns, slope])

@@ -138,7 +138,7 @@ def _lags(values: Mapping[str, float], sample_time: float, drive: Drive | None) 
     lag = 0.3 * sample_time if drive is None or drive.lag is None else drive.lag
     lags = {
         "tau": float(np.clip(0.7 * sample_time, 1e-6, 0.5)),
-        "R_s": lag / values["C_p"],
+        "R_s": float(np.clip(lag / values["C_p"], 1e-3, 1e7)),
     }
     lags |= {f"c_{m}": 0.05 * sample_time * values[f"k_{m}"] for m in "PB" if f"k_{m}" in values}
     return lags

@@ -71,7 +71,7 @@ def _status(model: Model, name: str, found: Identification | None) -> str:
     if found is not None and name in found.read_off:
         return "read off"
     if name not in model.provenance.free:
-        return "not fitted"
+        return "current" if name in model.provenance.intervals else "not fitted"
     degree = grade(found, name).degree if found is not None else "determined"
     return "fit" if degree in ("determined", "fixed") else f"fit, {degree}"
 
