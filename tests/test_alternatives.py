@@ -66,6 +66,11 @@ def test_the_command_writes_the_other_model_beside_the_extended_one(tmp_path: Pa
     bends = [{c.name for c in m.effects} for m in models]
     assert sorted(b.pop() for b in bends) == ["load_stiffness", "sensor_nonlinearity"]
     assert f"written: {other}" in done.output.replace("\n", "")
+    again = CliRunner().invoke(
+        app, ["diagnose", str(record), "--model", str(other), "-o", str(out)]
+    )
+    assert again.exit_code == 2
+    assert "could overwrite it" in " ".join(again.output.split())
 
 
 def test_sensor_and_environment_stay_out_of_a_plant() -> None:

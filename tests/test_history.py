@@ -96,7 +96,7 @@ def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> 
     extended = settled.with_effect(EFFECTS["sensor_lag"], {"sensor_lag_time": 1e-4})
     assert loads(dumps(extended)).own_starts() == extended.own_starts()
     assert extended.plant().own_starts() == settled.own_starts()
-    assert STACK.own_starts() == {}
+    assert STACK.own_starts() == settled.with_declared_starts().own_starts() == {}
     assert "starts" not in dumps(STACK)
     with pytest.raises(InputError, match="no state or input 'q'"):
         STACK.with_starts({"q": 1.0})

@@ -2,6 +2,7 @@
 
 import time as clock
 from collections.abc import Callable, Mapping
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +22,7 @@ from psa_casadi.cli.screen import (
 )
 
 if TYPE_CHECKING:
+    from psa_casadi.cli.inputs import Given
     from psa_casadi.diagnosis.result import Alternative, Diagnosis
 
 
@@ -99,6 +101,7 @@ def diagnose(
             given, held = Given(effects), holdout or []
             given.stiffness(stiffness)
             given.outputs({**outputs, "--next": following}, [*records, *held, model])
+            _keep_apart(given, output, model)
             found = given.records(records, held_out=held, columns=columns)
             start = given.model(model)
             given.check()
@@ -132,6 +135,14 @@ def diagnose(
         show("", quiet)
         show_table(timings_table(spent.stages), quiet)
         show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", quiet)
+
+
+def _keep_apart(given: "Given", output: Path | None, model: Path | None) -> None:
+    """Demand that no model written beside the output is the one that is read."""
+    if output is None or model is None or model.resolve().parent != output.resolve().parent:
+        return
+    if fnmatch(model.name, f"{output.stem}_*_for_*.json"):
+        given.add(f"{model}: a model beside {output} could overwrite it; give -o another name.")
 
 
 def _beside(path: Path | None) -> Path | None:
@@ -185,7 +196,10 @@ def _alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternativ
     """Return the models with another cause, each with its file beside the extended model's."""
     if output is None:
         return []
-    return [(a, output.with_name(f"{output.stem}_{a.instead}.json")) for a in d.alternatives]
+    return [
+        (a, output.with_name(f"{output.stem}_{a.instead}_for_{a.cause}.json"))
+        for a in d.alternatives
+    ]
 
 
 def _models(d: "Diagnosis", output: Path | None) -> list[str]:

@@ -1,6 +1,7 @@
 """Sensor jump: the reading jumps where the displacement passes one place, on both branches.
 
-It is narrow: a wide one would be a bent sensor.
+It is narrow: a wide one would be a bent sensor. A reading that stays off after a jump, as of an
+interferometer that has lost a count, is not this.
 """
 
 import casadi as ca
@@ -33,8 +34,8 @@ SENSOR_JUMP = Component(
     name="sensor_jump",
     description="the reading jumps where the displacement passes one place",
     source=(
-        "wide code or missing code of a converter (IEEE Std 1241), stitching error of a scale, lost"
-        " count of an interferometer: a static step of the reading"
+        "wide or missing code of a converter (IEEE Std 1241), stitching error of a scale: a static"
+        " step of the reading"
     ),
     belongs_to="sensor",
     gain="jump_gain",

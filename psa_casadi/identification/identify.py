@@ -12,7 +12,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
 from psa_casadi.identification.search.refitting import Progress, record_rms, refit
-from psa_casadi.identification.start.electrical import drive_of
+from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
@@ -113,8 +113,9 @@ def with_provenance(
     model: Model, found: Determinacy, records: Sequence[Record], stiffness_given: bool
 ) -> Model:
     """Return a fitted model that says from which records it comes and how sure its values are."""
-    drive = drive_of(records)
-    told = {} if drive is None else drive.intervals(model.values)
+    c_p = model.values.get("C_p", 0.0)
+    current = capacitance_of(records)
+    told = {"C_p": current.interval} if current is not None and current.is_that_of(c_p) else {}
     provenance = Provenance(
         identified_from=tuple((r.name, r.sha256) for r in records),
         package_version=__version__,
@@ -123,7 +124,7 @@ def with_provenance(
         force_scale="given" if stiffness_given else "assumed",
         notes=(
             *(() if stiffness_given else (FORCE_NOTE,)),
-            *((drive.sentence,) if drive is not None else ()),
+            *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
     return replace(model, provenance=provenance)

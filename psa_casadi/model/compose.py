@@ -102,6 +102,14 @@ class Model:
         every = _starting(self.structure)
         return {v.name: v.start for v in every if v.start != declared.get(v.name, v.start)}
 
+    def with_declared_starts(self) -> "Model":
+        """Return the model with the start values that its components declare."""
+        return (
+            self
+            if not self.own_starts()
+            else replace(self, structure=structure_of(self.components))
+        )
+
     def with_starts(self, starts: Mapping[str, float]) -> "Model":
         """Return the model with other start values of states and inputs (SI units).
 

@@ -6,7 +6,8 @@ the range. So the history is played into the same equations:
 
     0 V, relaxed -> V_1 -> V_2 -> ... -> V(0), one sweep each -> rest
 
-The hysteresis of the table does not depend on the rate; creep does on the durations.
+Of the hysteresis only the paper's asymmetry delta depends on the duration of a sweep, and much on a
+slow one; creep does, and on the rest. A voltage slower than `hold_rate` counts as held.
 """
 
 from collections.abc import Sequence
@@ -29,7 +30,8 @@ def memory_after(
     """Return the `memory` (see `simulate`) of a model after a virtual history.
 
     From relaxed at 0 V the voltage goes to each of the `voltages` [V] in turn and then to `at`, the
-    record's first one, in `sweep` [s] each, and stays there for `rest` [s].
+    record's first one, in `sweep` [s] each, and stays there for `rest` [s]. Equal voltages in a row
+    count once. Take sweeps as long as those that the stack has made: `delta` and creep see them.
 
     Raises InputError for bad numbers; SimulationError where the model cannot follow.
     """
@@ -73,7 +75,8 @@ def settled_at(
     """Return the model with start values where a `voltage` [V] holds it, for an export.
 
     States and the voltage input start there: the memory after a virtual `history` (see
-    `memory_after`), all else settled. Raises as `memory_after`, and InputError without a voltage.
+    `memory_after`), all other continuous ones settled; sampled states keep theirs. Raises as
+    `memory_after`, and InputError without a voltage.
     """
     if "voltage" not in model.input_names:
         raise InputError(

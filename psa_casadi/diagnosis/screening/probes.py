@@ -102,14 +102,13 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
 
 
 def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
-    """Periods [m] with which the first record's residual repeats over the displacement.
+    """Periods [m] with which the residual of the largest record repeats over the displacement.
 
     Of the mean residual in bins of the predicted displacement, under a Hann window.
     """
-    binned = _binned(fit, experiments[0])
-    if binned is None:
+    _, span, count, total = _binned(fit, experiments)
+    if span <= 0.0:
         return ()
-    _, span, count, total = binned
     mean = total / np.maximum(count, 1)
     power = np.abs(np.fft.rfft(mean * np.hanning(_BINS), _FINER * _BINS)) ** 2
     first = _FINER * _FEWEST_PERIODS
@@ -118,15 +117,14 @@ def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
 
 
 def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
-    """Places [m] at which the first record's residual jumps over the displacement.
+    """Places [m] at which the residual of the largest record jumps over the displacement.
 
     Where the difference of its means on either side is largest over what equal noise would make of
     it; places are displacements of the model, without the record's offset.
     """
-    binned = _binned(fit, experiments[0])
-    if binned is None:
+    low, span, count, total = _binned(fit, experiments)
+    if span <= 0.0:
         return ()
-    low, span, count, total = binned
     below, sums = (np.append(0.0, np.cumsum(q)) for q in (count, total))
     edges = np.arange(_SIDE, _BINS - _SIDE + 1)
     left, right = (below[edges + k] - below[edges + k - _SIDE] for k in (0, _SIDE))
@@ -135,22 +133,26 @@ def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     jump = after / np.maximum(right, 1) - before / np.maximum(left, 1)
     power = np.where(seen, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
     places = edges[highest_peaks(power, _SIDE, _PEAKS)]
-    found = low - fit.offset(0) + span * np.sort(places) / _BINS
+    found = low + span * np.sort(places) / _BINS
     return tuple(float(x) for x in found)
 
 
-def _binned(fit: Fit, experiment: Experiment) -> tuple[float, float, FloatArray, FloatArray] | None:
-    """Return lowest prediction and range [m]; samples and sum of the residual in bins of it.
+def _binned(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> tuple[float, float, FloatArray, FloatArray]:
+    """Return lowest displacement and range [m]; samples and sum of the residual in bins of it.
 
-    The residual is about its mean. None where the prediction stands still.
+    Of the record whose displacement, as the model has it, goes furthest; the residual is about its
+    mean.
     """
-    used = experiment.used[: experiment.stop]
-    residual = fit.residuals[: int(used.sum())]
-    x = measured(experiment.record)[: experiment.stop][used] - residual
+    parts = []
+    for k, (e, residual) in enumerate(zip(experiments, fit.residuals_of(experiments), strict=True)):
+        shown = measured(e.record)[: e.stop][e.used[: e.stop]]
+        parts.append((shown - residual - fit.offset(k), residual))
+    x, residual = max(parts, key=lambda part: float(np.ptp(part[0])))
     low, span = float(x.min()), float(np.ptp(x))
-    if span <= 0.0:
-        return None
-    places = np.minimum((_BINS * (x - low) / span).astype(np.int64), _BINS - 1)
+    places = (_BINS * (x - low) / max(span, 1e-300)).astype(np.int64)
+    places = np.minimum(places, _BINS - 1)
     count = np.bincount(places, minlength=_BINS).astype(float)
     total = np.bincount(places, residual - np.mean(residual), _BINS).astype(float)
     return low, span, count, total

@@ -8,12 +8,7 @@ from typing import Any
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.search.force_start import retuned
-from psa_casadi.identification.search.refinement import (
-    exchanged,
-    with_fast,
-    with_measured_drive,
-    without_blur,
-)
+from psa_casadi.identification.search.refinement import exchanged, with_fast, without_blur
 from psa_casadi.identification.search.refitting import (
     Progress,
     differing,
@@ -128,8 +123,6 @@ def search(
     if thorough and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)
         not_unique |= set(open_ones)
-    if not best.interrupted:
-        best = with_measured_drive(best, experiments, progress)
     names = best.unknowns.names
     return Search(best, outcomes, tuple(n for n in names if n in not_unique))
 

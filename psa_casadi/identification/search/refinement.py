@@ -16,10 +16,8 @@ from psa_casadi.identification.search.refitting import (
     differing,
     equal,
     quick_from,
-    refit,
     refit_or_keep,
 )
-from psa_casadi.identification.start.electrical import drive_of
 from psa_casadi.records.split import Experiment
 
 #: Parameters that only fast records determine: each is freed when the data can tell it.
@@ -57,27 +55,6 @@ def without_blur(best: Fit, experiments: Sequence[Experiment]) -> Fit:
     if np.sqrt(covariance_of(best, experiments)[k, k]) < _SHARP:
         return best
     return refit_or_keep(best, experiments, [n for n in names if n != "k_P"], best.sigma)
-
-
-def with_measured_drive(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
-    """Fix the drive's lag R_s C_p where a measured current tells it; the creep lag takes the rest.
-
-    A displacement hardly tells one lag from another, a current sees the drive's alone.
-    """
-    drive = drive_of([e.record for e in experiments])
-    names = best.unknowns.names
-    if drive is None or drive.lag is None or "R_s" not in names:
-        return best
-    progress("base fit with the drive that the current shows")
-    p = best.model.values
-    wanted = {"R_s": drive.lag / p["C_p"], "tau": p["tau"] + p["R_s"] * p["C_p"] - drive.lag}
-    bounds = {n: best.model.parameter(n).bounds for n in wanted}
-    moved = best.model.with_values({n: float(np.clip(v, *bounds[n])) for n, v in wanted.items()})
-    rest = [n for n in names if n != "R_s"]
-    try:
-        return refit(replace(best, model=moved), experiments, rest, sigma=best.sigma)
-    except PsaError:
-        return best
 
 
 def exchanged(

@@ -1,17 +1,18 @@
-"""What a measured current tells of the drive, without the mechanics.
+"""The capacitance that a measured current tells, without the mechanics.
 
     C_p u' = i,   i = (G v - u) / R_s,   G = 1
 
 With the voltage v linear between samples h apart the current has an exact step,
 
-    i_(k+1) = a i_k + (1 - a) C_p (v_(k+1) - v_k) / h,   a = exp(-h / (R_s C_p)),
+    i_(k+1) = a i_k + (1 - a) C_p (v_(k+1) - v_k) / h,   a = exp(-h / T),
 
-where h hardly varies (its mean is taken). It is linear in C_p, the zero of the sensor and the
-current before the record; the lag R_s C_p is sought along one line. Displacements only show the
-product R_s C_p: what tells the capacitance is the current.
+linear in C_p, in the sensor's zero and in the current before the record. The time T is sought along
+one line and then left alone: a loss of the ceramic's polarisation looks like a lag of the drive,
+R_s C_p, so that only their sum shows. Displacements show the product R_s C_p; the capacitance is
+the current's.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,119 +24,107 @@ from psa_casadi.variables import Interval
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Lags that are tried first, over the sampling interval: shorter ones do not show.
-_LAGS, _ROUNDS = np.geomspace(0.1, 200.0, 25), 4
+#: Times T that are tried, over the sampling interval, and how often the grid closes in.
+_TIMES, _ROUNDS = np.geomspace(0.1, 200.0, 25), 3
 #: Capacitances of stacks [F], with a wide margin: what lies outside is of another unit or thing.
 _ORDINARY = (1e-10, 1e-2)
 #: Least share of the current's variance that the drive must explain for its figures to count.
 _EXPLAINED = 0.9
-#: Standard errors of half a 95 % interval, and the largest one of ln(R_s C_p) that tells it.
-_NORMAL, _TOLD = 1.96, 0.25
+#: Standard errors of half a 95 % interval; steps that differ by more are uneven; a model's
+#: capacitance is the current's if it differs by less.
+_NORMAL, _UNEVEN, _SAME = 1.96, 1e-2, 0.02
 
 
 @dataclass(frozen=True)
-class Drive:
-    """Capacitance [F] and lag R_s C_p [s] by a measured current, each with its standard error.
+class Capacitance:
+    """Capacitance [F] by a measured current, with its standard error.
 
-    The lag is None where the current does not show one. `explained` is the share of the current's
-    variance.
+    `explained` is the share of the current's variance.
     """
 
-    capacitance: float
-    capacitance_error: float
-    lag: float | None
-    lag_error: float
+    value: float
+    error: float
     explained: float
 
     @property
-    def interval(self) -> tuple[float, float]:
-        """The capacitance's 95 % interval [F]."""
-        half = _NORMAL * self.capacitance_error
-        return self.capacitance - half, self.capacitance + half
+    def interval(self) -> Interval:
+        """The 95 % interval [F]."""
+        half = _NORMAL * self.error
+        return Interval(self.value - half, self.value + half)
 
-    def intervals(self, values: Mapping[str, float]) -> dict[str, Interval]:
-        """Return the 95 % intervals of those of a model's values that are the current's."""
-        c_p, r_s = values.get("C_p", 0.0), values.get("R_s", 0.0)
-        low, high = self.interval
-        found = {"C_p": Interval(low, high)} if low <= c_p <= high else {}
-        if found and self.lag is not None:
-            ends = [(self.lag + q * _NORMAL * self.lag_error) / c_p for q in (-1.0, 1.0)]
-            if ends[0] <= r_s <= ends[1]:
-                found["R_s"] = Interval(*ends)
-        return found
+    def is_that_of(self, value: float) -> bool:
+        """Whether a model has this capacitance."""
+        return abs(value - self.value) < _SAME * self.value
 
-    @property
-    def sentence(self) -> str:
-        """What the current says, in words."""
-        low, high = (1e6 * q for q in self.interval)
-        lag = ""
-        if self.lag is not None:
-            lag = (
-                f" and R_s C_p = {1e6 * self.lag:.3g} us"
-                f" (give or take {1e6 * _NORMAL * self.lag_error:.2g} us)"
-            )
+    def sentence(self, value: float) -> str:
+        """What the current says, in words; `value` [F] is that of the model."""
+        low, high = 1e6 * self.interval.low, 1e6 * self.interval.high
+        kept = "" if self.is_that_of(value) else f" The model keeps the {1e6 * value:.4g} uF given."
         return (
-            f"The measured current tells C_p = {1e6 * self.capacitance:.4g} uF"
-            f" ({low:.4g} to {high:.4g}; times the amplifier's gain, if the voltage is its"
-            f" input){lag}, which explain {100 * self.explained:.1f} % of it."
+            f"The measured current tells C_p = {1e6 * self.value:.4g} uF ({low:.4g} to {high:.4g};"
+            " times the amplifier's gain, if the voltage is its input): it explains"
+            f" {100 * self.explained:.1f} % of it.{kept}"
         )
 
 
-def drive_of(records: Sequence[Record]) -> Drive | None:
-    """Return what the measured currents tell; None without one, or where they follow no drive.
+def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
+    """Return what measured currents tell; None without one, or where they follow no capacitance.
 
-    A current that is limited, leaks, or belongs to another voltage is explained badly.
+    A current that is limited, leaks, has its sign turned, or belongs to another voltage is
+    explained badly. Records with uneven time steps tell nothing.
     """
-    own = [r for r in records if r.current is not None and r.n > 3]
-    given = [np.asarray(r.current)[:, None] for r in own]
-    if not own or not any(np.ptp(i) > 0.0 for i in given):
+    own = [r for r in records if r.current is not None and r.n > 3 and _even(r)]
+    shown = [np.asarray(r.current, dtype=np.float64) for r in own]
+    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in shown)
+    if total == 0.0:
         return None
-    h = min(r.sample_time for r in own)
-    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in given)
-
-    lags = h * _LAGS
+    times = min(r.sample_time for r in own) * _TIMES
     for _ in range(_ROUNDS):
-        tried = [_solved(own, float(q))[1] for q in lags]
-        k = int(np.argmin(tried))
-        best = float(lags[k])
-        lags = np.geomspace(lags[max(k - 1, 0)], lags[min(k + 1, len(lags) - 1)], len(_LAGS))
-    solution, rest, columns = _solved(own, best)
+        left = [_solved(own, float(q))[1] for q in times]
+        k = int(np.argmin(left))
+        best = float(times[k])
+        times = np.geomspace(times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)], len(_TIMES))
+    value, rest, error = _solved(own, best)
     explained = 1.0 - rest / total
-    if explained < _EXPLAINED or not _ORDINARY[0] < solution[0] < _ORDINARY[1]:
+    if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
         return None
-    slope = (_columns(own, best * 1.001)[:, 0] - columns[:, 0]) * solution[0] / 0.001
-    both = np.column_stack([columns, slope])
-    freedom = max(len(columns) - both.shape[1], 1)
-    spread = np.sqrt(np.diag(np.linalg.pinv(both.T @ both)) * rest / freedom)
-    told = h * _LAGS[0] < best < h * _LAGS[-1] and spread[-1] < _TOLD
-    return Drive(
-        capacitance=float(solution[0]),
-        capacitance_error=float(spread[0]),
-        lag=best if told else None,
-        lag_error=float(best * spread[-1]),
-        explained=explained,
-    )
+    return Capacitance(value, error, explained)
 
 
-def _solved(records: Sequence[Record], lag: float) -> tuple[FloatArray, float, FloatArray]:
-    """Return the linear unknowns, C_p first, at a lag [s]; the sum of squares left; the columns."""
-    columns = _columns(records, lag)
+def _even(record: Record) -> bool:
+    steps = np.diff(record.time)
+    return bool(np.ptp(steps) < _UNEVEN * float(np.mean(steps)))
+
+
+def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float]:
+    """Return C_p at a time T [s], the sum of squares left, and C_p's standard error.
+
+    For a residual that is an autoregression of first order.
+    """
+    columns = _columns(records, time)
+    scale = np.linalg.norm(columns, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
     shown = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
-    found = np.linalg.lstsq(columns, shown, rcond=None)[0]
-    rest = shown - columns @ found
-    return found, float(rest @ rest), columns
+    found, *_ = np.linalg.lstsq(columns / scale, shown, rcond=None)
+    rest = shown - (columns / scale) @ found
+    power = float(rest @ rest)
+    alike = min(max(float(rest[1:] @ rest[:-1]) / max(power, 1e-300), 0.0), 0.999)
+    inflation = (1.0 + alike) / (1.0 - alike)
+    spread = np.linalg.pinv((columns / scale).T @ (columns / scale), hermitian=True)[0, 0]
+    freedom = max(len(rest) - columns.shape[1], 1)
+    error = float(np.sqrt(spread * power / freedom * inflation)) / scale[0]
+    return float(found[0] / scale[0]), power, error
 
 
-def _columns(records: Sequence[Record], lag: float) -> FloatArray:
+def _columns(records: Sequence[Record], time: float) -> FloatArray:
     """Return the current per farad, and of every record the sensor's zero and the start."""
     every = []
     for k, record in enumerate(records):
-        step = np.diff(record.time)
-        keep = float(np.exp(-record.sample_time / lag))
-        rate = np.append(0.0, np.diff(record.voltage) / step)
+        keep = float(np.exp(-record.sample_time / time))
+        rate = np.append(0.0, np.diff(record.voltage) / np.diff(record.time))
         own = np.zeros((record.n, 1 + 2 * len(records)))
         own[:, 0] = filtered([1.0 - keep], [1.0, -keep], rate)
         own[:, 1 + 2 * k] = 1.0
-        own[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / lag)
+        own[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
         every.append(own)
     return np.vstack(every)

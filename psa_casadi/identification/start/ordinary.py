@@ -8,7 +8,7 @@ from psa_casadi.components import BASE
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.electrical import Drive, drive_of
+from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.records.record import Record
 
@@ -47,7 +47,7 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     sheet measures is k_B; it is `ASSUMED_STIFFNESS` where none is given, since voltage and
     displacement do not determine forces. k_P = 5 k_B is assumed; k_L (1/k_P + 1/k_B) is the
     regression slope of displacement on voltage (paper, eq. 14). C_p is that of the measured current
-    (`drive_of`), else assumed. Raises InputError where that is
+    (`capacitance_of`), else assumed. Raises InputError where that is
     far from what any stack does, or where no voltage or no displacement changes.
     """
     doubt = doubtful_unit(records)
@@ -60,20 +60,20 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     sample_time = min(r.sample_time for r in records)
     k_l = max(abs(static_slope(records)), 1e-12) / (1.0 / k_p + 1.0 / k_b)
-    drive = drive_of(records)
+    told = capacitance_of(records)
     values = {
         "u_rated": max(span, top),
         "k_L": k_l,
         "h_ref": _HYSTERESIS_SHARE * k_l * span,
         "hold_rate": 1e-3 * span,
-        "C_p": _CAPACITANCE if drive is None else drive.capacitance,
+        "C_p": _CAPACITANCE if told is None else told.value,
         "k_P": k_p,
         "k_B": k_b,
         **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
         "n": LOOP_SHAPES[0]["n"],
     }
     try:
-        return compose(BASE, {**values, **_lags(values, sample_time, drive)})
+        return compose(BASE, {**values, **_lags(values, sample_time)})
     except InputError as error:
         raise InputError([doubt]) if doubt else error from None
 
@@ -89,10 +89,12 @@ def chosen_start(
 ) -> tuple[Model, bool]:
     """Return where a fit starts, and whether its force scale is known.
 
-    A `model` is taken as it is; a `stiffness` [N/m] beside it changes its force scale.
+    A `model` is taken as it is, but for start values of its own, which belong to its parameters; a
+    `stiffness` [N/m] beside it changes its force scale.
     """
     if model is None:
         return starting_model(records, stiffness), stiffness is not None
+    model = model.with_declared_starts()
     if stiffness is None:
         return model, model.provenance.force_scale == "given"
     return with_stiffness(model, stiffness), True
@@ -126,19 +128,14 @@ def ordinary_values(model: Model, records: Sequence[Record]) -> dict[str, float]
     """
     k_l = max(abs(static_slope(records)), 1e-12) / static_compliance(model.values)
     loop = {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
-    lags = _lags(model.values, min(r.sample_time for r in records), drive_of(records))
-    return {"k_L": k_l, **loop, **lags}
+    return {"k_L": k_l, **loop, **_lags(model.values, min(r.sample_time for r in records))}
 
 
-def _lags(values: Mapping[str, float], sample_time: float, drive: Drive | None) -> dict[str, float]:
-    """Return lags somewhat below the sampling interval; what is much faster cannot be told.
-
-    The drive's is the one that its current shows, if it does.
-    """
-    lag = 0.3 * sample_time if drive is None or drive.lag is None else drive.lag
+def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:
+    """Return lags somewhat below the sampling interval; what is much faster cannot be told."""
     lags = {
         "tau": float(np.clip(0.7 * sample_time, 1e-6, 0.5)),
-        "R_s": float(np.clip(lag / values["C_p"], 1e-3, 1e7)),
+        "R_s": 0.3 * sample_time / values["C_p"],
     }
     lags |= {f"c_{m}": 0.05 * sample_time * values[f"k_{m}"] for m in "PB" if f"k_{m}" in values}
     return lags
