@@ -114,6 +114,17 @@ def test_a_parameter_at_its_bound_is_out_of_character(creeping: Creeping) -> Non
     assert not in_character(replace(creep.fit, model=model), cause, experiments)
 
 
+def test_a_ripple_that_hardly_repeats_is_out_of_character(creeping: Creeping) -> None:
+    """With less than two periods over the displacement it is a bent curve."""
+    _, creep, _, experiments = creeping
+    ripple = EFFECTS["sensor_ripple"]
+    widest = max(e.record.range_m for e in experiments)
+    for periods, fits in ((1.5, False), (3.0, True)):
+        values = {"ripple_gain": 1e-9, "ripple_period": widest / periods}
+        model = creep.fit.model.with_effect(ripple, values)
+        assert in_character(replace(creep.fit, model=model), ripple, experiments) is fits
+
+
 def test_without_finite_steps_an_effect_with_a_threshold_is_not_seen(
     fitted: tuple[Fit, tuple[Experiment, ...]],
 ) -> None:

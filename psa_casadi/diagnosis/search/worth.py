@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import Component
+from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
@@ -70,10 +70,14 @@ def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Exper
 def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
     """Whether the data ask for this effect and not for something else.
 
-    Not with a parameter pushed to the end of its range, or a tone among the harmonics of a
-    periodic drive.
+    Not with a parameter pushed to the end of its range, a tone among the harmonics of a
+    periodic drive, or a period over the displacement that fits into it less than twice.
     """
     values = fit.model.values
+    widest = max(e.record.range_m for e in experiments)
+    periods = [values[n] for n, grid in cause.probe.items() if grid == DISPLACEMENT_PEAKS]
+    if any(period > 0.5 * widest for period in periods):
+        return False
     tone = cause.tone
     if tone is not None and any(among_harmonics(values[tone], e.record) for e in experiments):
         return False
