@@ -140,6 +140,11 @@ class Component:
         return any(grid in READ_OFF for grid in self.probe.values())
 
     @property
+    def in_plant(self) -> bool:
+        """Whether an exported plant holds it: sensor and environment stay outside."""
+        return self.belongs_to not in ("sensor", "environment")
+
+    @property
     def fitted(self) -> tuple[str, ...]:
         """Names of the parameters that records can tell."""
         return tuple(p.name for p in self.parameters if p.fitted)

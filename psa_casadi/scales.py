@@ -27,6 +27,11 @@ def stroke_scale(p: Values) -> float:
     return force_scale(p) / stiffness_scale(p)
 
 
+def reading_scale(p: Values) -> float:
+    """An ordinary error of a reading, a thousandth of the stroke [m]."""
+    return 1e-3 * stroke_scale(p)
+
+
 def velocity_scale(p: Values) -> float:
     """Stroke times the lowest natural angular frequency [m/s]."""
     if "k_B" in p:

@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.diagnosis.alternatives import in_plant
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
@@ -74,7 +73,7 @@ def test_the_command_writes_the_other_model_beside_the_extended_one(tmp_path: Pa
 
 
 def test_sensor_and_environment_stay_out_of_a_plant() -> None:
-    assert not in_plant(EFFECTS["sensor_nonlinearity"])
-    assert not in_plant(EFFECTS["mains_hum"])
-    assert in_plant(EFFECTS["load_stiffness"])
-    assert in_plant(EFFECTS["drive_lag"])
+    assert not EFFECTS["sensor_nonlinearity"].in_plant
+    assert not EFFECTS["mains_hum"].in_plant
+    assert EFFECTS["load_stiffness"].in_plant
+    assert EFFECTS["drive_lag"].in_plant

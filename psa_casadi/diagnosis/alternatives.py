@@ -42,7 +42,7 @@ def alternatives(
         other = [
             n
             for n in told_from(step)
-            if n in effects and in_plant(effects[n]) != in_plant(step.cause)
+            if n in effects and effects[n].in_plant != step.cause.in_plant
         ]
         for name in sorted(other, key=lambda n: -step.probability.get(n, 0.0)):
             fitted = _fitted(step, name, experiments)
@@ -60,11 +60,6 @@ def alternatives(
             )
             break
     return tuple(found)
-
-
-def in_plant(effect: Component) -> bool:
-    """Whether an exported plant holds an effect."""
-    return effect.belongs_to not in ("sensor", "environment")
 
 
 def _fitted(step: Step, name: str, experiments: Sequence[Experiment]) -> Hypothesis | None:

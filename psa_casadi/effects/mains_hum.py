@@ -11,8 +11,8 @@ both phases.
 import casadi as ca
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Symbols
-from psa_casadi.scales import stroke_scale
-from psa_casadi.variables import Parameter, State, Values
+from psa_casadi.scales import reading_scale
+from psa_casadi.variables import Parameter, State
 
 _TWO_PI = 6.283185307179586
 
@@ -24,10 +24,6 @@ def _equations(s: Symbols) -> Equations:
         der={"hum_cosine": 0.0, "hum_sine": 0.0},
         add={"measured_displacement": s.hum_gain * hum},
     )
-
-
-def _scale(p: Values) -> float:
-    return 1e-3 * stroke_scale(p)
 
 
 def _part(name: str) -> State:
@@ -48,7 +44,9 @@ MAINS_HUM = Component(
         "  a' = b' = 0 with a start of each record's own"
     ),
     parameters=(
-        Parameter("hum_gain", 0.0, "m", (-1e-3, 1e-3), "size of the hum", "um", scale=_scale),
+        Parameter(
+            "hum_gain", 0.0, "m", (-1e-3, 1e-3), "size of the hum", "um", scale=reading_scale
+        ),
         Parameter("hum_frequency", 50.0, "Hz", (0.05, 1e5), "frequency of the line", log=True),
     ),
     states=(_part("cosine"), _part("sine")),

@@ -12,7 +12,7 @@ import casadi as ca
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.effects.hysteresis_memory import stop_rate
 from psa_casadi.effects.sizes import static_stiffness
-from psa_casadi.scales import stroke_scale, voltage_scale
+from psa_casadi.scales import reading_scale, stroke_scale, voltage_scale
 from psa_casadi.variables import Parameter, State, Values
 
 #: Terms of a curve and of one for each direction or over time; play and stop elements; relaxations.
@@ -106,14 +106,12 @@ def _gain_in_time(s: Symbols) -> Equations:
     return Equations(add={"displacement": _place(s, s.tip_displacement) * curve})
 
 
-def _size(p: Values) -> float:
-    return 1e-3 * stroke_scale(p)
-
-
 def _parameters(count: int, unit: str = "") -> tuple[Parameter, ...]:
     gain = Parameter(GAIN, 0.0, "1", (0.0, 1.0), "1 with the correction, 0 without", fitted=False)
     weights = [
-        Parameter(weight(k + 1), 0.0, "m", (-1.0, 1.0), f"weight of term {k + 1}", scale=_size)
+        Parameter(
+            weight(k + 1), 0.0, "m", (-1.0, 1.0), f"weight of term {k + 1}", scale=reading_scale
+        )
         for k in range(count)
     ]
     if not unit:

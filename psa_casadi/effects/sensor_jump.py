@@ -8,7 +8,7 @@ import casadi as ca
 
 from psa_casadi.component import DISPLACEMENT_STEPS, Component, Equations, Expression, Symbols
 from psa_casadi.effects.sizes import stroke
-from psa_casadi.scales import stroke_scale
+from psa_casadi.scales import reading_scale, stroke_scale
 from psa_casadi.variables import Parameter, Values
 
 
@@ -20,10 +20,6 @@ def _equations(s: Symbols) -> Equations:
 
     jump = 0.5 * s.jump_gain * (side(s.displacement) - side(ca.SX(0)))
     return Equations(add={"measured_displacement": jump})
-
-
-def _scale(p: Values) -> float:
-    return 1e-3 * stroke_scale(p)
 
 
 def _place_scale(p: Values) -> float:
@@ -44,15 +40,15 @@ SENSOR_JUMP = Component(
         "  w = jump_width x_s,  x_s = k_L u_rated / k_s,  k_s = k_P k_B/(k_P + k_B) or k"
     ),
     parameters=(
-        Parameter("jump_gain", 0.0, "m", (-1e-3, 1e-3), "size of the jump", "um", scale=_scale),
+        Parameter(
+            "jump_gain", 0.0, "m", (-1e-3, 1e-3), "size of the jump", "um", scale=reading_scale
+        ),
         Parameter(
             "jump_place", 5e-6, "m", (-1e-2, 1e-2), "displacement of it", "um", scale=_place_scale
         ),
-        Parameter(
-            "jump_width", 0.01, "1", (1e-6, 0.05), "half its rise over the stroke", log=True
-        ),
+        Parameter("jump_width", 0.01, "1", (1e-6, 0.05), "half its rise over the stroke", log=True),
     ),
     equations=_equations,
     probe={"jump_place": DISPLACEMENT_STEPS, "jump_width": (0.003, 0.03)},
     looks_like="the residual jumps at one displacement, the same on both branches",
-)  # fmt: skip
+)

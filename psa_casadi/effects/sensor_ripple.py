@@ -9,8 +9,8 @@ from math import pi
 import casadi as ca
 
 from psa_casadi.component import DISPLACEMENT_PEAKS, Component, Equations, Expression, Symbols
-from psa_casadi.scales import stroke_scale
-from psa_casadi.variables import Parameter, Values
+from psa_casadi.scales import reading_scale
+from psa_casadi.variables import Parameter
 
 
 def _wave(s: Symbols, angle: Expression) -> Expression:
@@ -21,10 +21,6 @@ def _wave(s: Symbols, angle: Expression) -> Expression:
 def _equations(s: Symbols) -> Equations:
     wave = _wave(s, 2 * pi * s.displacement / s.ripple_period)
     return Equations(add={"measured_displacement": s.ripple_gain * (wave - _wave(s, ca.SX(0)))})
-
-
-def _scale(p: Values) -> float:
-    return 1e-3 * stroke_scale(p)
 
 
 def _second(name: str) -> Parameter:
@@ -52,7 +48,9 @@ SENSOR_RIPPLE = Component(
         " + second_cosine cos(2 a) + second_sine sin(2 a)"
     ),
     parameters=(
-        Parameter("ripple_gain", 0.0, "m", (-1e-3, 1e-3), "size of the ripple", "um", scale=_scale),
+        Parameter(
+            "ripple_gain", 0.0, "m", (-1e-3, 1e-3), "size of the ripple", "um", scale=reading_scale
+        ),
         Parameter(
             "ripple_period", 2e-6, "m", (1e-9, 1e-2), "displacement of one period", "um", log=True
         ),

@@ -146,9 +146,7 @@ class Model:
 
     def plant(self) -> "Model":
         """Return the model without sensor and environment: what an exported plant contains."""
-        return self.without(
-            c.name for c in self.components if c.belongs_to in ("sensor", "environment")
-        )
+        return self.without(c.name for c in self.components if not c.in_plant)
 
 
 def _starting(of: Structure | Component) -> tuple[State | Input, ...]:

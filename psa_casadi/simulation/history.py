@@ -56,8 +56,7 @@ def memory_after(
     played = simulate(model, np.append(0.0, np.cumsum(steps)), np.concatenate([[0.0], *parts]))
     ended = {n: float(played.states[n][-1]) for n in names}
     stays = {s.name: ended[s.name] for s in model.structure.states if s.memory and not s.settles}
-    inputs = [at if i.name == "voltage" else i.start for i in model.structure.inputs]
-    settled = start_state(model, inputs, memory=stays).x
+    settled = start_state(model, _held(model, at), memory=stays).x
     for state, value in zip(model.structure.states, settled, strict=True):
         if state.memory and state.settles:
             ended[state.name] -= float(value)
@@ -83,7 +82,11 @@ def settled_at(
             f"The model has no input 'voltage' to be held at; it has {model.input_names}."
         )
     memory = memory_after(model, history, at=voltage, sweep=sweep, rest=rest)
-    inputs = [voltage if i.name == "voltage" else i.start for i in model.structure.inputs]
-    x = start_state(model, inputs, memory=memory).x
+    x = start_state(model, _held(model, voltage), memory=memory).x
     starts = dict(zip(model.state_names, x.tolist(), strict=True))
     return model.with_starts({**starts, "voltage": voltage})
+
+
+def _held(model: Model, voltage: float) -> list[float]:
+    """Return the inputs of a model at a voltage [V], the others at their start values."""
+    return [voltage if i.name == "voltage" else i.start for i in model.structure.inputs]
