@@ -43,14 +43,26 @@ static void try_step(psa_state *state, const psa_level *level, long sample, real
     }
 }
 
+/* The matrices' derivatives by the parameters, of one of the levels */
+#if PSA_LANES == 1
+static column *slopes_of(const psa_state *state, int at) {
+    const int blocks = (state->thetas + COLUMNS - 1) / COLUMNS;
+    return state->slopes + (size_t)at * (size_t)(blocks * state->slopes_size);
+}
+#endif
+
 static const psa_level *level_of(psa_state *state, int step, int level) {
-    const psa_exact *const run = state->run;
-    const int each = 1 + state->thetas, at = step * (run->finest + 1) + level;
-    psa_level *const found = state->levels + (size_t)at * (size_t)each;
+    const int at = step * (state->run->finest + 1) + level;
+    psa_level *const found = state->levels + at;
     if (!state->ready[at]) {
         for (int lane = 0; lane < PSA_LANES; ++lane)
-            for (int t = 0; t < each; ++t)
-                fill_level(state->ladders + step * PSA_LANES + lane, level, t, state->scale[lane], lane, found + t);
+            fill_level(state->ladders + step * PSA_LANES + lane, level, 0, state->scale[lane], lane, found);
+#if PSA_LANES == 1
+        for (int m = 0; m < state->thetas; ++m) {
+            fill_level(state->ladders + step, level, m + 1, state->scale[0], 0, state->mixed);
+            pack_slopes(state, state->mixed, m % COLUMNS, slopes_of(state, at) + (m / COLUMNS) * state->slopes_size);
+        }
+#endif
         state->ready[at] = 1;
     }
     return found;
@@ -65,9 +77,9 @@ static void start_ports(psa_state *state, const double *input) {
         ex_port_slopes(j, state->t, state->x, v, REAL(0.0), state->k, out);
         state->port[j] = out[0];
 #if PSA_LANES == 1
-        const int nb = state->blocks;
-        if (nb > 0)
-            chain(state, state->port_list[j], out + 1, state->s, NULL, ROW(state->sport, j));
+        for (int b = 0; b < state->blocks; ++b)
+            ex_port_chain(j, out + 1, state->s + b * EX_NX, NONE, state->unit + b * EX_NP,
+                          state->sport + b * (EX_NPORT + 1) + j);
 #endif
     }
 }
@@ -97,11 +109,15 @@ static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
         return 0;
     }
 #if PSA_LANES == 1
-    column *const dy = state->scratch;
+    double dy[MOST_UNKNOWNS + COLUMNS];
     ex_shown_slopes(state->t, state->x, v, 0.0, state->k, out);
-    chain(state, state->shown_list, out + 1, state->s, NULL, dy);
+    for (int b = 0; b < state->blocks; ++b) {
+        column own;
+        ex_shown_chain(0, out + 1, state->s + b * EX_NX, NONE, state->unit + b * EX_NP, &own);
+        memcpy(dy + b * COLUMNS, &own, sizeof own);
+    }
     run->shown[sample] = out[0];
-    memcpy(run->dy + sample * run->count, dy, sizeof(double) * (size_t)run->count);
+    for (int c = 0; c < run->count; ++c) run->dy[sample * run->count + c] = dy[state->place[c]];
     return !isfinite(out[0]);
 #else
     return 0;
@@ -177,7 +193,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
         }
         if (!any(accepted)) continue;
 #if PSA_LANES == 1
-        if (run->count > 0) step_columns(state);
+        if (run->count > 0) step_columns(state, slopes_of(state, step * (finest + 1) + level[0]));
 #endif
         for (int i = 0; i < EX_NX; ++i) state->x[i] = choose(accepted, trial->x[WHOLE][i], state->x[i]);
         for (int j = 0; j < EX_NPORT; ++j)
@@ -187,27 +203,56 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
     return 0;
 }
 
-/* The entries of one row that count here */
-APART static void activate(const psa_state *state, const psa_entry *entries, int count, int row, psa_active *list) {
-    for (int e = 0; e < count; ++e) {
-        if (entries[e].row != row) continue;
-        const int asked = entries[e].kind == 2 ? state->column_of[entries[e].index] : entries[e].index;
-        if (asked < 0) continue;
-        *list++ = (psa_active){entries[e].kind, (short)asked, (short)e};
+#if PSA_LANES == 1
+/* Columns for the unknowns: parameters of the linear part first; 0, or 2 where memory is out */
+APART static int set_up_columns(psa_state *state, int *theta) {
+    psa_exact *const run = state->run;
+    if (run->count > MOST_UNKNOWNS) return 2;
+    int found = 0;
+    for (int m = 0; m < EX_NTHETA; ++m)
+        for (int c = 0; c < run->count; ++c)
+            if (run->which[c] == ex_theta[m]) {
+                theta[found] = m;
+                state->place[c] = found++;
+            }
+    state->thetas = found;
+    for (int c = 0; c < run->count; ++c) {
+        int linear = 0;
+        for (int m = 0; m < EX_NTHETA; ++m) linear |= run->which[c] == ex_theta[m];
+        if (!linear) state->place[c] = found++;
     }
-    list->kind = -1;
-}
-
-APART static void activate_all(psa_state *state) {
-    for (int g = 0; g < EX_NG; ++g) {
-        activate(state, ex_rate_entries[g], ex_rate_count[g], 0, state->rate_list[g]);
-        for (int i = 0; i < ex_group_size[g]; ++i)
-            activate(state, ex_group_entries[g], ex_group_count[g], i, state->group_list[ex_group_first[g] + i]);
+    int zero[EX_NU + 1];
+    for (int q = 0; q < EX_NU; ++q) {
+        zero[q] = 1;
+        for (long n = 0; n < run->samples && zero[q]; ++n) zero[q] = run->v[n * EX_NU + q] == 0.0;
     }
-    for (int j = 0; j < EX_NPORT; ++j)
-        activate(state, ex_port_entries[j], ex_port_count[j], 0, state->port_list[j]);
-    activate(state, ex_shown_entries, EX_SHOWN_OUT - 1, 0, state->shown_list);
+    for (int k = 0; k < TAIL; ++k) {
+        /* inputs stand first, then the constant; a chord has the constant first, inputs behind its driver's part */
+        const int each = 1 + EX_NDRIVE + 2 * EX_NU + 3 * EX_NFEED, beside = 2 * EX_NU + 1 + 3 * EX_NPORT;
+        const int at = k < beside ? k : (k - beside) % each - 1 - EX_NDRIVE;
+        const int constant = k < beside ? k == 2 * EX_NU : at == -1 - EX_NDRIVE;
+        const int none = constant ? !EX_CONSTANT : at >= 0 && at < 2 * EX_NU && zero[at % SOME(EX_NU)];
+        if (!none || (k + 1 == TAIL && state->tails == 0)) state->tail[state->tails++] = k;
+    }
+    for (int r = 0; r < NL + EX_NEED; ++r)
+        state->slopes_size += ex_reads[r < NL ? r : ex_need[r - NL]] + state->tails;
+    const size_t nb = (size_t)(state->blocks = (run->count + COLUMNS - 1) / COLUMNS);
+    const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
+    const size_t own = levels * (size_t)((state->thetas + COLUMNS - 1) / COLUMNS * state->slopes_size);
+    column *const memory = calloc(nb * (EX_NX + EX_NPORT + 1 + EX_NP) + own, sizeof(column));
+    if (!memory) return 2;
+    state->s = memory;
+    state->sport = state->s + nb * EX_NX;
+    state->unit = state->sport + nb * (EX_NPORT + 1);
+    state->slopes = state->unit + nb * EX_NP;
+    for (int c = 0; c < run->count; ++c) {
+        const int b = state->place[c] / COLUMNS, lane = state->place[c] % COLUMNS;
+        for (int i = 0; i < EX_NX; ++i) ((double *)(state->s + b * EX_NX + i))[lane] = run->s0[i * run->count + c];
+        if (run->which[c] >= 0) ((double *)(state->unit + b * EX_NP + run->which[c]))[lane] = 1.0;
+    }
+    return 0;
 }
+#endif
 
 APART static int set_up(psa_state *state) {
     psa_exact *const run = state->run;
@@ -225,26 +270,19 @@ APART static int set_up(psa_state *state) {
     state->tolerance = run->tolerance + REAL(0.0);
     state->brief = v_sqrt(state->tolerance);
     psa_prepare(state->p, state->k);
-    for (int i = 0; i < EX_NP; ++i) state->column_of[i] = -1;
-    for (int c = 0; c < run->count; ++c)
-        if (run->which[c] >= 0) state->column_of[run->which[c]] = c;
-    activate_all(state);
     int theta[EX_NTHETA + 1];
-    state->thetas = 0;
-    for (int m = 0; m < EX_NTHETA; ++m)
-        if (state->column_of[ex_theta[m]] >= 0) {
-            theta[state->thetas] = m;
-            state->theta_column[state->thetas++] = state->column_of[ex_theta[m]];
-        }
+#if PSA_LANES == 1
+    if (run->count > 0 && set_up_columns(state, theta)) return 2;
+#endif
     state->ladders = calloc((size_t)(run->lengths * PSA_LANES), sizeof(psa_ladder));
     const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
-    state->levels = calloc(levels * (size_t)(1 + state->thetas), sizeof(psa_level));
+    state->levels = calloc(levels, sizeof(psa_level));
     state->ready = calloc(levels, 1);
-    state->mixed = PSA_LANES > 1 ? malloc(sizeof(psa_level)) : NULL;
+    state->mixed = calloc(1, sizeof(psa_level));
     real *const plain = malloc((size_t)one * sizeof(real));
     real *const slopes = malloc((size_t)(one * (EX_NTHETA + 1)) * sizeof(real));
     double *const lin = malloc((size_t)(one * (state->thetas + 1)) * sizeof(double));
-    int status = (PSA_LANES > 1 && !state->mixed) || !state->ladders || !state->levels || !state->ready || !plain || !slopes || !lin ? 2 : 0;
+    int status = !state->mixed || !state->ladders || !state->levels || !state->ready || !plain || !slopes || !lin ? 2 : 0;
     if (status == 0) {
         psa_linear(state->p, plain);
         if (state->thetas > 0) psa_linear_slopes(state->p, slopes);
@@ -262,22 +300,6 @@ APART static int set_up(psa_state *state) {
     free(plain);
     free(slopes);
     free(lin);
-#if PSA_LANES == 1
-    if (run->count > 0 && status == 0) {
-        const int nb = state->blocks = (run->count + COLUMNS - 1) / COLUMNS;
-        const size_t rows = EX_NX + EX_NPORT + NODES * (EX_NX + EX_NPORT + 1) + NL + EX_NEED + 9 * EX_NX + 3;
-        column *const memory = calloc(rows * (size_t)nb, sizeof(column));
-        if (!memory) return 2;
-        state->s = memory;
-        state->sport = ROW(state->s, EX_NX);
-        state->node = ROW(state->sport, EX_NPORT);
-        state->snode_port = ROW(state->node, NODES * EX_NX);
-        state->direct = ROW(state->snode_port, NODES * (EX_NPORT + 1));
-        state->scratch = ROW(state->direct, NL + EX_NEED);
-        for (int i = 0; i < EX_NX; ++i)
-            memcpy(ROW(state->s, i), run->s0 + i * run->count, sizeof(double) * (size_t)run->count);
-    }
-#endif
     return status;
 }
 

@@ -1,4 +1,4 @@
-/* Exact steps: the derivatives of an accepted step's own equations (exact.c). */
+/* Exact steps: the derivatives of an accepted step's own equations (exact.c), four columns at a time. */
 #ifndef PSA_EXACT_COLUMNS_H
 #define PSA_EXACT_COLUMNS_H
 
@@ -7,326 +7,308 @@
 #include "exact_ports.h"
 
 #if PSA_LANES == 1
-#define ROW(array, i) ((array) + (size_t)(i) * (size_t)nb)
+static const column NONE = {0.0};
 
-static void fill(column *x, int nb) { memset(x, 0, sizeof(column) * (size_t)nb); }
-static void copy(const column *from, column *to, int nb) { memcpy(to, from, sizeof(column) * (size_t)nb); }
-static inline void axpy(double a, const column *x, column *y, int nb) {
-    for (int b = 0; b < nb; ++b) y[b] += a * x[b];
-}
-static inline void add_to(column *x, int at, double value) { ((double *)x)[at] += value; }
+/* One block of columns: at the start of the step (states, ports), at its half and its end */
+typedef struct {
+    const column *s, *sport, *unit;       /* [EX_NX], [EX_NPORT], [EX_NP]: of the parameters themselves */
+    column x[2][EX_NX], port[2][EX_NPORT + 1];
+} psa_columns;
 
-/* The derivative of a value whose partial derivatives stand in `partial`; `x` are the states' columns, `rate`
-   those of the driver's rate */
-static inline void chain(const psa_state *state, const psa_active *list, const real *partial, const column *x,
-                         const column *rate, column *out) {
-    const int nb = state->blocks;
-    fill(out, nb);
-    for (; list->kind >= 0; ++list) {
-        const double a = partial[list->entry];
-        if (list->kind == 2) add_to(out, list->index, a);
-        else axpy(a, list->kind == 0 ? ROW(x, list->index) : rate, out, nb);
-    }
-}
-
-/* What the matrices' own derivatives add to the columns of L at the nodes: F's, the input's, the ports' weights'
-   and the chords', each in the column of its parameter */
-static void matrix_columns(psa_state *state) {
+/* What the matrices' own derivatives are multiplied with: L apart, here the input, the constant, the ports' values,
+   and the chords' slopes times what they respond to */
+static void tail_of(const psa_state *state, double *tail) {
     const psa_trial *const trial = &state->trial;
-    const int nb = state->blocks;
-    for (int m = 0; m < state->thetas; ++m) {
-        const psa_level *const d = trial->level + m + 1;
-        double sum[ROWS] = {0.0};
-        respond(&d->whole, trial->l, trial->v0, trial->dv, sum);
-        for (int j = 0; j < EX_NPORT; ++j) {
-            const double n0 = state->port[j], n1 = trial->port[HALF][j], n2 = trial->port[WHOLE][j];
-            for (int i = 0; i < ROWS; ++i)
-                sum[i] += d->whole.w[j][0][i] * n0 + d->whole.w[j][1][i] * n1 + d->whole.w[j][2][i] * n2;
+    double every[TAIL], *z = every;
+    for (int q = 0; q < EX_NU; ++q) *z++ = trial->v0[q];
+    for (int q = 0; q < EX_NU; ++q) *z++ = trial->dv[q];
+    *z++ = 1.0;
+    for (int j = 0; j < EX_NPORT; ++j) {
+        *z++ = state->port[j];
+        *z++ = trial->port[HALF][j];
+        *z++ = trial->port[WHOLE][j];
+    }
+    for (int c = 0; c < EX_NCH; ++c) {
+        const double sigma = trial->chord[c];
+        *z++ = sigma;
+        for (int k = 0; k < EX_NDRIVE; ++k) *z++ = sigma * trial->l[k];
+        for (int q = 0; q < EX_NU; ++q) *z++ = sigma * trial->v0[q];
+        for (int q = 0; q < EX_NU; ++q) *z++ = sigma * trial->dv[q];
+        for (int k = 0; k < EX_NFEED; ++k) {
+            const int j = ex_feed[c][k], no = j < 0;
+            *z++ = no ? 0.0 : sigma * state->port[j];
+            *z++ = no ? 0.0 : sigma * trial->port[HALF][j];
+            *z++ = no ? 0.0 : sigma * trial->port[WHOLE][j];
         }
+    }
+    for (int k = 0; k < state->tails; ++k) tail[k] = every[state->tail[k]];
+}
+
+/* The same of the matrices of a level: one parameter's derivatives, in that order, row by row */
+APART static void pack_slopes(const psa_state *state, const psa_level *d, int m, column *out) {
+    for (int r = 0; r < NL + EX_NEED; ++r) {
+        const int i = r < NL ? r : ex_need[r - NL];
+        const psa_row *const row = r < NL ? NULL : &d->inner[HALF - 1][r - NL];
+        double every[TAIL], *z = every;
+        for (int j = 0; j < ex_reads[i]; ++j) ((double *)out++)[m] = row ? row->f[j] : d->whole.f[j][i];
+        for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a1[q] : d->whole.a1[q][i];
+        for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a2[q] : d->whole.a2[q][i];
+        *z++ = row ? row->c : d->whole.c[i];
+        for (int j = 0; j < EX_NPORT; ++j)
+            for (int q = 0; q < 3; ++q) *z++ = row ? row->w[j][q] : d->whole.w[j][q][i];
         for (int c = 0; c < EX_NCH; ++c) {
-            double beyond[ROWS];
-            if (trial->chord[c] == 0.0) continue;
-            respond_beyond(state, trial, d, c, beyond);
-            for (int i = 0; i < ROWS; ++i) sum[i] += trial->chord[c] * beyond[i];
+            *z++ = row ? 0.0 : d->chord_c[c][i];
+            for (int k = 0; k < EX_NDRIVE; ++k) *z++ = row ? 0.0 : d->chord_f[c][k][i];
+            for (int q = 0; q < EX_NU; ++q) *z++ = row ? 0.0 : d->chord_a1[c][q][i];
+            for (int q = 0; q < EX_NU; ++q) *z++ = row ? 0.0 : d->chord_a2[c][q][i];
+            for (int k = 0; k < EX_NFEED; ++k)
+                for (int q = 0; q < 3; ++q) *z++ = row ? 0.0 : d->chord_w[c][k][q][i];
         }
-        for (int i = 0; i < NL; ++i) ((double *)ROW(state->direct, i))[state->theta_column[m]] = sum[i];
-        for (int r = 0; r < EX_NEED; ++r) {
-            const psa_row *const row = &d->inner[HALF - 1][r];
-            double inside = respond_inside(row, NL, trial->l, trial->v0, trial->dv);
-            for (int j = 0; j < EX_NPORT; ++j)
-                inside += row->w[j][0] * state->port[j] + row->w[j][1] * trial->port[HALF][j] +
-                          row->w[j][2] * trial->port[WHOLE][j];
-            ((double *)ROW(state->direct, NL + r))[state->theta_column[m]] = inside;
-        }
+        for (int k = 0; k < state->tails; ++k) ((double *)out++)[m] = every[state->tail[k]];
     }
 }
 
-/* Columns of L at a node without ports */
-static void linear_columns(psa_state *state, int n) {
-    const psa_level *const level = state->trial.level;
-    const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
-    column *const x = ROW(state->node, n * EX_NX);
-    for (int r = 0; r < rows; ++r) {
-        const int i = n == WHOLE ? r : ex_need[r];
-        column *const out = ROW(x, ex_linear[i]);
-        const column *const own = ROW(state->s, ex_linear[i]);
-        const column *const direct = ROW(state->direct, n == WHOLE ? i : NL + r);
-        for (int b = 0; b < nb; ++b) {
-            column sum = own[b] + direct[b];
-            for (int j = 0; j < ex_reads[i]; ++j)
-                sum += (n == WHOLE ? level->whole.f[j][i] : level->inner[n - 1][r].f[j]) *
-                       ROW(state->s, ex_linear[j])[b];
-            out[b] = sum;
-        }
-    }
-}
-
-static void add_port_columns(psa_state *state, int n, int j) {
-    const psa_level *const level = state->trial.level;
-    const int nb = state->blocks, rows = n == WHOLE ? NL : EX_NEED;
-    const column *const n0 = ROW(state->sport, j), *const n1 = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
-    const column *const n2 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
-    for (int r = 0; r < rows; ++r) {
-        const int i = n == WHOLE ? r : ex_need[r];
-        if (i < ex_port_reaches[j]) continue;
-        column *const out = ROW(ROW(state->node, n * EX_NX), ex_linear[i]);
-        double w[3];
-        for (int q = 0; q < 3; ++q) w[q] = n == WHOLE ? level->whole.w[j][q][i] : level->inner[n - 1][r].w[j][q];
-        for (int b = 0; b < nb; ++b) out[b] += w[0] * n0[b] + w[1] * n1[b] + w[2] * n2[b];
-    }
-}
-
-static void port_columns(psa_state *state, int n, int j) {
-    const int nb = state->blocks;
-    column *const out = ROW(state->snode_port, n * (EX_NPORT + 1) + j);
-    chain(state, state->port_list[j], state->trial.slopes[n][j] + 1, ROW(state->node, n * EX_NX), NULL, out);
-}
-
-static void do_port_columns(psa_state *state, int j) {
+/* Columns of L at the end and the half, without ports; `slopes` are the matrices' own, NULL where this block has
+   none */
+static void linear_columns(const psa_state *state, psa_columns *to, const column *slopes, const double *tail) {
     const psa_trial *const trial = &state->trial;
-    const int nb = state->blocks, c = ex_port_chord[j];
-    port_columns(state, HALF, j);
-    port_columns(state, WHOLE, j);
-    add_port_columns(state, HALF, j);
+    for (int r = 0; r < NL + EX_NEED; ++r) {
+        const int i = r < NL ? r : ex_need[r - NL], reads = ex_reads[i];
+        const real *const f = r < NL ? &trial->level->whole.f[0][i] : trial->level->inner[HALF - 1][r - NL].f;
+        const int stride = r < NL ? ROWS : 1;
+        column sum = to->s[ex_linear[i]];
+        for (int j = 0; j < reads; ++j) sum += f[j * stride] * to->s[ex_linear[j]];
+        if (slopes) {
+            column own = tail[0] * slopes[reads];
+            for (int j = 0; j < reads; ++j) own += trial->l[j] * slopes[j];
+            for (int k = 1; k < state->tails; ++k) own += tail[k] * slopes[reads + k];
+            sum += own;
+            slopes += reads + state->tails;
+        }
+        to->x[r < NL ? WHOLE : HALF][ex_linear[i]] = sum;
+    }
+}
+
+static void add_port_columns(const psa_state *state, psa_columns *to, int n, int j) {
+    const psa_level *const level = state->trial.level;
+    const column n0 = to->sport[j], n1 = to->port[HALF][j], n2 = to->port[WHOLE][j];
+    if (n == WHOLE) {
+        const real (*const w)[ROWS] = level->whole.w[j];
+        for (int i = ex_port_reaches[j]; i < NL; ++i)
+            to->x[n][ex_linear[i]] += w[0][i] * n0 + w[1][i] * n1 + w[2][i] * n2;
+        return;
+    }
+    for (int r = 0; r < EX_NEED; ++r) {
+        const real *const w = level->inner[n - 1][r].w[j];
+        if (ex_need[r] >= ex_port_reaches[j])
+            to->x[n][ex_linear[ex_need[r]]] += w[0] * n0 + w[1] * n1 + w[2] * n2;
+    }
+}
+
+static void port_columns(const psa_state *state, psa_columns *to, int n, int j) {
+    ex_port_chain(j, state->trial.slopes[n][j] + 1, to->x[n], NONE, to->unit, &to->port[n][j]);
+}
+
+static void do_port_columns(const psa_state *state, psa_columns *to, int j) {
+    const psa_trial *const trial = &state->trial;
+    const int c = ex_port_chord[j];
+    port_columns(state, to, HALF, j);
+    port_columns(state, to, WHOLE, j);
+    add_port_columns(state, to, HALF, j);
     if (c >= 0 && trial->chord[c] != 0.0) {
         const int u = ex_linear[ex_chord_driver[c]];
         const psa_chord *const chord = trial->chords + c;
         const double sigma = trial->chord[c], weight = BENDS * BENDS;
-        const column *const half = ROW(state->node, HALF * EX_NX + u);
-        const column *const nh = ROW(state->snode_port, HALF * (EX_NPORT + 1) + j);
-        column *const x = ROW(state->node, WHOLE * EX_NX), *const dsigma = state->scratch;
-        const column *const n0 = ROW(state->sport, j);
-        const column *const n1 = ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j);
-        for (int b = 0; b < nb; ++b) {
-            const column u0 = ROW(state->s, u)[b], u1 = ROW(x, u)[b];
-            const column dway = u1 - u0, dbend = half[b] - 0.5 * (u0 + u1);
-            const column dchange = n1[b] - n0[b], dbent = nh[b] - 0.5 * (n0[b] + n1[b]);
-            dsigma[b] = (weight * (chord->way * dchange + chord->change * dway) + chord->bend * dbent +
-                         chord->bent * dbend -
-                         2.0 * sigma * (weight * chord->way * dway + chord->bend * dbend)) / chord->over;
-        }
-        add_port_columns(state, WHOLE, j);
+        const column u0 = to->s[u], u1 = to->x[WHOLE][u], dway = u1 - u0;
+        const column dbend = to->x[HALF][u] - 0.5 * (u0 + u1);
+        const column n0 = to->sport[j], n1 = to->port[WHOLE][j], dchange = n1 - n0;
+        const column dbent = to->port[HALF][j] - 0.5 * (n0 + n1);
+        const column dsigma = (weight * (chord->way * dchange + chord->change * dway) + chord->bend * dbent +
+                               chord->bent * dbend -
+                               2.0 * sigma * (weight * chord->way * dway + chord->bend * dbend)) / chord->over;
+        column moved[SOME(EX_NDRIVE)];
+        for (int q = 0; q < ex_reads[ex_chord_driver[c]]; ++q) moved[q] = sigma * to->s[ex_linear[q]];
+        add_port_columns(state, to, WHOLE, j);
         for (int i = 0; i < NL; ++i) {
-            column *const out = ROW(x, ex_linear[i]);
-            const double beyond = trial->beyond[c][i];
-            for (int b = 0; b < nb; ++b) {
-                column sum = beyond * dsigma[b];
-                for (int q = 0; q < ex_reads[ex_chord_driver[c]]; ++q)
-                    sum += sigma * trial->level->chord_f[c][q][i] * ROW(state->s, ex_linear[q])[b];
-                for (int q = 0; q < EX_NFEED && ex_feed[c][q] >= 0; ++q) {
-                    const real(*const w)[ROWS] = trial->level->chord_w[c][q];
-                    const int f = ex_feed[c][q];
-                    sum += sigma * (w[0][i] * ROW(state->sport, f)[b] +
-                                    w[1][i] * ROW(state->snode_port, HALF * (EX_NPORT + 1) + f)[b] +
-                                    w[2][i] * ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + f)[b]);
-                }
-                out[b] += sum;
+            column sum = trial->beyond[c][i] * dsigma;
+            for (int q = 0; q < ex_reads[ex_chord_driver[c]]; ++q) sum += trial->level->chord_f[c][q][i] * moved[q];
+            for (int q = 0; q < EX_NFEED && ex_feed[c][q] >= 0; ++q) {
+                const real(*const w)[ROWS] = trial->level->chord_w[c][q];
+                const int f = ex_feed[c][q];
+                sum += sigma * (w[0][i] * to->sport[f] + w[1][i] * to->port[HALF][f] + w[2][i] * to->port[WHOLE][f]);
             }
+            to->x[WHOLE][ex_linear[i]] += sum;
         }
-    } else add_port_columns(state, WHOLE, j);
+    } else add_port_columns(state, to, WHOLE, j);
 }
 
 /* Columns of the driver at its turn: at a zero of its rate, those at a fixed time */
-static void turn_columns(psa_state *state, int g, column *out, column *rate) {
+static column turn_column(const psa_state *state, const psa_columns *to, int g) {
     static const int AT[3] = {NODES, HALF, WHOLE};
     const psa_trial *const trial = &state->trial;
     const psa_stages *const stages = trial->stages + g;
-    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
-    fill(out, nb);
+    const int u = ex_linear[ex_group_driver[g]];
+    column sum = NONE, rate;
     for (int k = 0; k < 3; ++k) {
-        const column *const x = AT[k] == NODES ? state->s : ROW(state->node, AT[k] * EX_NX);
-        chain(state, state->rate_list[g], stages->rate_slopes[AT[k]] + 1, x, NULL, rate);
-        axpy(stages->basis[2 * k], ROW(x, u), out, nb);
-        axpy(stages->basis[2 * k + 1] * trial->dt, rate, out, nb);
+        const column *const x = AT[k] == NODES ? to->s : to->x[AT[k]];
+        ex_rate_chain(g, stages->rate_slopes[AT[k]] + 1, x, NONE, to->unit, &rate);
+        sum += stages->basis[2 * k] * x[u] + stages->basis[2 * k + 1] * trial->dt * rate;
     }
+    return sum;
 }
 
-/* Columns along one leg: `from` and `to` are those of the path variables, `x` those of the states at its
-   start, which become those at its end; `k` holds the four slopes' */
-static void leg_columns(psa_state *state, int g, const psa_leg *leg, const column *from, const column *to,
-                        column *start, column *x, column *k, column *drift) {
+/* Columns of a group's states on one leg: at its begin and end, slopes at its begin and end, drift */
+typedef struct {
+    column begin[EX_NX], end[EX_NX], first[EX_NX], last[EX_NX], drift[EX_NX];
+} psa_leg_columns;
+
+/* Columns along one leg; `from` and `to` are those of the path variables. `leg->end` are those of the states at its
+   start, which become those at its end. */
+static void leg_columns(const psa_state *state, int g, const psa_leg *leg, const column *unit, const column *from,
+                        const column *to, psa_leg_columns *own) {
     static const double SHARE[4] = {0.0, 0.5, 0.5, 1.0};
-    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
+    const int u = ex_linear[ex_group_driver[g]];
     const int first = ex_group_first[g], size = ex_group_size[g];
     const double dt = leg->dt;
-    column *const rate = ROW(k, 4 * size);
-    if (dt > 0.0)
-        for (int b = 0; b < nb; ++b) rate[b] = (ROW(to, u)[b] - ROW(from, u)[b]) / dt;
-    else fill(rate, nb);
+    column x[EX_NX], k[4][EX_NX], rate = NONE;
+    if (dt > 0.0) rate = (to[u] - from[u]) * (1.0 / dt);
+    memcpy(own->begin, own->end, sizeof(column) * (size_t)size);
     for (int stage = 0; stage < leg->stages; ++stage) {
         const double share = SHARE[stage];
         for (int r = 0; r < EX_NPATH; ++r) {
             const int q = ex_path[r];
-            for (int b = 0; b < nb; ++b)
-                ROW(x, q)[b] = ROW(from, q)[b] + share * (ROW(to, q)[b] - ROW(from, q)[b]);
+            x[q] = from[q] + share * (to[q] - from[q]);
         }
         for (int i = 0; i < size; ++i) {
             const int q = ex_group_states[first + i];
-            copy(ROW(start, i), ROW(x, q), nb);
-            if (stage > 0) axpy(share * dt, ROW(k, (stage - 1) * size + i), ROW(x, q), nb);
+            x[q] = own->begin[i];
+            if (stage > 0) x[q] += share * dt * k[stage - 1][i];
         }
-        for (int i = 0; i < size; ++i) {
-            column *const out = ROW(k, stage * size + i);
-            chain(state, state->group_list[first + i], leg->out[stage] + size, x, rate, out);
-        }
+        ex_group_chain(g, leg->out[stage] + size, x, rate, unit, k[stage]);
         if (stage == 0 && state->trial.stages[g].drifts) {
-            column *const great = ROW(drift, size);
-            for (int b = 0; b < nb; ++b) great[b] = FAST * rate[b];
-            for (int i = 0; i < size; ++i) {
-                column *const out = ROW(drift, i);
-                chain(state, state->group_list[first + i], state->trial.stages[g].fast + size, x, great, out);
-                for (int b = 0; b < nb; ++b) out[b] = ROW(k, i)[b] - out[b] / FAST;
-            }
+            ex_group_chain(g, state->trial.stages[g].fast + size, x, FAST * rate, unit, own->drift);
+            for (int i = 0; i < size; ++i) own->drift[i] = k[0][i] - own->drift[i] * (1.0 / FAST);
         }
     }
     for (int i = 0; i < size; ++i) {
-        const column *const k1 = ROW(k, i), *const k2 = ROW(k, size + i), *const k3 = ROW(k, 2 * size + i);
-        column *const k4 = ROW(k, 3 * size + i), *const x1 = ROW(start, i);
-        if (leg->stages == 4)
-            for (int b = 0; b < nb; ++b) x1[b] += dt / 6.0 * (k1[b] + 2.0 * (k2[b] + k3[b]) + k4[b]);
-        else
-            for (int b = 0; b < nb; ++b) {
-                x1[b] += dt * k2[b];
-                k4[b] = 2.0 * k2[b] - k1[b]; /* the slope at the end */
-            }
+        own->first[i] = k[0][i];
+        if (leg->stages == 4) {
+            own->end[i] += dt / 6.0 * (k[0][i] + 2.0 * (k[1][i] + k[2][i]) + k[3][i]);
+            own->last[i] = k[3][i];
+        } else {
+            own->end[i] += dt * k[1][i];
+            own->last[i] = 2.0 * k[1][i] - k[0][i];
+        }
     }
 }
 
 /* Columns of a group's states at the half of the step, if that lies on this leg */
-static void half_columns(psa_state *state, int g, const psa_leg *leg, const column *from, const column *to,
-                         const column *begin, const column *end, const column *k, const column *drift) {
+static void half_columns(const psa_state *state, psa_columns *at, int g, const psa_leg *leg, const column *from,
+                         const column *to, const psa_leg_columns *own) {
     const psa_trial *const trial = &state->trial;
-    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
+    const int u = ex_linear[ex_group_driver[g]];
     const int first = ex_group_first[g], size = ex_group_size[g];
     const double s = trial->stages[g].share[HALF], dt = leg->dt;
     const int inside = s > 0.0 && s < 1.0 && fabs(leg->way) > STILL * state->nominal[u];
     const int drifts = trial->stages[g].drifts;
-    column *const half = ROW(state->node, HALF * EX_NX);
+    const column moved = at->x[HALF][u] - from[u] - s * (to[u] - from[u]);
     real basis[4];
     hermite(s, basis);
     for (int i = 0; i < size; ++i) {
         const int q = ex_group_states[first + i];
         const double change = leg->to[q] - leg->from[q], a = dt * leg->out[0][i], e = dt * leg->last[i];
         const double by_share = 6.0 * s * (1.0 - s) * change + (1.0 - s) * (1.0 - 3.0 * s) * a + s * (3.0 * s - 2.0) * e;
-        const column *const k1 = ROW(k, i), *const k4 = ROW(k, 3 * size + i);
-        for (int b = 0; b < nb; ++b) {
-            column sum = basis[0] * ROW(begin, i)[b] + basis[1] * dt * k1[b] + basis[2] * ROW(end, i)[b] +
-                         basis[3] * dt * k4[b];
-            const double slope = by_share - (drifts ? trial->dt * trial->stages[g].drift[i] : 0.0);
-            if (inside)
-                sum += slope / leg->way *
-                       (ROW(half, u)[b] - ROW(from, u)[b] - s * (ROW(to, u)[b] - ROW(from, u)[b]));
-            if (drifts) sum += (0.5 - s) * trial->dt * ROW(drift, i)[b];
-            ROW(half, q)[b] = sum;
-        }
+        const double slope = by_share - (drifts ? trial->dt * trial->stages[g].drift[i] : 0.0);
+        column sum = basis[0] * own->begin[i] + basis[1] * dt * own->first[i] + basis[2] * own->end[i] +
+                     basis[3] * dt * own->last[i];
+        if (inside) sum += slope / leg->way * moved;
+        if (drifts) sum += (0.5 - s) * trial->dt * own->drift[i];
+        at->x[HALF][q] = sum;
     }
 }
 
-static void do_group_columns(psa_state *state, int g) {
+static void do_group_columns(const psa_state *state, psa_columns *to, int g) {
     const psa_trial *const trial = &state->trial;
     const psa_stages *const stages = trial->stages + g;
-    const int nb = state->blocks, u = ex_linear[ex_group_driver[g]];
-    const int first = ex_group_first[g], size = ex_group_size[g];
-    column *const x = state->scratch, *const k = ROW(x, EX_NX), *const turn = ROW(k, 4 * size + 1);
-    column *const begin = ROW(turn, EX_NX), *const end = ROW(begin, size), *const drift = ROW(end, size);
-    const column *from = state->s, *to = ROW(state->node, WHOLE * EX_NX);
-    for (int i = 0; i < size; ++i) copy(ROW(state->s, ex_group_states[first + i]), ROW(end, i), nb);
+    const int u = ex_linear[ex_group_driver[g]], first = ex_group_first[g], size = ex_group_size[g];
+    column turn[EX_NX];
+    psa_leg_columns own;
+    for (int i = 0; i < size; ++i) own.end[i] = to->s[ex_group_states[first + i]];
     if (stages->legs > 1) {
-        const double s = stages->turn;
         for (int r = 0; r < EX_NPATH; ++r) {
             const int q = ex_path[r];
-            for (int b = 0; b < nb; ++b)
-                ROW(turn, q)[b] = ROW(from, q)[b] + s * (ROW(to, q)[b] - ROW(from, q)[b]);
+            turn[q] = to->s[q] + stages->turn * (to->x[WHOLE][q] - to->s[q]);
         }
-        turn_columns(state, g, ROW(turn, u), k);
+        turn[u] = turn_column(state, to, g);
     }
     for (int n = 0; n < stages->legs; ++n) {
-        const column *const a = n == 0 ? from : turn, *const b = n + 1 == stages->legs ? to : turn;
-        memcpy(begin, end, sizeof(column) * (size_t)(size * nb));
-        leg_columns(state, g, stages->leg + n, a, b, end, x, k, drift);
-        if (stages->on[HALF] == n) half_columns(state, g, stages->leg + n, a, b, begin, end, k, drift);
+        const column *const a = n == 0 ? to->s : turn, *const b = n + 1 == stages->legs ? to->x[WHOLE] : turn;
+        leg_columns(state, g, stages->leg + n, to->unit, a, b, &own);
+        if (stages->on[HALF] == n) half_columns(state, to, g, stages->leg + n, a, b, &own);
     }
-    for (int i = 0; i < size; ++i)
-        copy(ROW(end, i), ROW(state->node, WHOLE * EX_NX + ex_group_states[first + i]), nb);
+    for (int i = 0; i < size; ++i) to->x[WHOLE][ex_group_states[first + i]] = own.end[i];
 }
 
 #if EX_NLOOP > 0
-static void do_loop_columns(psa_state *state, const int *ports, int count) {
+static void do_loop_columns(const psa_state *state, psa_columns *to, const int *ports, int count) {
     static const int AT[2] = {HALF, WHOLE};
     const psa_trial *const trial = &state->trial;
-    const int nb = state->blocks, size = 2 * count;
+    const int size = 2 * count;
     real a[4 * EX_NPORT * EX_NPORT];
+    column b[2 * EX_NPORT];
     /* first with the ports' values held at half and end, then what they change by */
     for (int n = 0; n < 2; ++n)
-        for (int j = 0; j < count; ++j) fill(ROW(state->snode_port, AT[n] * (EX_NPORT + 1) + ports[j]), nb);
+        for (int j = 0; j < count; ++j) to->port[AT[n]][ports[j]] = NONE;
     for (int n = 0; n < 2; ++n)
-        for (int j = 0; j < count; ++j) add_port_columns(state, AT[n], ports[j]);
+        for (int j = 0; j < count; ++j) add_port_columns(state, to, AT[n], ports[j]);
     for (int n = 0; n < 2; ++n)
-        for (int j = 0; j < count; ++j) port_columns(state, AT[n], ports[j]);
+        for (int j = 0; j < count; ++j) port_columns(state, to, AT[n], ports[j]);
     loop_matrix(trial, ports, count, a);
+    for (int k = 0; k < size; ++k) b[k] = to->port[AT[k / count]][ports[k % count]];
     for (int k = 0; k < size; ++k)
         for (int i = k + 1; i < size; ++i) {
             const double factor = a[i * size + k] / a[k * size + k];
             for (int j = k; j < size; ++j) a[i * size + j] -= factor * a[k * size + j];
-            axpy(-factor, ROW(state->snode_port, AT[k / count] * (EX_NPORT + 1) + ports[k % count]),
-                 ROW(state->snode_port, AT[i / count] * (EX_NPORT + 1) + ports[i % count]), nb);
+            b[i] -= factor * b[k];
         }
     for (int k = size - 1; k >= 0; --k) {
-        column *const b = ROW(state->snode_port, AT[k / count] * (EX_NPORT + 1) + ports[k % count]);
-        for (int j = k + 1; j < size; ++j)
-            axpy(-a[k * size + j], ROW(state->snode_port, AT[j / count] * (EX_NPORT + 1) + ports[j % count]), b,
-                 nb);
-        for (int q = 0; q < nb; ++q) b[q] /= a[k * size + k];
+        for (int j = k + 1; j < size; ++j) b[k] -= a[k * size + j] * b[j];
+        b[k] *= 1.0 / a[k * size + k];
     }
+    for (int k = 0; k < size; ++k) to->port[AT[k / count]][ports[k % count]] = b[k];
     for (int n = 0; n < 2; ++n)
         for (int r = 0; r < (AT[n] == WHOLE ? NL : EX_NEED); ++r) {
             const int i = AT[n] == WHOLE ? r : ex_need[r];
-            column *const out = ROW(ROW(state->node, AT[n] * EX_NX), ex_linear[i]);
             for (int j = 0; j < count; ++j)
-                for (int m = 0; m < 2; ++m)
-                    axpy(AT[n] == WHOLE ? trial->level->whole.w[ports[j]][m + 1][i]
-                                        : trial->level->inner[AT[n] - 1][r].w[ports[j]][m + 1],
-                         ROW(state->snode_port, AT[m] * (EX_NPORT + 1) + ports[j]), out, nb);
+                for (int m = 0; m < 2; ++m) {
+                    const real weight = AT[n] == WHOLE ? trial->level->whole.w[ports[j]][m + 1][i]
+                                                       : trial->level->inner[AT[n] - 1][r].w[ports[j]][m + 1];
+                    to->x[AT[n]][ex_linear[i]] += weight * to->port[AT[m]][ports[j]];
+                }
         }
 }
 #endif
 
-static void step_columns(psa_state *state) {
-    matrix_columns(state);
-    linear_columns(state, HALF);
-    linear_columns(state, WHOLE);
-    for (int k = 0; k < EX_NITEMS; ++k) {
-        const psa_item *const item = ex_items + k;
-        if (item->kind == EX_GROUP) do_group_columns(state, item->members[0]);
-        else if (item->kind == EX_PORT) do_port_columns(state, item->members[0]);
+/* Take all columns over the step that was accepted */
+static void step_columns(psa_state *state, const column *slopes) {
+    double tail[TAIL];
+    if (state->thetas > 0) tail_of(state, tail);
+    for (int b = 0; b < state->blocks; ++b) {
+        column *const s = state->s + b * EX_NX, *const sport = state->sport + b * (EX_NPORT + 1);
+        psa_columns to = {.s = s, .sport = sport, .unit = state->unit + b * EX_NP};
+        const int own = 4 * b < state->thetas;
+        linear_columns(state, &to, own ? slopes + (size_t)b * state->slopes_size : NULL, tail);
+        for (int k = 0; k < EX_NITEMS; ++k) {
+            const psa_item *const item = ex_items + k;
+            if (item->kind == EX_GROUP) do_group_columns(state, &to, item->members[0]);
+            else if (item->kind == EX_PORT) do_port_columns(state, &to, item->members[0]);
 #if EX_NLOOP > 0
-        else do_loop_columns(state, item->members, item->count);
+            else do_loop_columns(state, &to, item->members, item->count);
 #endif
+        }
+        memcpy(s, to.x[WHOLE], sizeof to.x[WHOLE]);
+        memcpy(sport, to.port[WHOLE], sizeof(column) * EX_NPORT);
     }
-    const int nb = state->blocks;
-    memcpy(state->s, ROW(state->node, WHOLE * EX_NX), sizeof(column) * (size_t)(EX_NX * nb));
-    for (int j = 0; j < EX_NPORT; ++j)
-        copy(ROW(state->snode_port, WHOLE * (EX_NPORT + 1) + j), ROW(state->sport, j), nb);
 }
 #endif
 

@@ -66,6 +66,7 @@ static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int 
        its root */
     const bits brief = MASK(v_fabs(leg->way) < state->brief * state->nominal[ex_linear[ex_group_driver[g]]]);
     leg->stages = any(~brief) ? 4 : 2;
+    ex_group_rate(g, leg->rate, state->k);
     for (int stage = 0; stage < leg->stages; ++stage) {
         real *const x = leg->at[stage], v[EX_NU + 1];
         const double s = SHARE[stage];
@@ -139,6 +140,12 @@ static void group_node(psa_state *state, psa_trial *trial, int g, int n, double 
     }
 }
 
+/* A group's slopes at a rate of its driver */
+static void group_at(psa_state *state, int g, real t, const real *x, const real *v, real rate, real *out) {
+    ex_group_rate(g, rate, state->k);
+    ex_group(g, t, x, v, rate, state->k, out);
+}
+
 /* A driver that slows down may come to rest, or all but so. What its states do in time and not along its way
    (what is left of r when its part in proportion to the rate is taken off) is then not that at the mean rate:
    Simpson's rule tells by how much. */
@@ -157,8 +164,8 @@ static void check_rest(psa_state *state, psa_trial *trial, int g, const real *w,
             const int q = ex_path[r];
             x[q] = at[k] ? at[k][q] : 0.5 * (state->x[q] + trial->x[WHOLE][q]);
         }
-        ex_group(g, state->t, x, v[k], FAST * most, state->k, fast);
-        ex_group(g, state->t, x, v[k], rates[k], state->k, out);
+        group_at(state, g, state->t, x, v[k], FAST * most, fast);
+        group_at(state, g, state->t, x, v[k], rates[k], out);
         for (int i = 0; i < ex_group_size[g]; ++i) {
             const real in_time = out[i] - fast[i] * (v_fabs(rates[k]) / (FAST * v_fabs(most)));
             missed[i] = WEIGHT[k] * in_time + (k ? missed[i] : REAL(0.0));
@@ -242,6 +249,7 @@ static void find_drift(psa_state *state, psa_trial *trial, int g, int slopes) {
     stages->drifts = any(uneven);
     if (!stages->drifts) return;
     const real rate = FAST * leg->rate;
+    ex_group_rate(g, rate, state->k);
     if (slopes) ex_group_slopes(g, state->t, leg->at[0], trial->v0, rate, state->k, stages->fast);
     else ex_group(g, state->t, leg->at[0], trial->v0, rate, state->k, stages->fast);
     for (int i = 0; i < ex_group_size[g]; ++i)
@@ -257,8 +265,8 @@ static void check_turn(psa_state *state, psa_trial *trial, int g, int k) {
     const bits turned = MASK(stages->turn < 1.0) & MASK(leg->rate != 0.0);
     const real mean = choose(turned, leg->rate, REAL(1.0)), t = state->t + leg->begin * trial->dt;
     real fast[EX_GROUP_OUT] = {REAL(0.0)}, out[EX_GROUP_OUT] = {REAL(0.0)};
-    ex_group(g, t, leg->at[0], trial->v[HALF], FAST * mean, state->k, fast);
-    ex_group(g, t, leg->at[0], trial->v[HALF], far, state->k, out);
+    group_at(state, g, t, leg->at[0], trial->v[HALF], FAST * mean, fast);
+    group_at(state, g, t, leg->at[0], trial->v[HALF], far, out);
     for (int i = 0; i < ex_group_size[g]; ++i) {
         const real apart = (out[i] - leg->out[0][i]) - fast[i] / FAST * (far - mean) / mean;
         const real e = leg->dt * v_fabs(apart) / state->nominal[ex_group_states[ex_group_first[g] + i]];

@@ -36,11 +36,17 @@ typedef struct {
     double v[NV][NL];
 } psa_block;
 
+/* Rows of L by blocks of one vector, the last ones 0; with lanes a row is a vector already */
 #if PSA_LANES == 1
-#define ROWS ((NL + 3) / 4 * 4) /* rows of L in whole vectors, the last ones 0 */
+typedef double block __attribute__((vector_size(32), aligned(8)));
+#define ROWS ((NL + 3) / 4 * 4)
+#define BLOCKS (ROWS / 4)
 #else
+typedef real block;
 #define ROWS NL
+#define BLOCKS NL
 #endif
+#define ROWS_OF(array, b) (((block *)(array))[b])
 
 /* What a step of one length needs. Of its whole: F, a_1, a_2, c_1, and each port's weights of its values at the
    start, the half and the end, by columns. Of its half and its quarter: the same (a_2 over the step's whole

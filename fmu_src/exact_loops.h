@@ -5,13 +5,10 @@
 #include "exact_ports.h"
 
 #if EX_NLOOP > 0
-/* Entry of a port's partial derivatives by a linear state, 0 where it has none */
+/* A port's partial derivative by a linear state, 0 where it has none */
 static real port_by_linear(const psa_trial *trial, int n, int j, int linear) {
-    real sum = REAL(0.0);
-    for (int e = 0; e < ex_port_count[j]; ++e)
-        if (ex_port_entries[j][e].kind == 0 && ex_port_entries[j][e].index == ex_linear[linear])
-            sum += trial->slopes[n][j][1 + e];
-    return sum;
+    const int at = ex_port_by_linear[j][linear];
+    return at < 0 ? REAL(0.0) : trial->slopes[n][j][at];
 }
 
 /* I - d(values)/d(values) of the ports of a loop at half and end: their own response seen by themselves */

@@ -8,6 +8,8 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "exact_tables.h"
+
 #if defined(__GNUC__)
 #define APART __attribute__((noinline)) /* runs once: compiled once; not `cold`, which slows its callers */
 #else
@@ -25,6 +27,9 @@ typedef uint64_t ubits;
 #define LANE(r, i) ((void)(i), (r))
 #define SET_LANE(r, i, value) ((void)(i), (r) = (value))
 #define REAL(c) (c)
+/* Columns of sensitivities, four at a time; with lanes there are none */
+typedef double column __attribute__((vector_size(32), aligned(8)));
+#define COLUMNS 4
 #else
 typedef double real __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
 typedef int64_t bits __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
@@ -32,6 +37,7 @@ typedef uint64_t ubits __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
 #define LANE(r, i) ((r)[i])
 #define SET_LANE(r, i, value) ((r)[i] = (value))
 #define REAL(c) (c - (real){0})
+typedef real column;
 #endif
 
 static inline bits bits_of(real x) {
@@ -93,22 +99,47 @@ static inline real v_or(real a, real b) { return choose(MASK(a != 0.0) | MASK(b 
 static inline real v_if(real condition, real x) { return choose(MASK(condition != 0.0), x, REAL(0.0)); }
 static inline real v_sign(real x) { return v_less(REAL(0.0), x) - v_less(x, REAL(0.0)); }
 
-/* exp(x) to one unit in the last place, between -708 and 709, where it ends: x = n ln 2 + r, |r| <= ln(2)/2,
-   and the Taylor polynomial of degree 13 in Estrin's order. */
+/* The entries of a table for whole numbers from 0 on */
+static inline real look_up(const double *table, int stride, bits at) {
+    real found = REAL(0.0);
+    for (int i = 0; i < PSA_LANES; ++i) SET_LANE(found, i, table[stride * LANE(at, i)]);
+    return found;
+}
+
+/* exp(x) to one unit in the last place, between -708 and 709, where it ends: x = n ln 2 / 128 + r, with
+   |r| <= ln(2)/256, 2^(n/128) from a table (Tang, ACM Trans. Math. Softw. 15 (1989) 144). */
 static inline real v_exp(real x) {
     const double shift = 6755399441055744.0; /* 1.5 * 2^52: what is added to it is rounded to integers */
     const real y = choose(MASK(x < -708.0), REAL(-708.0), choose(MASK(x > 709.0), REAL(709.0), x));
-    const real shifted = y * 1.4426950408889634074 + shift;
+    const real shifted = y * 0x1.71547652b82fep7 + shift;
     const real n = shifted - shift;
-    const real r = (y - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10;
-    const real r2 = r * r, r4 = r2 * r2, r8 = r4 * r4;
-    const real a = (1.0 + r) + r2 * (0.5 + r * (1.0 / 6.0));
-    const real b = (1.0 / 24.0 + r * (1.0 / 120.0)) + r2 * (1.0 / 720.0 + r * (1.0 / 5040.0));
-    const real c = (1.0 / 40320.0 + r * (1.0 / 362880.0)) + r2 * (1.0 / 3628800.0 + r * (1.0 / 39916800.0));
-    const real d = 1.0 / 479001600.0 + r * (1.0 / 6227020800.0);
-    const real p = (a + r4 * b) + r8 * (c + r4 * d);
-    const bits power = (bits)((ubits)(bits_of(shifted) - bits_of(REAL(shift)) + 1023) << 52);
-    return p * real_of(power);
+    const real r = (y - n * 0x1.62e42fee00000p-8) - n * 0x1.a39ef35793c76p-40;
+    const bits whole = bits_of(shifted) - bits_of(REAL(shift));
+    const real power = look_up(EXP_TABLE, 1, whole & ((1 << TABLE_BITS) - 1));
+    const bits octave = (bits)((ubits)(whole >> TABLE_BITS) << 52);
+    const real scale = real_of(bits_of(power) + octave);
+    const real r2 = r * r;
+    const real p = (r + r2 * (0.5 + r * (1.0 / 6.0))) + r2 * r2 * (1.0 / 24.0 + r * (1.0 / 120.0));
+    return scale + scale * p;
+}
+
+/* log(x) within 2^-52 and its own last place, for normal x > 0, not a number elsewhere: x = 2^k m, m c = 1 + r
+   with 1/c and log(c) from a table (Tang, ACM Trans. Math. Softw. 16 (1990) 378). What is good enough for powers;
+   next to 1, where v_log keeps its digits, this one does not. */
+static inline real v_log_of_base(real x) {
+    const int64_t half = 0x3FE6A09E667F3BCDLL; /* the bits of sqrt(1/2) */
+    const bits b = bits_of(x), beyond = b - half, e = beyond >> 52;
+    const bits at = (beyond >> (52 - TABLE_BITS)) & ((1 << TABLE_BITS) - 1);
+    const real m = real_of(b - (bits)((ubits)e << 52)); /* between sqrt(1/2) and sqrt(2) */
+    const real r = m * look_up(LOG_TABLE[0], 2, at) - 1.0, r2 = r * r;
+#if PSA_LANES == 1
+    const real k = (real)e;
+#else
+    const real k = __builtin_convertvector(e, real);
+#endif
+    const real p = (r + r2 * (r * (1.0 / 3.0) - 0.5)) + r2 * r2 * ((r * 0.2 - 0.25) - r2 * (1.0 / 6.0));
+    const real y = (k * 6.93147180559945309417e-01 + look_up(LOG_TABLE[0] + 1, 2, at)) + p;
+    return choose(MASK(x > 0.0), y, REAL(NAN));
 }
 
 /* log(x) to one unit in the last place for normal x > 0, not a number elsewhere: the algorithm of

@@ -4,13 +4,21 @@
 
 #include "exact_state.h"
 
-/* sum += the response of L to its start, the input and a constant; the whole of it */
+/* sum += the response of L to its start, the input and a constant; the whole of it. A block of rows at a time: its
+   sum stays in a register. */
 static inline void respond(const psa_whole *whole, const real *l, const real *v0, const real *dv, real *sum) {
-    for (int i = 0; i < ROWS; ++i) sum[i] += whole->c[i];
-    for (int j = 0; j < NL; ++j)
-        for (int i = 0; i < ROWS; ++i) sum[i] += whole->f[j][i] * l[j];
-    for (int j = 0; j < EX_NU; ++j)
-        for (int i = 0; i < ROWS; ++i) sum[i] += whole->a1[j][i] * v0[j] + whole->a2[j][i] * dv[j];
+    for (int b = 0; b < BLOCKS; ++b) {
+        block s = ROWS_OF(sum, b) + ROWS_OF(whole->c, b);
+        for (int j = 0; j < NL; ++j) s += ROWS_OF(whole->f[j], b) * l[j];
+        for (int j = 0; j < EX_NU; ++j) s += ROWS_OF(whole->a1[j], b) * v0[j] + ROWS_OF(whole->a2[j], b) * dv[j];
+        ROWS_OF(sum, b) = s;
+    }
+}
+
+/* sum += what a port's values at the start, the half and the end add to it */
+static inline void respond_to_port(const real (*w)[ROWS], real n0, real n1, real n2, real *sum) {
+    for (int b = 0; b < BLOCKS; ++b)
+        ROWS_OF(sum, b) += ROWS_OF(w[0], b) * n0 + ROWS_OF(w[1], b) * n1 + ROWS_OF(w[2], b) * n2;
 }
 
 /* The same of one row inside the step */
@@ -119,17 +127,16 @@ static void check_port(psa_state *state, psa_trial *trial, int j, real sigma, in
 /* The response to a chord's driver beyond the parabola */
 static inline void respond_beyond(const psa_state *state, const psa_trial *trial, const psa_level *level, int c,
                                   real *sum) {
-    for (int i = 0; i < ROWS; ++i) sum[i] = level->chord_c[c][i];
-    for (int k = 0; k < ex_reads[ex_chord_driver[c]]; ++k)
-        for (int i = 0; i < ROWS; ++i) sum[i] += level->chord_f[c][k][i] * trial->l[k];
-    for (int q = 0; q < EX_NU; ++q)
-        for (int i = 0; i < ROWS; ++i)
-            sum[i] += level->chord_a1[c][q][i] * trial->v0[q] + level->chord_a2[c][q][i] * trial->dv[q];
+    for (int b = 0; b < BLOCKS; ++b) {
+        block s = ROWS_OF(level->chord_c[c], b);
+        for (int k = 0; k < ex_reads[ex_chord_driver[c]]; ++k) s += ROWS_OF(level->chord_f[c][k], b) * trial->l[k];
+        for (int q = 0; q < EX_NU; ++q)
+            s += ROWS_OF(level->chord_a1[c][q], b) * trial->v0[q] + ROWS_OF(level->chord_a2[c][q], b) * trial->dv[q];
+        ROWS_OF(sum, b) = s;
+    }
     for (int k = 0; k < EX_NFEED && ex_feed[c][k] >= 0; ++k) {
         const int j = ex_feed[c][k];
-        for (int i = 0; i < ROWS; ++i)
-            sum[i] += level->chord_w[c][k][0][i] * state->port[j] + level->chord_w[c][k][1][i] * trial->port[HALF][j] +
-                      level->chord_w[c][k][2][i] * trial->port[WHOLE][j];
+        respond_to_port(level->chord_w[c][k], state->port[j], trial->port[HALF][j], trial->port[WHOLE][j], sum);
     }
 }
 

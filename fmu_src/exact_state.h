@@ -15,15 +15,10 @@
 #define UNEVEN 2e-3      /* share of its way by which a driver is off the middle at the half of a step */
 #define NEWTON_LIMIT 12
 #define STILL 1e-9       /* of its nominal size: a driver's way along which nothing can be told */
+#define MOST_UNKNOWNS (EX_NP + EX_NX)
 
-/* Columns of sensitivities, four at a time; with lanes there are none */
-#if PSA_LANES == 1
-typedef double column __attribute__((vector_size(32), aligned(8)));
-#define COLUMNS 4
-#else
-typedef real column;
-#define COLUMNS 1
-#endif
+/* Factors of the matrices' derivatives beside L: inputs and their changes, 1, ports, chords */
+#define TAIL (2 * EX_NU + 1 + 3 * EX_NPORT + EX_NCH * (1 + EX_NDRIVE + 2 * EX_NU + 3 * EX_NFEED))
 
 enum { WHOLE, HALF, QUARTER, NODES };
 
@@ -71,12 +66,6 @@ typedef struct {
     real error;                           /* over the tolerance */
 } psa_trial;
 
-/* A partial derivative that counts: by a state (kind 0), the rate (1), or straight into a column (2); the
-   list ends with kind -1 */
-typedef struct {
-    short kind, index, entry;
-} psa_active;
-
 /* Where the lanes stand within a sample, the levels of their next steps, and which have come to an end */
 typedef struct {
     long at[PSA_LANES], tried[PSA_LANES];
@@ -86,22 +75,20 @@ typedef struct {
 typedef struct {
     psa_exact *run;
     real t, x[EX_NX], port[EX_NPORT + 1], start_slopes[EX_NPORT + 1][EX_PORT_OUT];
-    real p[EX_NP + 1], k[EX_NK + 1];
+    real p[EX_NP + 1], k[EX_NK + EX_NRATED + 1];
     real nominal[EX_NX], inverse_nominal[NL], tolerance, brief;
     psa_ladder *ladders;                  /* [lengths][lanes] */
-    psa_level *levels;                    /* [lengths][finest + 1][1 + thetas] */
-    psa_level *mixed;                     /* of lanes whose levels differ */
+    psa_level *levels;                    /* [lengths][finest + 1] */
+    psa_level *mixed;                     /* of lanes whose levels differ; of one parameter's derivatives */
     char *ready;                          /* [lengths][finest + 1] */
     double scale[PSA_LANES][NL];
-    int thetas;                           /* unknown parameters of the linear part */
-    int theta_column[EX_NTHETA + 1];
-    int column_of[EX_NP + 1];             /* -1: not asked for */
+    int thetas;                           /* unknown parameters of the linear part: the first columns */
+    int place[MOST_UNKNOWNS + 1];         /* column of each unknown */
+    int tails, tail[TAIL];                /* what is not zero of the factors of the matrices' derivatives */
+    int slopes_size;                      /* vectors of one block of columns in those of a level */
+    column *slopes;                       /* [lengths][finest + 1][blocks of thetas][slopes_size] */
     int blocks;                           /* of columns */
-    column *s, *sport;                    /* [EX_NX][blocks], [EX_NPORT][blocks] */
-    column *node, *snode_port, *scratch;  /* work of one step */
-    column *direct;                       /* [NL + EX_NEED][blocks]: of the matrices' own derivatives */
-    psa_active group_list[EX_NX + 1][EX_GROUP_OUT + 1], port_list[EX_NPORT + 1][EX_PORT_OUT + 1],
-        rate_list[EX_NG + 1][EX_RATE_OUT + 1], shown_list[EX_SHOWN_OUT + 1];
+    column *s, *sport, *unit;             /* [blocks][EX_NX], [blocks][EX_NPORT + 1], [blocks][EX_NP] */
     psa_trial trial;
 } psa_state;
 

@@ -50,19 +50,26 @@ class Unprintable(Exception):  # noqa: N818 - the model is stepped instead, whic
 
 @dataclass
 class _Graph:
-    """Nodes by number; a node's arguments have smaller numbers. `fixed` ones need no state."""
+    """Nodes by number; a node's arguments have smaller numbers.
+
+    `fixed` ones need no state, `rated` ones none but the rate w.
+    """
 
     nodes: list[_Node] = field(default_factory=list)
     numbers: dict[_Node, int] = field(default_factory=dict)
-    fixed: list[Any] = field(default_factory=list)
+    fixed: list[bool] = field(default_factory=list)
+    rated: list[bool] = field(default_factory=list)
 
     def add(self, *node: Any) -> int:
         if node not in self.numbers:
             leaf = node[0] in _LEAVES
-            fixed = node[0] in ("p", "c") if leaf else all(self.fixed[int(a)] for a in node[1:])
+            given = [] if leaf else [int(a) for a in node[1:]]
             self.numbers[node] = len(self.nodes)
             self.nodes.append(node)
-            self.fixed.append(fixed)
+            self.fixed.append(node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in given))
+            self.rated.append(
+                node[0] in ("p", "c", "w") if leaf else all(self.rated[a] for a in given)
+            )
         return self.numbers[node]
 
     def constant(self, value: float) -> int:
@@ -73,8 +80,8 @@ class _Graph:
         return float(node[1]) if node[0] == "c" else None
 
     def operation(self, op: int, *arguments: int) -> int:
-        if op == ca.OP_DIV and self.fixed[arguments[1]] and not self.fixed[arguments[0]]:
-            return self.add("*", arguments[0], self.add("/", self.constant(1.0), arguments[1]))
+        if op == ca.OP_DIV and not (self.fixed[arguments[0]] and self.fixed[arguments[1]]):
+            return self._times(arguments[0], self._inverse(arguments[1]))
         if op in _BINARY:
             return self.add(_BINARY[op], *arguments)
         if op in _POWERS:
@@ -84,14 +91,30 @@ class _Graph:
             ca.OP_SQ: lambda: self.add("*", one, one),
             ca.OP_TWICE: lambda: self.add("+", one, one),
             ca.OP_NEG: lambda: self.add("neg", one),
-            ca.OP_INV: lambda: self.add("/", self.constant(1.0), one),
+            ca.OP_INV: lambda: self._inverse(one),
             ca.OP_ASSIGN: lambda: one,
         }
         if op in simple:
             return simple[op]()
+        if op == ca.OP_LOG and ("v_log_of_base", one) in self.numbers:
+            return self.add("v_log_of_base", one)  # beside a power of the same base
         if op in _CALLS:
             return self.add(_CALLS[op], *arguments)
         raise Unprintable(f"operation {op}")
+
+    def _times(self, a: int, b: int) -> int:
+        return b if self.value(a) == 1.0 else self.add("*", a, b)
+
+    def _inverse(self, number: int) -> int:
+        """Return 1/x; one division serves all that divide by x, and by products with it."""
+        node = self.nodes[number]
+        if self.fixed[number]:
+            return self.add("/", self.constant(1.0), number)
+        if node[0] == "*":
+            return self.add("*", self._inverse(node[1]), self._inverse(node[2]))
+        if node[0] == "+" and node[1] == node[2]:
+            return self.add("*", self.constant(0.5), self._inverse(node[1]))
+        return self.add("/", self.constant(1.0), number)
 
     def _power(self, base: int, exponent: int) -> int:
         """Return base^exponent; base^(e + k/2) from base^e where that is there."""
@@ -99,12 +122,12 @@ class _Graph:
         if symbol is None:
             if shift == round(shift) and 0 < shift <= 16:
                 return self._whole(base, int(shift))
-            return self.add("v_exp", self.add("*", self.add("v_log", base), exponent))
+            return self.add("v_exp", self.add("*", self.add("v_log_of_base", base), exponent))
         halves = 2.0 * shift
         rest = shift - 0.5 * round(halves)
         scaled = symbol if factor == 1.0 else self.add("*", symbol, self.constant(factor))
         reduced = scaled if rest == 0.0 else self.add("+", scaled, self.constant(rest))
-        first = self.add("v_exp", self.add("*", self.add("v_log", base), reduced))
+        first = self.add("v_exp", self.add("*", self.add("v_log_of_base", base), reduced))
         return self._shifted(first, base, round(halves))
 
     def _shifted(self, power: int, base: int, halves: int) -> int:
@@ -115,7 +138,9 @@ class _Graph:
             factor = root if factor is None else self.add("*", factor, root)
         if factor is None:
             return power
-        return self.add("*" if halves > 0 else "/", power, factor)
+        if halves > 0 or self.fixed[factor]:
+            return self.add("*" if halves > 0 else "/", power, factor)
+        return self.add("*", power, self._inverse(factor))
 
     def _whole(self, base: int, exponent: int) -> int:
         if exponent == 1:
@@ -159,6 +184,8 @@ class Printer:
         self._arguments = dict(arguments)
         self._graph = _Graph()
         self._kept: dict[int, int] = {}
+        self._rated: dict[int, int] = {}
+        self._own_rated: list[int] = []
         self.functions: list[str] = []
 
     def function(self, name: str, outputs: Sequence[Expression]) -> None:
@@ -185,6 +212,22 @@ class Printer:
         ]
         head = f"APART static void {name}(const real *p, real *out) {{"
         self.functions.append("\n".join([head, "    (void)p;", *lines, "}", ""]))
+
+    def of_rate(self, name: str) -> None:
+        """Print `static void name(w, k)`: what the functions since the last call read of the rate.
+
+        It stands in `k` behind what depends on the parameters alone.
+        """
+        own, self._own_rated = self._own_rated, []
+        lines = self._body(own, fixed=False, rated=True)
+        lines += [f"    k[EX_NK + {self._rated[n]}] = s{n};" for n in own]
+        head = f"static inline void {name}(real w, real *k) {{"
+        self.functions.append("\n".join([head, "    (void)w, (void)k;", *lines, "}", ""]))
+
+    @property
+    def rated(self) -> int:
+        """How many numbers of the rate there are in `k`."""
+        return len(self._rated)
 
     def kept(self) -> tuple[int, str]:
         """Return the size of `k` and the function `psa_prepare(p, k)`; print it last."""
@@ -216,18 +259,19 @@ class Printer:
                 slots[function.instruction_output(k)[0]] = self._graph.operation(op, *given)
         return found
 
-    def _body(self, numbers: Sequence[int], *, fixed: bool) -> list[str]:
-        """Return the assignments that the numbers need; the fixed ones too, or read from k."""
+    def _body(self, numbers: Sequence[int], *, fixed: bool, rated: bool = False) -> list[str]:
+        """Return the assignments that numbers need; those of parameters or rate too, or from k."""
         needed: set[int] = set()
         stack = list(numbers)
         while stack:
             n = stack.pop()
             node = self._graph.nodes[n]
-            if n in needed or node[0] in _LEAVES or (self._graph.fixed[n] and not fixed):
+            told = (self._graph.rated[n] and not rated) or self._graph.fixed[n]
+            if n in needed or node[0] in _LEAVES or (told and not fixed):
                 continue
             needed.add(n)
             stack += [int(a) for a in node[1:]]
-        name = self._fixed_name if fixed else self._name
+        name = self._fixed_name if fixed else self._rate_name if rated else self._name
         return [f"    const real s{n} = {self._text(n, name)};" for n in sorted(needed)]
 
     def _leaf(self, number: int) -> str | None:
@@ -241,9 +285,17 @@ class Printer:
         return None
 
     def _name(self, number: int) -> str:
-        """Return how a varying function reads a node; what is fixed it reads from k."""
-        node = self._graph.nodes[number]
-        if self._graph.fixed[number] and node[0] != "c":
+        """Return how a varying function reads a node; what needs no state it reads from k."""
+        leaf = self._graph.nodes[number][0] in _LEAVES
+        if self._graph.rated[number] and not (self._graph.fixed[number] or leaf):
+            if number not in self._own_rated:
+                self._own_rated.append(number)
+            return f"k[EX_NK + {self._rated.setdefault(number, len(self._rated))}]"
+        return self._rate_name(number)
+
+    def _rate_name(self, number: int) -> str:
+        """Return how a function reads a node; what is fixed it reads from k."""
+        if self._graph.fixed[number] and self._graph.nodes[number][0] != "c":
             return f"k[{self._kept.setdefault(number, len(self._kept))}]"
         return self._leaf(number) or f"s{number}"
 

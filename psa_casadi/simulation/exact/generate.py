@@ -35,14 +35,14 @@ def generate(split: Split, output: str) -> str:
     thetas = [k for k in range(s.p.numel()) if ca.depends_on(linear, s.p[k])]
     printer.of_parameters("psa_linear", [linear])
     printer.of_parameters("psa_linear_slopes", [ca.jacobian(linear, s.p[k]) for k in thetas])
-    group_size, rate_size = _groups(split, printer, rate, tables)
+    group_size, rate_size = _groups(split, printer, rate)
     port_size = _ports(split, printer, tables)
     shown = s.y[[o.name for o in s.outputs].index(output)]
     partials, entries = _partials(split, [shown], None)
     printer.function("ex_outputs", [s.y])
     printer.function("ex_shown", [shown])
     printer.function("ex_shown_slopes", [shown, *partials])
-    tables.append(_entries("ex_shown_entries", entries))
+    printer.functions.append(_chains("ex_shown_chain", [_chain("ex_shown_chain_0", entries)]))
     kept, prepare = printer.kept()
     place = {state: k for k, state in enumerate(split.linear)}
     chords = [k for k, q in enumerate(split.ports) if q.chord >= 0]
@@ -53,6 +53,7 @@ def generate(split: Split, output: str) -> str:
         "EX_NPORT": len(split.ports), "EX_NCH": len(chords), "EX_NTHETA": len(thetas),
         "EX_NK": kept, "EX_NITEMS": len(split.order), "EX_GROUP_OUT": group_size,
         "EX_PORT_OUT": port_size, "EX_RATE_OUT": rate_size, "EX_SHOWN_OUT": 1 + len(entries),
+        "EX_NRATED": printer.rated, "EX_CONSTANT": int(not c.is_zero()),
         "EX_NLOOP": sum(kind == "loop" for kind, _ in split.order),
     }  # fmt: skip
     needed, path = _needed(split)
@@ -87,7 +88,6 @@ def generate(split: Split, output: str) -> str:
     head += [f"#define {name} {value}" for name, value in sizes.items()]
     head += [
         "enum { EX_GROUP, EX_PORT, EX_LOOP };",
-        "typedef struct { short row, kind, index; } psa_entry;",
         "typedef struct { int kind, count; const int *members; } psa_item;",
         *(_integers(name, values) for name, values in lists.items()),
         _table("ex_feed", feeds, sizes["EX_NFEED"] + 1),
@@ -108,11 +108,6 @@ def _table(name: str, rows: Sequence[Sequence[int]], width: int) -> str:
     filled = [[*row, *[-1] * (width - len(row))] for row in rows] or [[-1] * width]
     text = ", ".join("{" + ", ".join(str(v) for v in row) + "}" for row in filled)
     return f"static const int {name}[{len(filled)}][{width}] = {{{text}}};"
-
-
-def _entries(name: str, entries: Sequence[_Entry]) -> str:
-    text = ", ".join(f"{{{e.row}, {e.kind}, {e.index}}}" for e in entries) or "{0, 0, 0}"
-    return f"static const psa_entry {name}[{max(1, len(entries))}] = {{{text}}};"
 
 
 def _items(split: Split) -> list[str]:
@@ -143,62 +138,88 @@ def _partials(
     return found, entries
 
 
-def _dispatch(name: str, count: int) -> str:
+_GIVEN = "real t, const real *x, const real *v, real w, const real *k, real *out"
+_OF_RATE = "real w, real *k"
+_OF_COLUMNS = "const real *d, const column *x, column w, const column *p, column *out"
+
+
+def _dispatch(name: str, count: int, given: str = _GIVEN) -> str:
     """Return a function that calls the one with the number it is given."""
-    cases = "".join(f"    case {k}: {name}_{k}(t, x, v, w, k, out); break;\n" for k in range(count))
+    passed = [q.split()[-1].lstrip("*") for q in given.split(",")]
+    unused = ", ".join(f"(void){q}" for q in passed)
+    calls = ", ".join(passed)
+    cases = "".join(f"    case {k}: {name}_{k}({calls}); break;\n" for k in range(count))
     return (
-        f"static inline void {name}(int which, real t, const real *x, const real *v, real w,\n"
-        f"        const real *k, real *out) {{\n"
-        f"    (void)t, (void)x, (void)v, (void)w, (void)k, (void)out;\n"
+        f"static inline void {name}(int which, {given}) {{\n    {unused};\n"
         f"    switch (which) {{\n{cases}    default: break;\n    }}\n}}\n"
     )
 
 
-def _groups(split: Split, printer: Printer, rate: Expression, tables: list[str]) -> tuple[int, int]:
-    s, counts, rate_counts, largest, rate_size = split.structure, [], [], 1, 1
+def _chain(name: str, entries: Sequence[_Entry], rows: int = 1, last: Sequence[int] = ()) -> str:
+    """Return the chain rule as C: partial derivatives `d` times columns of what they are by.
+
+    Terms by the states `last` stand at the end: what comes before does not wait for them.
+    """
+    terms: list[list[tuple[bool, str]]] = [[] for _ in range(rows)]
+    for place, e in enumerate(entries):
+        by = ("x[{}]", "w", "p[{}]")[e.kind].format(e.index)
+        terms[e.row].append((e.kind == 0 and e.index in last, f"d[{place}] * {by}"))
+    lines = [
+        f"    out[{i}] = {' + '.join(term for _, term in sorted(row)) or '(column){0.0}'};\n"
+        for i, row in enumerate(terms)
+    ]
+    unused = "    (void)d, (void)x, (void)w, (void)p;\n"
+    return f"static inline void {name}({_OF_COLUMNS}) {{\n{unused}{''.join(lines)}}}\n"
+
+
+def _chains(name: str, chains: Sequence[str]) -> str:
+    """Return chains and the function that calls one of them; with lanes there are no columns."""
+    text = "".join(chains) + _dispatch(name, len(chains), _OF_COLUMNS)
+    return f"#if PSA_LANES == 1\n{text}#endif\n"
+
+
+def _groups(split: Split, printer: Printer, rate: Expression) -> tuple[int, int]:
+    s, chains, rate_chains, largest, rate_size = split.structure, [], [], 1, 1
     for k, group in enumerate(split.groups):
         slopes = ca.substitute(group.slopes, group.rate, rate)
         rows = [slopes[i] for i in range(len(group.states))]
         partials, entries = _partials(split, rows, rate)
         printer.function(f"ex_group_{k}", rows)
         printer.function(f"ex_group_slopes_{k}", [*rows, *partials])
+        printer.of_rate(f"ex_group_rate_{k}")
         driver = s.xdot[group.driver]
         moved, rate_entries = _partials(split, [driver], None)
         printer.function(f"ex_rate_{k}", [driver])
         printer.function(f"ex_rate_slopes_{k}", [driver, *moved])
-        tables.append(_entries(f"ex_rate_entries_{k}", rate_entries))
-        rate_counts.append(len(rate_entries))
         rate_size = max(rate_size, 1 + len(moved))
-        tables.append(_entries(f"ex_group_entries_{k}", entries))
-        counts.append(len(entries))
         largest = max(largest, len(rows) + len(partials))
-    tables.append(_pointers("ex_group", len(counts)))
-    tables.append(_integers("ex_group_count", counts))
-    tables.append(_pointers("ex_rate", len(counts)))
-    tables.append(_integers("ex_rate_count", rate_counts))
+        chains.append(_chain(f"ex_group_chain_{k}", entries, len(rows), group.states))
+        rate_chains.append(_chain(f"ex_rate_chain_{k}", rate_entries))
     for name in ("ex_group", "ex_group_slopes", "ex_rate", "ex_rate_slopes"):
-        printer.functions.append(_dispatch(name, len(counts)))
+        printer.functions.append(_dispatch(name, len(split.groups)))
+    printer.functions.append(_dispatch("ex_group_rate", len(split.groups), _OF_RATE))
+    printer.functions.append(_chains("ex_group_chain", chains))
+    printer.functions.append(_chains("ex_rate_chain", rate_chains))
     return largest, rate_size
 
 
-def _pointers(name: str, count: int) -> str:
-    listed = ", ".join(f"{name}_entries_{k}" for k in range(count)) or "0"
-    return f"static const psa_entry *const {name}_entries[{max(1, count)}] = {{{listed}}};"
-
-
 def _ports(split: Split, printer: Printer, tables: list[str]) -> int:
-    counts, largest = [], 1
+    chains, by_state, largest = [], [], 1
     for k, port in enumerate(split.ports):
         partials, entries = _partials(split, [port.value], None)
         printer.function(f"ex_port_{k}", [port.value])
         printer.function(f"ex_port_slopes_{k}", [port.value, *partials])
-        tables.append(_entries(f"ex_port_entries_{k}", entries))
-        counts.append(len(entries))
+        chains.append(_chain(f"ex_port_chain_{k}", entries))
+        at = [-1] * len(split.linear)
+        for place, entry in enumerate(entries):
+            if entry.kind == 0 and entry.index in split.linear:
+                at[split.linear.index(entry.index)] = 1 + place
+        by_state.append(at)
         largest = max(largest, 1 + len(partials))
-    tables.append(_pointers("ex_port", len(counts)))
-    tables.append(_integers("ex_port_count", counts))
+    tables.append(_table("ex_port_by_linear", by_state, max(1, len(split.linear))))
     for name in ("ex_port", "ex_port_slopes"):
-        printer.functions.append(_dispatch(name, len(counts)))
+        printer.functions.append(_dispatch(name, len(split.ports)))
+    printer.functions.append(_chains("ex_port_chain", chains))
     return largest
 
 
