@@ -124,12 +124,15 @@ static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
 #endif
 }
 
-/* The levels of lanes that differ, put together */
+/* The levels of lanes that differ, put together; what a lane had the last time it has still */
 #if PSA_LANES > 1
 static const psa_level *gather(psa_state *state, int step, const int *level) {
     const size_t count = sizeof(psa_level) / sizeof(real);
     for (int lane = 0; lane < PSA_LANES; ++lane) {
-        const double *const from = (const double *)level_of(state, step, level[lane]) + lane;
+        const psa_level *const own = level_of(state, step, level[lane]);
+        if (own == state->mixed_from[lane]) continue;
+        state->mixed_from[lane] = own;
+        const double *const from = (const double *)own + lane;
         double *const to = (double *)state->mixed + lane;
         for (size_t k = 0; k < count; ++k) to[k * PSA_LANES] = from[k * PSA_LANES];
     }
@@ -144,6 +147,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
     const int step = run->which_step[sample], finest = run->finest;
     const double h = run->length[step];
     const long end = 1L << finest;
+    const double unit = 1.0 / (double)end;
     psa_trial *const trial = &state->trial;
     for (int lane = 0; lane < PSA_LANES; ++lane) pace->at[lane] = pace->dead[lane] ? end : 0;
     for (;;) {
@@ -155,8 +159,8 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
         for (int lane = 0; lane < PSA_LANES; ++lane) {
             level[lane] = pace->level[pace->at[lane] < end ? lane : first];
             same &= level[lane] == level[first];
-            SET_LANE(begin, lane, ldexp((double)pace->at[lane], -finest));
-            SET_LANE(length, lane, ldexp(1.0, -level[lane]));
+            SET_LANE(begin, lane, (double)pace->at[lane] * unit);
+            SET_LANE(length, lane, (double)(end >> level[lane]) * unit);
         }
 #if PSA_LANES > 1
         const psa_level *const matrices = same ? level_of(state, step, level[0]) : gather(state, step, level);
@@ -188,7 +192,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
             run->steps++;
             if (level[lane] > run->coarsest && error < GROWS && pace->at[lane] % (2 * units) == 0)
                 pace->level[lane]--;
-            SET_LANE(state->t, lane, run->t[sample] + h * ldexp((double)pace->at[lane], -finest));
+            SET_LANE(state->t, lane, run->t[sample] + h * (double)pace->at[lane] * unit);
             SET_LANE(accepted, lane, -1);
         }
         if (!any(accepted)) continue;
@@ -235,7 +239,7 @@ APART static int set_up_columns(psa_state *state, int *theta) {
         if (!none || (k + 1 == TAIL && state->tails == 0)) state->tail[state->tails++] = k;
     }
     for (int r = 0; r < NL + EX_NEED; ++r)
-        state->slopes_size += ex_reads[r < NL ? r : ex_need[r - NL]] + state->tails;
+        state->slopes_size += ex_row_size[r < NL ? r : ex_need[r - NL]] + state->tails;
     const size_t nb = (size_t)(state->blocks = (run->count + COLUMNS - 1) / COLUMNS);
     const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
     const size_t own = levels * (size_t)((state->thetas + COLUMNS - 1) / COLUMNS * state->slopes_size);

@@ -50,7 +50,10 @@ APART static void pack_slopes(const psa_state *state, const psa_level *d, int m,
         const int i = r < NL ? r : ex_need[r - NL];
         const psa_row *const row = r < NL ? NULL : &d->inner[HALF - 1][r - NL];
         double every[TAIL], *z = every;
-        for (int j = 0; j < ex_reads[i]; ++j) ((double *)out++)[m] = row ? row->f[j] : d->whole.f[j][i];
+        for (int e = 0; e < ex_row_size[i]; ++e) {
+            const int j = ex_row[i][e];
+            ((double *)out++)[m] = row ? row->f[j] : d->whole.f[j][i];
+        }
         for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a1[q] : d->whole.a1[q][i];
         for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a2[q] : d->whole.a2[q][i];
         *z++ = row ? row->c : d->whole.c[i];
@@ -73,14 +76,15 @@ APART static void pack_slopes(const psa_state *state, const psa_level *d, int m,
 static void linear_columns(const psa_state *state, psa_columns *to, const column *slopes, const double *tail) {
     const psa_trial *const trial = &state->trial;
     for (int r = 0; r < NL + EX_NEED; ++r) {
-        const int i = r < NL ? r : ex_need[r - NL], reads = ex_reads[i];
+        const int i = r < NL ? r : ex_need[r - NL], reads = ex_row_size[i];
+        const int *const row = ex_row[i];
         const real *const f = r < NL ? &trial->level->whole.f[0][i] : trial->level->inner[HALF - 1][r - NL].f;
         const int stride = r < NL ? ROWS : 1;
         column sum = to->s[ex_linear[i]];
-        for (int j = 0; j < reads; ++j) sum += f[j * stride] * to->s[ex_linear[j]];
+        for (int e = 0; e < reads; ++e) sum += f[row[e] * stride] * to->s[ex_linear[row[e]]];
         if (slopes) {
             column own = tail[0] * slopes[reads];
-            for (int j = 0; j < reads; ++j) own += trial->l[j] * slopes[j];
+            for (int e = 0; e < reads; ++e) own += trial->l[row[e]] * slopes[e];
             for (int k = 1; k < state->tails; ++k) own += tail[k] * slopes[reads + k];
             sum += own;
             slopes += reads + state->tails;
@@ -295,7 +299,10 @@ static void step_columns(psa_state *state, const column *slopes) {
     if (state->thetas > 0) tail_of(state, tail);
     for (int b = 0; b < state->blocks; ++b) {
         column *const s = state->s + b * EX_NX, *const sport = state->sport + b * (EX_NPORT + 1);
-        psa_columns to = {.s = s, .sport = sport, .unit = state->unit + b * EX_NP};
+        psa_columns to; /* what it is not given here it is by the items, in their order */
+        to.s = s;
+        to.sport = sport;
+        to.unit = state->unit + b * EX_NP;
         const int own = 4 * b < state->thetas;
         linear_columns(state, &to, own ? slopes + (size_t)b * state->slopes_size : NULL, tail);
         for (int k = 0; k < EX_NITEMS; ++k) {

@@ -80,6 +80,7 @@ typedef struct {
     psa_ladder *ladders;                  /* [lengths][lanes] */
     psa_level *levels;                    /* [lengths][finest + 1] */
     psa_level *mixed;                     /* of lanes whose levels differ; of one parameter's derivatives */
+    const psa_level *mixed_from[PSA_LANES];
     char *ready;                          /* [lengths][finest + 1] */
     double scale[PSA_LANES][NL];
     int thetas;                           /* unknown parameters of the linear part: the first columns */

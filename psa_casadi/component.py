@@ -47,6 +47,7 @@ BALANCES: dict[str, Balance] = {
         Balance("wafer_force", "N", "force that accelerates and strains the wafers"),
         Balance("transmitted_force", "N", "force the wafers pass on to the output mass"),
         Balance("tip_force", "N", "force on the output mass from outside the stack"),
+        Balance("rest_displacement", "m", "displacement that the wafers' force has at rest"),
         Balance("tip_displacement", "m", "displacement of the output mass"),
         Balance("displacement", "m", "output displacement, with creep and further modes"),
         Balance("blocked_force", "N", "force that would hold the output at zero displacement"),
@@ -102,7 +103,7 @@ class Component:
     means nothing. `trial_starts` are starts of its memory states at which it is looked for, where
     it does nothing at their ordinary start. `curve` names the quantity over which an effect bends
     a static curve, in a form of its own: effects with the same one differ, below the resonances,
-    by these forms only.
+    by these forms only. `more_of` names the effect of which this one is several.
 
     `sampled` are states that change at sample instants only: at every time that is a multiple of
     the parameter `sample_period` [s], whoever declares it, each takes the value in
@@ -130,6 +131,7 @@ class Component:
     needs: tuple[str, ...] = ()
     trial_starts: tuple[Mapping[str, float], ...] = ()
     curve: str | None = None
+    more_of: str | None = None
     sampled: tuple[State, ...] = ()
     sample_period: str | None = None
     home: str = ""

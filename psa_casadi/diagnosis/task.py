@@ -20,6 +20,7 @@ STEPS = {
     "fits afresh": "no fits from an ordinary base beside those from the fitted one",
     "base again": "the base is not fitted again from where a cause has led",
     "resonances": "no resonances that the base has missed are tried",
+    "several modes": "no series of modes is fitted where one leaves structure",
     "several at once": "causes are found one by one only",
     "exchange": "causes are not exchanged beside the later ones",
     "all afresh": "effects far behind in the screening are never fitted",

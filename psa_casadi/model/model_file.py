@@ -9,6 +9,7 @@ from typing import Any
 from psa_casadi.component import Component
 from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
+from psa_casadi.effects.modal_series import MODAL_SERIES
 from psa_casadi.effects.patches import PATCHES
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
@@ -17,6 +18,10 @@ from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.variables import Interval, Provenance
 
 FORMAT = "psa_casadi.model/1"
+
+
+#: What a diagnosis may add beside the effects of the table.
+_BESIDE = {c.name: c for c in (*MODAL_SERIES.values(), *PATCHES.values())}
 
 
 def dumps(model: Model) -> str:
@@ -62,7 +67,7 @@ def dumps(model: Model) -> str:
 
 def foreign_components(model: Model) -> tuple[str, ...]:
     """Return the names of a model's components that MODEL.json cannot name."""
-    known = (*COMPONENTS.values(), *EFFECTS.values(), *PATCHES.values())
+    known = (*COMPONENTS.values(), *EFFECTS.values(), *_BESIDE.values())
     return tuple(c.name for c in model.components if c not in known and not c.home)
 
 
@@ -84,7 +89,7 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
             f"{source} is not JSON ({error}); give a file that `psa identify` or `psa diagnose`"
             " wrote."
         ) from error
-    table = {**known_effects(effects), **{c.name: c for c in PATCHES.values()}}
+    table = {**known_effects(effects), **_BESIDE}
     problems = _problems(content, source, table)
     if problems:
         raise InputError(problems)

@@ -23,8 +23,8 @@ class Structure:
 
     `time`, `x`, `u`, `p` are the symbols (columns, in the order of the variable tables);
     `balances` maps each balance to its terms' sum with balances kept as symbols (for people);
-    `xdot`, `y` and `switches` (zero where xdot has a kink) have everything substituted (for
-    machines).
+    `sums` (the same), `xdot`, `y` and `switches` (zero where xdot has a kink) have everything
+    substituted (for machines).
 
     `z` are the sampled states, constant but for the instants k T of the parameter `period`, T [s];
     there they take the value `znext`, in which `z` stands for their values before the instant
@@ -42,6 +42,7 @@ class Structure:
     p: Expression
     symbols: Mapping[str, Expression]
     balances: Mapping[str, Expression]
+    sums: Mapping[str, Expression]
     der: Mapping[str, Expression]
     out: Mapping[str, Expression]
     xdot: Expression
@@ -66,6 +67,10 @@ class Structure:
         """
         names = ["time", "x", "u", "p", "z"][: len(self.arguments)]
         return ca.Function("f", self.arguments, [self.xdot, self.y], names, ["xdot", "y"])
+
+    def balance(self, name: str) -> ca.Function:
+        """Return the casadi function `(time, x, u, p) -> sum` of one balance, in its unit."""
+        return ca.Function(name, self.arguments, [self.sums[name]])
 
     @cached_property
     def slopes(self) -> ca.Function:
@@ -135,6 +140,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
         p=_column(table[q.name] for q in parameters),
         symbols={**table, **sums},
         balances=balances,
+        sums=dict(zip(sums, full, strict=True)),
         der=der,
         out=out,
         xdot=xdot,

@@ -27,10 +27,12 @@ from psa_casadi.diagnosis.search.fits import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import NONE, Known, Names, Searched, is_left
+from psa_casadi.diagnosis.search.modes import with_modes
 from psa_casadi.diagnosis.search.several import fit_sets
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage
@@ -127,16 +129,19 @@ class _Search:
 
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""
-        if h.causes and self.once("challenged", h.names):
+        series = any(c.more_of for c in h.causes)  # it has taken all that rings
+        if h.causes and not series and self.once("challenged", h.names):
             self.challenge(h)
             return
         view = self.known.view(h)
-        if self.resonances(h, view):
+        if not series and self.resonances(h, view):
             self.done.discard(("challenged", h.names))
             return
         self.expanded[h.names] = h
+        if self.several_modes(h, view):
+            return
         if view.shows and len(h.causes) < thresholds().most_causes:
-            if h.causes:
+            if h.causes and not series:
                 self.several_at_once()
             self.add_causes(h, view)
 
@@ -161,6 +166,25 @@ class _Search:
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
         self.known.finish([c for c in self.known.leaders(h) if not c.final][:_FINALISTS])
+
+    @stage("fits of candidates")
+    def several_modes(self, h: Hypothesis, view: View) -> bool:
+        """Fit a series of modes where fast records show several; whether that is the best then.
+
+        In place of a mode that leaves structure, or beside the base.
+        """
+        if "several modes" in self.task.method.without or not (self.task.fast and view.test.alarm):
+            return False
+        less = self.known.get(h.names - {STRUCTURAL_MODE.name})
+        if less is None or (h.causes and less is h) or not self.once("several modes", less.names):
+            return False
+        self.tell(less, "several modes at once")
+        found = with_modes(less, self.task.experiments)
+        if found is None:
+            return False
+        self.known.note(found)
+        self.known.remember(less, found.causes[-1].name)
+        return self.known.best().names == found.names
 
     def several_at_once(self) -> None:
         """Fit sets of causes at once, again where the base without causes has become another."""

@@ -232,7 +232,9 @@ class Known:
         return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.price
 
     def different(self, effect: Component, h: Hypothesis) -> bool:
-        """Whether an effect bends another curve than the causes of a hypothesis do."""
+        """Whether an effect is none of the causes, nor bends the same curve as one of them."""
+        if effect.name in {c.more_of for c in h.causes}:
+            return False
         groups = self.task.alike(self.root.fit)
         return not any(effect.name in g and h.names & set(g) for g in groups)
 

@@ -62,8 +62,12 @@ def fit_with_all(
     reset: dict[str, float],
     evaluations: int,
 ) -> Fit | None:
-    """Fit with more effects, each from its values and its gain; None if that fails."""
-    names = list(before.unknowns.names)
+    """Fit with more effects, each from its values and its gain; None if that fails.
+
+    A series of modes that is there already stays as it is.
+    """
+    held = series_parameters(before)
+    names = [n for n in before.unknowns.names if n not in held]
     names += [n for effect, _, _ in added for n in effect.fitted if n not in names]
     for share in (1.0, 0.3):
         model = before.model
@@ -87,6 +91,11 @@ def fit_with_all(
     return None
 
 
+def series_parameters(of: Fit) -> tuple[str, ...]:
+    """Return the parameters of effects that are several of one: many, which quick fits hold."""
+    return tuple(n for c in of.model.effects if c.more_of for n in c.fitted)
+
+
 def continued(
     current: Fit,
     experiments: Sequence[Experiment],
@@ -94,11 +103,12 @@ def continued(
     tolerance: float,
     evaluations: int,
 ) -> Fit:
-    """Go on with a fit from where it stopped. Raises PsaError."""
+    """Go on with a fit from where it stopped, with all that is free. Raises PsaError."""
+    names = current.unknowns.names
     return fit(
         current.model,
         experiments,
-        current.unknowns.names,
+        [*names, *(n for n in series_parameters(current) if n not in names)],
         sigma=current.sigma,
         start_states=current.starts(),
         evaluations=evaluations,

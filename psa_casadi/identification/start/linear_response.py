@@ -29,14 +29,7 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
     """
     from scipy.signal import lfilter  # noqa: PLC0415 (half a second to load, which few records need)
 
-    z = pole * h
-    if abs(z) < _SERIES:
-        one = 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120
-        two = 0.5 + z / 6 + z**2 / 24 + z**3 / 120 + z**4 / 720
-    else:
-        one = (np.exp(z) - 1) / z
-        two = (np.exp(z) - 1 - z) / z**2
-    now, before, decay = residue * h * two, residue * h * (one - two), np.exp(z)
+    now, before, decay = _weights(pole, residue, h)
     if pole.imag:
         other = np.conj(decay)
         upper = 2.0 * np.real([now, before - now * other, -before * other])
@@ -45,6 +38,27 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
         upper, lower = np.real([now, before]), [1.0, -np.real(decay)]
     found: FloatArray = lfilter(upper, lower, x, axis=0)
     return found
+
+
+def one_pole(pole: complex, x: FloatArray, h: float) -> ComplexArray:
+    """Return the response (n,) of 1/(s - pole) to x (n,), as `mode` takes it, complex."""
+    from scipy.signal import lfilter  # noqa: PLC0415 (see `mode`)
+
+    now, before, decay = _weights(pole, 1.0, h)
+    found: ComplexArray = lfilter([now, before], [1.0, -decay], x.astype(np.complex128))
+    return found
+
+
+def _weights(pole: complex, residue: complex, h: float) -> tuple[complex, complex, complex]:
+    """Return the weights of x now and a sample before, and what remains of the response."""
+    z = pole * h
+    if abs(z) < _SERIES:
+        one = 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120
+        two = 0.5 + z / 6 + z**2 / 24 + z**3 / 120 + z**4 / 720
+    else:
+        one = (np.exp(z) - 1) / z
+        two = (np.exp(z) - 1 - z) / z**2
+    return residue * h * two, residue * h * (one - two), np.exp(z)
 
 
 def first_order(time_constant: float, x: FloatArray, h: float) -> FloatArray:

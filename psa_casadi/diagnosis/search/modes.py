@@ -1,0 +1,101 @@
+"""Several modes at once where one is not enough: read off the residual, then fitted together."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
+from psa_casadi.diagnosis.search.quick_fits import fit_with_all
+from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES, MOST
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.start.modes import MOST_DAMPED, Mode, Shaken, modes_of
+from psa_casadi.model.compose import Model
+from psa_casadi.records.decimate import is_uniform
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.start import start_on
+from psa_casadi.simulation.ways import accurate
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Samples of all records from which modes are read off; evaluations of the fit.
+_ENOUGH, _EVALUATIONS = 20_000, 20
+_RTOL = 1e-4
+
+
+def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+    """Fit with a series of modes; None where the residual shows fewer than two, or no fit works.
+
+    Modes that a fit damps until they ring no more are left out: they stand for something else.
+    """
+    records = [e.record for e in experiments]
+    if "rest_displacement" not in before.fit.model.structure.balances or not all(
+        is_uniform(r.time) for r in records
+    ):
+        return None
+    most = max(1, _ENOUGH // len(records))
+    try:
+        shaken = [
+            _shaken(before.fit.model, e, p, most)
+            for e, p in zip(experiments, before.predicted, strict=True)
+        ]
+    except PsaError:
+        return None
+    free = np.vstack([
+        before.fit.jacobian[before.fit.of_record(experiments, k)][: int(s.used.sum())]
+        for k, s in enumerate(shaken)
+    ])  # fmt: skip
+    modes = modes_of(shaken, free, most=MOST, better=thresholds().better)
+    fit, states = before.fit, tuple(before.fit.starts())
+    while len(modes) >= FEWEST:
+        effect = MODAL_SERIES[len(modes)]
+        added = [(effect, _values(modes), 1.0)]
+        found = fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
+        if found is None:
+            return None
+        ringing = [m for m in _modes(found, len(modes)) if m.damping < MOST_DAMPED]
+        if len(ringing) == len(modes):
+            return hypothesis((*before.causes, effect), found, experiments)
+        base = found.model.without([effect.name])
+        modes, states = ringing, tuple(found.starts())
+        fit = replace(before.fit, model=base)
+    return None
+
+
+def _modes(fit: Fit, count: int) -> list[Mode]:
+    """Return the modes of a fit."""
+    names = ("frequency", "damping", "share", "ahead")
+    values = fit.model.values
+    return [Mode(*(values[f"series_{name}_{k}"] for name in names)) for k in range(1, count + 1)]
+
+
+def _values(modes: Sequence[Mode]) -> dict[str, float]:
+    return {
+        f"series_{name}_{k}": value
+        for k, mode in enumerate(modes, 1)
+        for name, value in asdict(mode).items()
+    }
+
+
+def _shaken(model: Model, e: Experiment, predicted: FloatArray, most: int) -> Shaken:
+    """Return what drives the modes of a record, and the first samples of its residual."""
+    count = min(most, e.stop)
+    drive = _at_rest(model, e.record, count)
+    left = measured(e.record)[:count] - predicted[:count]
+    return Shaken(drive, left, e.used[:count], e.record.sample_time)
+
+
+def _at_rest(model: Model, record: Record, count: int) -> FloatArray:
+    """Return the displacement that the wafers' force has at rest [m], at the first samples."""
+    t, u = record.time[:count] - record.time[0], record_inputs(model, record, count)
+    steps, _ = accurate(model, t, u, start_on(model, t, u).x, rtol=_RTOL, hold="linear")
+    values = model.structure.balance("rest_displacement").map(count)
+    p = np.tile(model.parameter_vector()[:, None], count)
+    found: FloatArray = values(t[None], steps.x.T, u.T, p).full().ravel()
+    return found
