@@ -1,5 +1,6 @@
 """Several modes at once: read off a residual, fitted beside the base, exported like any effect."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -113,15 +114,15 @@ def test_a_model_with_modes_is_saved_and_read() -> None:
     assert again.components[-1] is MODAL_SERIES[2]
 
 
-def shaken_stack(seed: int) -> Record:
-    """Return a record of a stack in a structure with four modes, plain NumPy and SciPy."""
+def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN) -> Record:
+    """Return a record of a stack in a structure with modes, plain NumPy and SciPy."""
     rng = np.random.default_rng(seed)
     stack, time = draw_stack(rng), np.arange(COUNT) / RATE
     wave = multisine(time, 0.0, 1.0, (5.0, 1800.0), seed=seed)
     command = stack.u_rated * wave * np.clip((time - 0.01) / 0.05, 0.0, 1.0)
     run = simulate_base(stack, time, command)
     x = run.displacement + sum(
-        contribution(run, {"frequency": f, "zeta": z}, share) for f, z, share in HIDDEN
+        contribution(run, {"frequency": f, "zeta": z}, share) for f, z, share in modes
     )
     x = x + 1e-3 * np.ptp(x) * rng.standard_normal(COUNT)
     return Record("shaken", time, command, x)
@@ -129,14 +130,20 @@ def shaken_stack(seed: int) -> Record:
 
 @slow
 def test_several_modes_are_found_together() -> None:
-    record = shaken_stack(11)
-    found = psa.diagnose([record])
-    assert [c.effect for c in found.causes] == ["modal_series_4"]
-    assert found.extended_errors.holdout_nrmse_percent < 0.13  # the noise is 0.1
+    found = psa.diagnose([shaken_stack(11)])
+    (cause,) = found.causes
+    assert cause.effect.startswith("modal_series")
     assert found.base_errors.holdout_nrmse_percent > 1.0
-    values = found.causes[0].fit.model.values
-    tones = sorted(values[f"series_frequency_{k}"] for k in range(1, 5))
-    np.testing.assert_allclose(tones, [f for f, _, _ in HIDDEN], rtol=2e-3)
+    assert found.extended_errors.holdout_nrmse_percent < 0.12  # the noise is 0.1
+    values = found.extended_fit.model.values
+    tones = np.array([v for n, v in values.items() if n.startswith("series_frequency")])
+    for frequency, _, _ in HIDDEN:
+        assert np.min(np.abs(tones / frequency - 1.0)) < 2e-3
+
+
+@slow
+def test_a_fast_record_without_modes_has_none() -> None:
+    assert psa.diagnose([shaken_stack(14, ())]).verdict == "adequate"
 
 
 @slow

@@ -76,6 +76,7 @@ def modal_series(count: int) -> Component:
         equations=partial(_equations, count),
         looks_like="the residual rings at several tones that are no poles of the stack",
         more_of=STRUCTURAL_MODE.name,
+        count=count,
     )
 
 

@@ -169,21 +169,29 @@ class _Search:
 
     @stage("fits of candidates")
     def several_modes(self, h: Hypothesis, view: View) -> bool:
-        """Fit a series of modes where fast records show several; whether that is the best then.
+        """Fit a series of modes beside the base or in a single one's place; whether it is best.
 
-        In place of a mode that leaves structure, or beside the base.
+        Where fast records show several, or where one leaves structure.
         """
-        if "several modes" in self.task.method.without or not (self.task.fast and view.test.alarm):
+        name, experiments = STRUCTURAL_MODE.name, self.task.experiments
+        if "several modes" in self.task.method.without or not view.test.alarm:
             return False
-        less = self.known.get(h.names - {STRUCTURAL_MODE.name})
-        if less is None or (h.causes and less is h) or not self.once("several modes", less.names):
+        if STRUCTURAL_MODE not in self.task.table:
+            return False
+        less = self.known.get(h.names - {name})
+        if less is None or not (name in h.names or (self.task.fast and not h.causes)):
+            return False
+        if not self.once("several modes", less.names):
             return False
         self.tell(less, "several modes at once")
-        found = with_modes(less, self.task.experiments)
+        found = with_modes(less, experiments)
         if found is None:
             return False
         self.known.note(found)
-        self.known.remember(less, found.causes[-1].name)
+        single = view.starts_of(name) if less is h else []
+        if single:
+            self.known.note(with_cause(h, experiments, single))
+        self.known.remember(less, found.causes[-1].name, name)
         return self.known.best().names == found.names
 
     def several_at_once(self) -> None:

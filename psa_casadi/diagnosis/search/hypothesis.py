@@ -114,8 +114,8 @@ class Scale:
         return self._known[of.fit]
 
     def score(self, of: Hypothesis) -> float:
-        """Evidence less the price of the causes."""
-        return self.evidence(of) - self.price * len(of.causes)
+        """Evidence less the price of the causes; a series of modes is several."""
+        return self.evidence(of) - self.price * sum(c.count for c in of.causes)
 
 
 def ended(of: Hypothesis) -> Hypothesis:
