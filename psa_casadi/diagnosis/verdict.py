@@ -228,10 +228,14 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
     base = float(np.mean(first.fit.residuals**2))
     excess = max(base - floor**2, 1e-300)
     rows = []
-    for name, score in first.screening.best_by_effect().items():
+    scores = first.screening.best_by_effect()
+    for name in dict.fromkeys((*scores, *first.fitted)):  # a series of modes was not screened
         known = first.fitted.get(name)
-        gone = score.decrease * first.screening.colour.level**2 / len(first.fit.residuals)
-        gone = gone if known is None else known.removes(first.view.of)
+        if known is not None:
+            gone = known.removes(first.view.of)
+        else:
+            level = first.screening.colour.level
+            gone = scores[name].decrease * level**2 / len(first.fit.residuals)
         rows.append(
             Candidate(
                 effect=name,

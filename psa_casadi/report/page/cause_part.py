@@ -10,7 +10,7 @@ from psa_casadi.report.plots.signature_figure import size_sentence
 from psa_casadi.report.plots.view_plots import signature_plot, view_named
 from psa_casadi.report.words.phrases import (
     alternative_sentence,
-    cause_estimates,
+    cause_size,
     listing,
     percent,
     plain,
@@ -49,7 +49,7 @@ def add_causes(page: Document, d: Diagnosis) -> None:
         page.heading(f"{plain(cause.effect)} ({cause.belongs_to})")
         page.paragraph(
             f"Confidence {percent(cause.confidence)}. "
-            f"Size (95 % interval): {'; '.join(cause_estimates(d, cause))}."
+            f"Found (in brackets 95 % intervals): {cause_size(d, cause)}."
         )
         if cause.cannot_be_told_from:
             rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")

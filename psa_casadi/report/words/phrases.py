@@ -212,12 +212,18 @@ def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
     )
 
 
-def cause_estimates(d: Diagnosis, cause: Cause) -> list[str]:
-    """Return "name = value unit (low to high)" for every parameter of a cause."""
+def cause_size(d: Diagnosis, cause: Cause) -> str:
+    """Return "name = value unit (low to high)" for every parameter of a cause.
+
+    Of one that is several of a kind, and has many, at which frequencies they are.
+    """
+    if any(c.name == cause.effect and c.count > 1 for c in d.model.components):
+        tones = sorted(e.value for e in cause.parameters.values() if e.unit == "Hz")
+        return f"at {', '.join(number(v) for v in tones)} Hz"
     texts = []
     for name, e in cause.parameters.items():
         unit, display = shown_in(d.model, name)
         value, low, high = (convert(v, unit, display) for v in (e.value, *e.interval))
         estimate = with_unit(number(value), display)
         texts.append(f"{name} = {estimate} ({interval_text(low, high)})")
-    return texts
+    return ", ".join(texts)

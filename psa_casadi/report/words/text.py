@@ -17,7 +17,7 @@ from psa_casadi.report.words.phrases import (
     Scale,
     added,
     alternative_sentence,
-    cause_estimates,
+    cause_size,
     length_scale,
     listing,
     number,
@@ -72,7 +72,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
 def _cause(d: Diagnosis, cause: Cause) -> str:
     """Return a cause with place, confidence and parameters."""
     sure = f"{cause.belongs_to}, {percent(cause.confidence)}"
-    return f"{plain(cause.effect)} ({sure}): {', '.join(cause_estimates(d, cause))}"
+    return f"{plain(cause.effect)} ({sure}): {cause_size(d, cause)}"
 
 
 def _rivals(d: Diagnosis, cause: Cause) -> str:
