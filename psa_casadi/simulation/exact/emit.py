@@ -119,28 +119,29 @@ class _Graph:
     def _power(self, base: int, exponent: int) -> int:
         """Return base^exponent; base^(e + k/2) from base^e where that is there."""
         symbol, factor, shift = self._affine(exponent)
+        halves = round(2.0 * shift)
         if symbol is None:
-            if shift == round(shift) and 0 < shift <= 16:
-                return self._whole(base, int(shift))
+            if 2.0 * shift == halves and 0 < abs(halves) <= 32:
+                return self._halves(base, halves)
             return self.add("v_exp", self.add("*", self.add("v_log_of_base", base), exponent))
-        halves = 2.0 * shift
-        rest = shift - 0.5 * round(halves)
+        rest = shift - 0.5 * halves
         scaled = symbol if factor == 1.0 else self.add("*", symbol, self.constant(factor))
         reduced = scaled if rest == 0.0 else self.add("+", scaled, self.constant(rest))
         first = self.add("v_exp", self.add("*", self.add("v_log_of_base", base), reduced))
-        return self._shifted(first, base, round(halves))
+        return self._shifted(first, base, halves)
 
     def _shifted(self, power: int, base: int, halves: int) -> int:
         """Return power base^(halves/2)."""
-        factor = self._whole(base, abs(halves) // 2) if abs(halves) > 1 else None
-        if halves % 2:
-            root = self.add("v_sqrt", base)
-            factor = root if factor is None else self.add("*", factor, root)
-        if factor is None:
-            return power
-        if halves > 0 or self.fixed[factor]:
-            return self.add("*" if halves > 0 else "/", power, factor)
-        return self.add("*", power, self._inverse(factor))
+        return self.add("*", power, self._halves(base, halves)) if halves else power
+
+    def _halves(self, base: int, halves: int) -> int:
+        """Return base^(halves/2): whole powers, roots, and what one division makes of them."""
+        if halves < 0:
+            return self._inverse(self._halves(base, -halves))
+        if halves % 2 == 0:
+            return self._whole(base, halves // 2)
+        root = self.add("v_sqrt", base)
+        return root if halves == 1 else self.add("*", self._whole(base, halves // 2), root)
 
     def _whole(self, base: int, exponent: int) -> int:
         if exponent == 1:
