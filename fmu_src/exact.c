@@ -116,9 +116,9 @@ static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
         ex_shown_chain(0, out + 1, state->s + b * EX_NX, NONE, state->unit + b * EX_NP, &own);
         memcpy(dy + b * COLUMNS, &own, sizeof own);
     }
-    run->shown[sample] = out[0];
-    for (int c = 0; c < run->count; ++c) run->dy[sample * run->count + c] = dy[state->place[c]];
-    return !isfinite(out[0]);
+    double sum = run->shown[sample] = out[0]; /* not finite where one of them is not */
+    for (int c = 0; c < run->count; ++c) sum += run->dy[sample * run->count + c] = dy[state->place[c]];
+    return !isfinite(sum);
 #else
     return 0;
 #endif

@@ -75,6 +75,11 @@ def test_noise_has_no_modes() -> None:
     assert modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95) == []
 
 
+def test_what_is_not_driven_has_no_modes() -> None:
+    shaken = Shaken(np.zeros(COUNT), noise(COUNT, 3), np.ones(COUNT, bool), 1.0 / RATE)
+    assert modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95) == []
+
+
 def with_two_modes() -> psa.Model:
     values = {"series_gain": 1.0}
     for k, (frequency, damping, share) in enumerate(HIDDEN[:2], 1):
@@ -144,6 +149,13 @@ def test_several_modes_are_found_together() -> None:
 @slow
 def test_a_fast_record_without_modes_has_none() -> None:
     assert psa.diagnose([shaken_stack(14, ())]).verdict == "adequate"
+
+
+@slow
+def test_a_diagnosis_from_a_model_with_modes_finds_them_again() -> None:
+    found = psa.diagnose([shaken_stack(11)], model=psa.diagnose([shaken_stack(11)]).model)
+    assert found.base_errors.holdout_nrmse_percent > 1.0
+    assert [c.effect.startswith("modal_series") for c in found.causes] == [True]
 
 
 @slow

@@ -68,7 +68,8 @@ def _diagnose(
         experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
         start, scale_given = chosen_start(records, model, stiffness)
         refuse_stuck([e.record for e in experiments])
-        start = start.without(c.name for c in table if c.gain is not None)
+        searched = (*table, *(c for c in start.effects if c.more_of in {e.name for e in table}))
+        start = start.without(c.name for c in searched if c.gain is not None)
         there = {c.name for c in start.components}
         table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
     base = fit_base(start, experiments, progress=progress)

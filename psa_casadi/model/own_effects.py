@@ -23,6 +23,7 @@ import casadi as ca
 from psa_casadi.component import Component, Expression, Symbols
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
+from psa_casadi.effects.modal_series import MODAL_SERIES
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import compose
 
@@ -39,9 +40,9 @@ def own_effects(module: str) -> Mapping[str, Component]:
     or holds one that does not fit beside the base model.
     """
     found = _held_by(_imported(module), module)
-    problems = Problems()
+    problems, series = Problems(), {c.name: c for c in MODAL_SERIES.values()}
     for component in found:
-        if component.name in {**COMPONENTS, **EFFECTS}:
+        if component.name in {**COMPONENTS, **EFFECTS, **series}:
             problems.add(f"{module}: an effect of this package is named '{component.name}' too.")
             continue
         try:

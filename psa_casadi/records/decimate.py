@@ -48,7 +48,7 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
                 f" what was measured."
             )
     best, factor = record, 1
-    if not is_uniform(record.time):
+    if not _uniform(record.time):
         return best, factor
     while record.n // (2 * factor) >= FEWEST:
         wider = _averages(record, 2 * factor)
@@ -58,8 +58,7 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
     return best, factor
 
 
-def is_uniform(time: FloatArray) -> bool:
-    """Whether all steps of times (n,) are alike to a thousandth."""
+def _uniform(time: FloatArray) -> bool:
     steps = np.diff(time)
     usual = float(np.median(steps))
     return bool(np.all(np.abs(steps - usual) < 1e-3 * usual))

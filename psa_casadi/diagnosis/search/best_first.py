@@ -61,6 +61,7 @@ class _Search:
         self.expanded: dict[Names, Hypothesis] = {}
         self.done: set[tuple[str, Names]] = set()
         self.sets_of: Hypothesis | None = None
+        self.shaken: dict[Names, Fit] = {}
 
     def run(self) -> None:
         for _ in range(_VISITS):
@@ -129,8 +130,8 @@ class _Search:
 
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""
-        series = any(c.more_of for c in h.causes)  # it has taken all that rings
-        if h.causes and not series and self.once("challenged", h.names):
+        series = has_series(h)
+        if h.causes and self.once("challenged", h.names):
             self.challenge(h)
             return
         view = self.known.view(h)
@@ -181,8 +182,9 @@ class _Search:
         less = self.known.get(h.names - {name})
         if less is None or not (name in h.names or (self.task.fast and not h.causes)):
             return False
-        if not self.once("several modes", less.names):
+        if self.shaken.get(less.names) is less.fit:
             return False
+        self.shaken[less.names] = less.fit
         self.tell(less, "several modes at once")
         found = with_modes(less, experiments)
         if found is None:
@@ -206,7 +208,8 @@ class _Search:
         floor = noise_rms(h.fit.residuals, view.screening.colour)
         excess = excess_power(h.fit.residuals, view.screening.colour, floor)
         count = _AFRESH_FURTHER if h.causes else _AFRESH
-        for k, child in enumerate(self.known.children(h)[:count]):
+        children = [c for c in self.known.children(h) if not has_series(c)]
+        for k, child in enumerate(children[:count]):
             best = max(self.known.children(h), key=lambda c: c.removes(h))
             if best.fit.rms < _SETTLED * floor or (k > 0 and best.removes(h) > _NEARLY * excess):
                 break
@@ -230,10 +233,11 @@ class _Search:
         task = self.task
         if "base again" not in task.method.without:
             for cause in h.causes:
-                task.progress(f"without {cause.name}")
-                self.known.note(without(h, cause, task.experiments))
+                if not cause.more_of:
+                    task.progress(f"without {cause.name}")
+                    self.known.note(without(h, cause, task.experiments))
         before = self.known.get(h.names_upto(len(h.causes) - 1))
-        if "resonances" in task.method.without or before is None:
+        if "resonances" in task.method.without or before is None or has_series(h):
             return
         last, found = h.causes[-1], None
         if rings(last):
@@ -278,3 +282,8 @@ class _Search:
 
     def tell(self, h: Hypothesis, what: str) -> None:
         self.task.progress(f"cause {len(h.causes) + 1}: {what}")
+
+
+def has_series(h: Hypothesis) -> bool:
+    """Whether a cause is a series of modes, which has taken all that rings."""
+    return any(c.more_of for c in h.causes)

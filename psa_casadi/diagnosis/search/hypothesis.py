@@ -108,14 +108,14 @@ class Scale:
     _known: dict[Fit, float] = field(init=False, default_factory=dict)
 
     def evidence(self, of: Hypothesis) -> float:
-        """Ln of the Bayes factor over the plain base."""
+        """Ln of the Bayes factor over the plain base; more modes than one have their price here."""
         if of.fit not in self._known:
             self._known[of.fit] = evidence(self.base, of.fit, self.colour)
-        return self._known[of.fit]
+        return self._known[of.fit] - self.price * sum(c.count - 1 for c in of.causes)
 
     def score(self, of: Hypothesis) -> float:
-        """Evidence less the price of the causes; a series of modes is several."""
-        return self.evidence(of) - self.price * sum(c.count for c in of.causes)
+        """Evidence less the price of the causes."""
+        return self.evidence(of) - self.price * len(of.causes)
 
 
 def ended(of: Hypothesis) -> Hypothesis:

@@ -10,8 +10,8 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.search.refitting import quick_rtol
 from psa_casadi.records.split import Experiment
 
-#: Evaluations of a quick fit from a direction.
-QUICK = 8
+#: Evaluations of a quick fit from a direction; with what it held, free again.
+QUICK, _FREED = 8, 3
 
 #: An effect's values without its gain, the gain, and the records' memories.
 Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
@@ -64,19 +64,21 @@ def fit_with_all(
 ) -> Fit | None:
     """Fit with more effects, each from its values and its gain; None if that fails.
 
-    A series of modes that is there already stays as it is.
+    A series of modes that is there already stays as it is until the last evaluations.
     """
     held = series_parameters(before)
     names = [n for n in before.unknowns.names if n not in held]
     names += [n for effect, _, _ in added for n in effect.fitted if n not in names]
+    rtol = quick_rtol(before.sigma, experiments)
     for share in (1.0, 0.3):
         model = before.model
-        for effect, values, gain in added:
-            low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
-            value = float(np.clip(share * gain, 0.9 * low, 0.9 * high))
-            model = model.with_effect(effect, {**values, **reset, effect.gain or "": value})
         try:
-            return fit(
+            for effect, values, gain in added:
+                low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
+                own = share * gain if effect.gain in effect.fitted else gain
+                value = float(np.clip(own, 0.9 * low, 0.9 * high))
+                model = model.with_effect(effect, {**values, **reset, effect.gain or "": value})
+            found = fit(
                 model,
                 experiments,
                 names,
@@ -84,8 +86,9 @@ def fit_with_all(
                 start_states=memory,
                 evaluations=evaluations,
                 tolerance=1e-3,
-                rtol=quick_rtol(before.sigma, experiments),
+                rtol=rtol,
             )
+            return continued(found, experiments, rtol, 1e-3, _FREED) if held else found
         except PsaError:
             continue
     return None

@@ -190,23 +190,31 @@ def _minimum(
     allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
     ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
     ways.append(Way(rtol, 0.1 * rtol, stepped=True))
-    spent = 0
+    spent, before = 0, None
     for way in ways:
         evaluate = objective(model, experiments, unknowns, weights, way)
-        found = minimise(
-            evaluate,
-            theta,
-            unknowns.bounds(),
-            tolerance=effort.tolerance,
-            evaluations=max(effort.evaluations - spent, 2),
-            goal=effort.goal,
-            linear=effort.linear,
-        )
+        try:
+            found = minimise(
+                evaluate,
+                theta,
+                unknowns.bounds(),
+                tolerance=effort.tolerance,
+                evaluations=max(effort.evaluations - spent, 2),
+                goal=effort.goal,
+                linear=effort.linear,
+            )
+        except KeyboardInterrupt:
+            if before is None:  # nothing was evaluated yet
+                raise
+            minimum, rougher = before
+            ended = replace(minimum, evaluations=spent, interrupted=True, converged=False)
+            return ended, rougher, []
         if found is None:
             raise SimulationError(
                 "The model cannot be simulated at the start of the fit; start from other values."
             )
         minimum, theta = found, found.theta
+        before = minimum, way
         spent += found.evaluations
         if minimum.interrupted:  # whoever interrupts does not wait for the error
             return replace(minimum, evaluations=spent), way, []

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from psa_casadi.errors import PsaError
@@ -170,6 +170,11 @@ def _quick_fits(
             quick = fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
         except PsaError:
             continue
+        except KeyboardInterrupt:
+            if not found:
+                raise
+            found = [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
+            break
         found.append((name, quick))
         if quick.interrupted:
             break

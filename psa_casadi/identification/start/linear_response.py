@@ -150,7 +150,7 @@ def orthonormal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     transform: FloatArray = np.diag(1.0 / np.where(scale > 0, scale, 1.0))
     for _ in range(2):
         values, vectors = np.linalg.eigh(q.T @ q)
-        large = values > 1e-14 * values[-1]
+        large = values > 1e-14 * np.max(values, initial=1e-300)
         step = vectors[:, large] / np.sqrt(values[large])
         q, transform = q @ step, transform @ step
     return q, transform

@@ -49,7 +49,7 @@ def add_causes(page: Document, d: Diagnosis) -> None:
         page.heading(f"{plain(cause.effect)} ({cause.belongs_to})")
         page.paragraph(
             f"Confidence {percent(cause.confidence)}. "
-            f"Found (in brackets 95 % intervals): {cause_size(d, cause)}."
+            f"Found, with 95 % intervals of parameters: {cause_size(d, cause)}."
         )
         if cause.cannot_be_told_from:
             rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
@@ -63,7 +63,7 @@ def add_causes(page: Document, d: Diagnosis) -> None:
 def _signature(page: Document, d: Diagnosis, cause: Cause) -> None:
     """Add the signature of a cause beside the same view of the record that shows most of it."""
     effect = next((c for c in d.model.components if c.name == cause.effect), None)
-    if effect is None:
+    if effect is None or effect.more_of:  # several modes look as their tones make them look
         return
     seen = signature(effect)
     page.heading(f"{plain(effect.name)}, as it looks and as the data look")

@@ -217,8 +217,9 @@ def cause_size(d: Diagnosis, cause: Cause) -> str:
 
     Of one that is several of a kind, and has many, at which frequencies they are.
     """
-    if any(c.name == cause.effect and c.count > 1 for c in d.model.components):
-        tones = sorted(e.value for e in cause.parameters.values() if e.unit == "Hz")
+    several = next((c for c in d.model.components if c.name == cause.effect and c.count > 1), None)
+    if several is not None:
+        tones = sorted(d.model.values[p.name] for p in several.parameters if p.unit == "Hz")
         return f"at {', '.join(number(v) for v in tones)} Hz"
     texts = []
     for name, e in cause.parameters.items():
