@@ -47,7 +47,6 @@ BALANCES: dict[str, Balance] = {
         Balance("wafer_force", "N", "force that accelerates and strains the wafers"),
         Balance("transmitted_force", "N", "force the wafers pass on to the output mass"),
         Balance("tip_force", "N", "force on the output mass from outside the stack"),
-        Balance("rest_displacement", "m", "displacement that the wafers' force has at rest"),
         Balance("tip_displacement", "m", "displacement of the output mass"),
         Balance("displacement", "m", "output displacement, with creep and further modes"),
         Balance("blocked_force", "N", "force that would hold the output at zero displacement"),

@@ -44,7 +44,6 @@ def _cascade(s: Symbols) -> Equations:
         add={
             "transmitted_force": elastic,
             "tip_force": s.load_force,
-            "rest_displacement": s.wafer_force * (1.0 / s.k_P + 1.0 / s.k_B),
             "tip_displacement": s.x,
             "displacement": s.tip_displacement,
             "blocked_force": s.transmitted_force + s.c_B * s.v_y + s.k_B * s.y,
@@ -61,7 +60,6 @@ def _single_mass(s: Symbols) -> Equations:
         },
         add={
             "tip_force": s.load_force,
-            "rest_displacement": s.wafer_force / s.k,
             "tip_displacement": s.x,
             "displacement": s.tip_displacement,
             "blocked_force": s.wafer_force,

@@ -7,7 +7,7 @@ There is a component for every number of modes.
 
 from functools import partial
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, State, Values
@@ -18,16 +18,24 @@ FEWEST, MOST = 2, 9
 
 
 def _equations(count: int, s: Symbols) -> Equations:
-    der, total = {}, 0.0
+    der, total, rest = {}, 0.0, s.wafer_force * _compliance(s)
     for k in range(1, count + 1):
         q, rate = getattr(s, f"q_s{k}"), getattr(s, f"r_s{k}")
         omega = _TWO_PI * getattr(s, f"series_frequency_{k}")
         damping = 2.0 * getattr(s, f"series_damping_{k}") * omega
         der[f"q_s{k}"] = rate
-        der[f"r_s{k}"] = omega**2 * (s.rest_displacement - q) - damping * rate
+        der[f"r_s{k}"] = omega**2 * (rest - q) - damping * rate
         ahead = getattr(s, f"series_ahead_{k}") * rate / omega
         total = total + getattr(s, f"series_share_{k}") * q + ahead
     return Equations(der=der, add={"displacement": s.series_gain * total})
+
+
+def _compliance(s: Symbols) -> Expression:
+    """Return what a force of the wafers moves the output at rest by [m/N]."""
+    try:
+        return 1.0 / s.k_P + 1.0 / s.k_B
+    except AttributeError:  # the single mass
+        return 1.0 / s.k
 
 
 def _rate_scale(k: int, p: Values) -> float:

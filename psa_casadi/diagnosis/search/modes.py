@@ -16,6 +16,7 @@ from psa_casadi.identification.start.modes import MOST_DAMPED, Mode, Shaken, mod
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
+from psa_casadi.scales import stiffness_scale
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.ways import accurate
@@ -35,7 +36,7 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
 
     Modes that a fit damps until they ring no more are left out: they stand for something else.
     """
-    if "rest_displacement" not in before.fit.model.structure.balances:
+    if "wafer_force" not in before.fit.model.structure.balances:
         return None
     even = [k for k, e in enumerate(experiments) if _even(e.record.time)]
     most = _ENOUGH // max(1, len(even))
@@ -101,7 +102,7 @@ def _at_rest(model: Model, record: Record, count: int) -> FloatArray:
     """Return the displacement that the wafers' force has at rest [m], at the first samples."""
     t, u = record.time[:count] - record.time[0], record_inputs(model, record, count)
     steps, _ = accurate(model, t, u, start_on(model, t, u).x, rtol=_RTOL, hold="linear")
-    values = model.structure.balance("rest_displacement").map(count)
+    values = model.structure.balance("wafer_force").map(count)
     p = np.tile(model.parameter_vector()[:, None], count)
     found: FloatArray = values(t[None], steps.x.T, u.T, p).full().ravel()
-    return found
+    return found / stiffness_scale(model.values)
