@@ -25,8 +25,8 @@ _LADDER = ((0.03, 0), (0.01, 2), (3e-3, 4), (3e-3, 6))
 _AGREE = 0.5
 #: Below this tolerance two runs may share an error that is of its size: the stepper is taken.
 _TIGHTEST = 1e-6
-#: Loosest tolerance of exact steps, at which most samples take one step: little is won beyond it.
-LOOSEST = 1e-4
+#: Loosest tolerance of exact steps: beyond it nothing is won.
+LOOSEST = 1e-5
 #: Range below which a displacement counts as constant, over its nominal size.
 _STILL = 1e-3
 
