@@ -37,16 +37,9 @@ typedef struct {
 } psa_block;
 
 /* Rows of L by blocks of one vector, the last ones 0; with lanes a row is a vector already */
-#if PSA_LANES == 1
-typedef double block __attribute__((vector_size(32), aligned(8)));
-#define ROWS ((NL + 3) / 4 * 4)
-#define BLOCKS (ROWS / 4)
-#else
-typedef real block;
-#define ROWS NL
-#define BLOCKS NL
-#endif
-#define ROWS_OF(array, b) (((block *)(array))[b])
+#define BLOCKS ((NL + COLUMNS - 1) / COLUMNS)
+#define ROWS (BLOCKS * COLUMNS)
+#define ROWS_OF(array, b) (((column *)(array))[b])
 
 /* What a step of one length needs. Of its whole: F, a_1, a_2, c_1, and each port's weights of its values at the
    start, the half and the end, by columns. Of its half and its quarter: the same (a_2 over the step's whole

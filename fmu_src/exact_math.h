@@ -38,6 +38,7 @@ typedef uint64_t ubits __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
 #define SET_LANE(r, i, value) ((r)[i] = (value))
 #define REAL(c) (c - (real){0})
 typedef real column;
+#define COLUMNS 1
 #endif
 
 static inline bits bits_of(real x) {

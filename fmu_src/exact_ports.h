@@ -8,7 +8,7 @@
    sum stays in a register. */
 static inline void respond(const psa_whole *whole, const real *l, const real *v0, const real *dv, real *sum) {
     for (int b = 0; b < BLOCKS; ++b) {
-        block s = ROWS_OF(sum, b) + ROWS_OF(whole->c, b);
+        column s = ROWS_OF(sum, b) + ROWS_OF(whole->c, b);
         for (int j = 0; j < NL; ++j) s += ROWS_OF(whole->f[j], b) * l[j];
         for (int j = 0; j < EX_NU; ++j) s += ROWS_OF(whole->a1[j], b) * v0[j] + ROWS_OF(whole->a2[j], b) * dv[j];
         ROWS_OF(sum, b) = s;
@@ -128,7 +128,7 @@ static void check_port(psa_state *state, psa_trial *trial, int j, real sigma, in
 static inline void respond_beyond(const psa_state *state, const psa_trial *trial, const psa_level *level, int c,
                                   real *sum) {
     for (int b = 0; b < BLOCKS; ++b) {
-        block s = ROWS_OF(level->chord_c[c], b);
+        column s = ROWS_OF(level->chord_c[c], b);
         for (int k = 0; k < ex_reads[ex_chord_driver[c]]; ++k) s += ROWS_OF(level->chord_f[c][k], b) * trial->l[k];
         for (int q = 0; q < EX_NU; ++q)
             s += ROWS_OF(level->chord_a1[c][q], b) * trial->v0[q] + ROWS_OF(level->chord_a2[c][q], b) * trial->dv[q];

@@ -44,14 +44,14 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
     for k in even:
         e = experiments[k]
         part = _moving(e, most)
-        counts = np.flatnonzero(np.isin(np.flatnonzero(e.used[: e.stop]), part))
+        first, last = (int(e.used[:end].sum()) for end in (part.start, part.stop))
         try:
             drive = _at_rest(before.fit.model, e.record, e.stop)
         except PsaError:
             return None
         left = measured(e.record)[part] - before.predicted[k][part]
         shaken.append(Shaken(drive[part], left, e.used[part], e.record.sample_time))
-        free.append(before.fit.jacobian[before.fit.of_record(experiments, k)][counts])
+        free.append(before.fit.jacobian[before.fit.of_record(experiments, k)][first:last])
     modes = modes_of(shaken, np.vstack(free), most=MOST, better=_LOWERED) if shaken else []
     fit, states = before.fit, tuple(before.fit.starts())
     while len(modes) >= FEWEST:
@@ -75,12 +75,12 @@ def _even(time: FloatArray) -> bool:
     return bool(np.max(np.abs(time - grid)) < 0.1 * (time[-1] - time[0]) / (time.size - 1))
 
 
-def _moving(e: Experiment, most: int) -> npt.NDArray[np.int64]:
+def _moving(e: Experiment, most: int) -> slice:
     """Return so many samples at most, from where the voltage begins to move."""
     v = e.record.voltage[: e.stop]
     moves = np.flatnonzero(v != v[0])
     begin = max(0, int(moves[0]) - 1) if moves.size else 0
-    return np.arange(begin, min(e.stop, begin + most))
+    return slice(begin, min(e.stop, begin + most))
 
 
 def _modes(fit: Fit, count: int) -> list[Mode]:
