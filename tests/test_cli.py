@@ -236,6 +236,7 @@ def test_effects_are_listed_and_shown() -> None:
     shown = done("effects", "slow-creep").stdout
     assert "equation" in shown
     assert "Croft, Shed and Devasia" in " ".join(shown.split())
+    assert "4 further resonances" in done("effects", "modal_series_4").stdout
 
 
 def test_an_identification_tells_its_warnings(demo: Demo) -> None:
