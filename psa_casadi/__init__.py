@@ -55,7 +55,13 @@ if TYPE_CHECKING:
     from psa_casadi.model.system.nanopositioner import nanopositioner
     from psa_casadi.model.system.system import System, connect
     from psa_casadi.model.system.tuning import controller_for, margins_of
-    from psa_casadi.records import Record, read_record, read_records, write_record
+    from psa_casadi.records import (
+        Record,
+        read_record,
+        read_records,
+        record_from,
+        write_record,
+    )
     from psa_casadi.report.page.diagnosis import write_report
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.report.plots.figure import save_figure
@@ -73,6 +79,7 @@ _HOMES = {
         "Record",
         "read_record",
         "read_records",
+        "record_from",
         "write_record",
     ),
     "psa_casadi.components": (
@@ -176,6 +183,7 @@ __all__ = [
     "Record",
     "read_record",
     "read_records",
+    "record_from",
     "write_record",
     "BASE",
     "SIMPLIFIED",

@@ -19,6 +19,7 @@ from psa_casadi.identification.start.ordinary import chosen_start, refuse_stuck
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
 from psa_casadi.records.quality.suspects import cleaned
+from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, in_one_order
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
@@ -32,9 +33,9 @@ STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sen
 
 @one_thread_of_algebra()
 def diagnose(
-    records: Sequence[Record],
+    records: Records,
     *,
-    holdout: Sequence[Record] = (),
+    holdout: Records = (),
     model: Model | None = None,
     stiffness: float | None = None,
     effects: Sequence[Component] | None = None,
@@ -43,14 +44,17 @@ def diagnose(
 ) -> Diagnosis:
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
+    `records` are those of one device: a record, the path of a file, a data frame or a mapping of
+    arrays (see `record_from`), or several of these.
     Held-out data are the records `holdout`, else a quarter of every record in blocks (see
     `divided`); they choose nothing but whether an extension may stay. `model` is where the base fit
     starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search; `method` can
     leave parts of the method out (for its ablation). Raises InputError.
     """
     method = method or Method()
+    given, kept = records_given(records), records_given(holdout)
     with using(method.thresholds):
-        return _diagnose(records, holdout, model, stiffness, effects, method, progress)
+        return _diagnose(given, kept, model, stiffness, effects, method, progress)
 
 
 def _diagnose(

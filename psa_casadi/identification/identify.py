@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +18,10 @@ from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
+from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.variables import Provenance
 from psa_casadi.version import __version__
@@ -34,8 +37,8 @@ FORCE_NOTE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Reported):
     """An identified model with the fit behind it, what the data determine, and warnings.
 
     `starts` tells what became of every start of the search; `sentences` what was done to the
@@ -55,10 +58,24 @@ class Identification:
     advice: tuple[Advice, ...] = ()
     read_off: tuple[str, ...] = ()
 
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas DataFrame: value, 95 % interval, unit, meaning."""
+        parameters = self.model.structure.parameters
+        intervals = [self.model.provenance.intervals.get(p.name) for p in parameters]
+        columns = {
+            "parameter": [p.name for p in parameters],
+            "value": [self.model.values[p.name] for p in parameters],
+            "low": [float("nan") if i is None else i.low for i in intervals],
+            "high": [float("nan") if i is None else i.high for i in intervals],
+            "unit": [p.unit for p in parameters],
+            "meaning": [p.description for p in parameters],
+        }
+        return frame(columns)
+
 
 @one_thread_of_algebra()
 def identify(
-    records: Sequence[Record],
+    records: Records,
     *,
     model: Model | None = None,
     stiffness: float | None = None,
@@ -66,13 +83,16 @@ def identify(
 ) -> Identification:
     """Fit the base model, or `model`, to all samples of all records.
 
+    `records` are those of one device: a record, the path of a file, a data frame or a mapping of
+    arrays (see `record_from`), or several of these.
     Maximum likelihood over all records together: every record has its own noise level (its
     residual's), initial state and offset. `stiffness` is the free stack's stiffness [N/m] from a
     data sheet; without it forces keep the scale of an assumed stiffness, and the model says so. A
     keyboard interrupt ends the search with the best fit so far, which `warnings` then says. Raises
     InputError, SimulationError.
     """
-    ready = [prepared(r) for r in records]
+    given_records = records_given(records)
+    ready = [prepared(r) for r in given_records]
     fitted = [r for r, _ in ready]
     experiments = tuple(whole(r) for r in fitted)
     start, given = chosen_start(fitted, model, stiffness)
@@ -97,7 +117,7 @@ def identify(
         progress("what further records would tell")
         advised = advice(best, experiments, determined, force_scale_given=given)
     return Identification(
-        model=with_provenance(best.model, determined, records, given),
+        model=with_provenance(best.model, determined, given_records, given),
         fit=best,
         determinacy=determined,
         experiments=experiments,

@@ -14,7 +14,7 @@ from psa_casadi.variables import Input, Parameter, Provenance, State, nominal_va
 __all__ = ["Model", "Structure", "compose"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Model:
     """A composed model with parameter values (SI units) and where they come from."""
 
@@ -23,6 +23,11 @@ class Model:
     name: str = "psa"
     description: str = ""
     provenance: Provenance = field(default_factory=Provenance)
+
+    def __repr__(self) -> str:
+        """Return name and composition in one line."""
+        parts = ", ".join(c.name for c in self.components)
+        return f"<Model '{self.name}': {parts}; {len(self.values)} parameters>"
 
     @property
     def components(self) -> tuple[Component, ...]:

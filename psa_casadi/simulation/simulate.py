@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +10,7 @@ import numpy.typing as npt
 from psa_casadi.errors import Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
+from psa_casadi.shown import Shown, frame
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import Steps
 from psa_casadi.simulation.ways import accurate
@@ -16,8 +18,8 @@ from psa_casadi.simulation.ways import accurate
 FloatArray = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Shown):
     """A simulated experiment in SI units; arrays of shape (n,), one per state and output.
 
     `way` tells how it was integrated, by exact steps of the linear part or by the stepper.
@@ -35,6 +37,10 @@ class Trajectory:
         """Displacement that the sensor shows; without a sensor, that of the output [m]."""
         name = "measured_displacement"
         return self.outputs[name if name in self.outputs else "displacement"]
+
+    def to_frame(self) -> Any:
+        """Return time, voltage, states and outputs as a pandas DataFrame, in SI units."""
+        return frame({"time": self.time, "voltage": self.voltage, **self.states, **self.outputs})
 
 
 def simulate(

@@ -34,7 +34,7 @@ FIT_RTOL = 1e-6
 _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """The result of a prediction-error fit.
 
@@ -58,6 +58,11 @@ class Fit:
     evaluations: int
     way: Way
     simulated: tuple[Simulated, ...]
+
+    def __repr__(self) -> str:
+        """Return what was fitted and what it leaves, in one line."""
+        names = ", ".join(self.unknowns.names)
+        return f"<Fit of {names}: residual {self.rms:.3g} m rms, {self.evaluations} evaluations>"
 
     def of_record(self, experiments: Sequence[Experiment], record: int) -> slice:
         """Where the used samples of one record stand in `residuals` and `jacobian`."""
