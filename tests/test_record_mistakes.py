@@ -141,14 +141,14 @@ def test_files_that_are_no_csv_are_named_with_the_reason(tmp_path: Path) -> None
     (tmp_path / "empty.csv").write_text("\n \n")
     (tmp_path / "comments.csv").write_text("# only\n# comments\n")
     (tmp_path / "binary.csv").write_bytes(b"PK\x03\x04\x00\x00\x08")
-    (tmp_path / "wide.csv").write_bytes("time [s]".encode("utf-16"))
+    (tmp_path / "wide.csv").write_bytes("time [s]".encode("utf-16")[:-1])
     reasons = {
         "absent.csv": "there is no such file; check the name",
         "": "is a directory; name the CSV files in it",
         "empty.csv": "the file is empty",
         "comments.csv": "holds no header and no data",
         "binary.csv": "is not text but a binary file",
-        "wide.csv": "is UTF-16 text, expected UTF-8",
+        "wide.csv": "begins as UTF-16 text and is none",
     }
     for name, reason in reasons.items():
         (problem,) = problems_of(tmp_path / name)

@@ -28,7 +28,7 @@ app = typer.Typer(
     epilog="Start with: psa demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 export = typer.Typer(help="Write a model in a format that other tools read.", no_args_is_help=True)
 design = typer.Typer(

@@ -1,6 +1,8 @@
 """The bytes of a record's file, or a sentence that says why there are none."""
 
+import gzip
 import os
+import zlib
 from pathlib import Path
 
 from psa_casadi.errors import InputError
@@ -27,3 +29,17 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     if not data.strip():
         raise InputError(f"{path}: the file is empty; export the record again.")
     return data
+
+
+def unpacked(data: bytes, path: str | os.PathLike[str]) -> bytes:
+    """Return the content of a gzipped file, of any other the data itself.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    if not data.startswith(b"\x1f\x8b"):
+        return data
+    try:
+        return gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error

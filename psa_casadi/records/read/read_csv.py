@@ -1,9 +1,11 @@
 """Columns from CSV files.
 
-A header names each column with its unit in brackets, in any order:
-`time [s],voltage [V],displacement [um],load_force [N],temperature [degC]`. Lines before it that
-begin with # are comments. Cells are separated by commas, semicolons or tabs, as in the header.
-Missing samples are allowed in `displacement` (an empty cell or nan).
+A header names each column with its unit, in any order:
+`time [s],voltage [V],displacement [um],load_force [N],temperature [degC]`. Laboratories' names for
+them are understood (`Time (s)`, `voltage_V`, `pos [um]`), and units in a row below. What stands
+before the header is left alone. Cells are separated by commas, semicolons, tabs or spaces, as in
+the header. A file of numbers alone needs `wanted` with the columns counted from 1. Missing samples
+are allowed in `displacement` (an empty cell or nan).
 """
 
 from collections.abc import Sequence
@@ -26,7 +28,10 @@ def read_csv(
         InputError: the file cannot be read, or is not text.
     """
     text = load_text(path)
-    fields = parse_header(text.header, required, text.where_header, problems, wanted)
+    if not text.header and all(source.array.isdecimal() for source in wanted.values()) and wanted:
+        text = text.numbered()
+    header = text.header or text.rows[0].split(text.delimiter)
+    fields = parse_header(header, required, text.where_header, problems, wanted)
     if not fields:
         return None
     numbers = parse_numbers(text, fields, problems)
