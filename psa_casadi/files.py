@@ -33,6 +33,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             if target.exists():
                 temporary.chmod(target.stat().st_mode & 0o777)
             replace_durably(temporary, target)
+    except BrokenPipeError:  # who read it has gone
+        raise
     except OSError as error:
         raise InputError(
             f"{path}: cannot write ({error.strerror or error}); choose another place or free this"

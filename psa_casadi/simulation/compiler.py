@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy.lib.introspect
 
 from psa_casadi.cache import VARIABLE, cached, writable_room
-from psa_casadi.errors import PsaError
+from psa_casadi.errors import MachineError
 from psa_casadi.scratch import run_child
 
 #: Flags for speed that keep the results of one source the same on every compiler.
@@ -34,7 +34,7 @@ def sources_directory() -> Path:
     for candidate in (here / "fmu_src", here.parent / "fmu_src"):
         if candidate.is_dir():
             return candidate
-    raise PsaError(
+    raise MachineError(
         "The C sources (fmu_src) are missing from this installation; reinstall psa_casadi."
     )
 
@@ -42,7 +42,7 @@ def sources_directory() -> Path:
 def compiler_command() -> list[str]:
     """Return the command that compiles C on this machine.
 
-    Raises PsaError where `$CC` is no command.
+    Raises MachineError where `$CC` is no command.
     """
     wanted = os.environ.get("CC", "").strip()
     if not wanted:
@@ -53,7 +53,7 @@ def compiler_command() -> list[str]:
     try:
         return shlex.split(wanted, posix=platform.system() != "Windows")
     except ValueError as error:
-        raise PsaError(f"CC is {wanted!r}, which is no command ({error}); {_CURE}") from error
+        raise MachineError(f"CC is {wanted!r}, which is no command ({error}); {_CURE}") from error
 
 
 def zig_command() -> list[str]:
@@ -74,13 +74,13 @@ def vector_flags() -> tuple[str, ...]:
 
 
 def run_compiler(command: Sequence[str], directory: Path) -> None:
-    """Run a compiler command in a directory; raise PsaError with its messages if it fails.
+    """Run a compiler command in a directory; raise MachineError with its messages if it fails.
 
     What it makes for itself lies in the directory too, so that it goes with it. Raises OSError
     where the disk is full.
     """
     own = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(directory))
-    environment = {**os.environ, **own}
+    environment = {**os.environ, **own, "LC_ALL": "C"}  # its messages in English
     if "ziglang" in command:
         environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(writable_room("zig")))
         environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(directory))
@@ -89,14 +89,14 @@ def run_compiler(command: Sequence[str], directory: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.ENOENT, errno.EACCES, errno.ENOEXEC):
             raise
-        raise PsaError(
+        raise MachineError(
             f"The C compiler {command[0]} cannot be started ({error.strerror}); {_CURE}"
         ) from error
     full = os.strerror(errno.ENOSPC)
     if done.returncode and full in done.stderr:
         raise OSError(errno.ENOSPC, full, str(directory))
     if done.returncode:
-        raise PsaError(
+        raise MachineError(
             f"The C compiler failed ({' '.join(command[:3])} ...){_how(done.returncode)}:\n"
             f"{done.stderr[-4000:]}\n{_CURE[0].upper()}{_CURE[1:]}"
         )
@@ -145,7 +145,7 @@ def generated_library(
         except OSError as error:
             if error.errno != errno.ENOEXEC:
                 raise
-            raise PsaError(
+            raise MachineError(
                 f"{error.filename}: a compiled model cannot be loaded ({error.strerror}). A folder"
                 f" from which no program may run (noexec), or a CC for another machine, is the"
                 f" likely cause; set {VARIABLE} to a folder of another disk, or unset CC."
@@ -189,5 +189,5 @@ def _compile(
     ]  # fmt: skip
     run_compiler(command, work)
     if not (work / output).is_file():
-        raise PsaError(f"The C compiler {command[0]} wrote no library; {_CURE}")
+        raise MachineError(f"The C compiler {command[0]} wrote no library; {_CURE}")
     return work / output

@@ -89,7 +89,7 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
     version, so that the same model is compiled once. A machine's own compiler may change unseen.
 
-    Raises PsaError with the compiler's messages if it fails.
+    Raises MachineError with the compiler's messages if it fails.
     """
     output = identifier + target.suffix
     own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
