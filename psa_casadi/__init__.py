@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from psa_casadi.diagnosis.result import Diagnosis
     from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
-    from psa_casadi.errors import InputError, PsaError
+    from psa_casadi.errors import InputError, MachineError, PsaError
     from psa_casadi.export.check.check import CheckReport, check_fmu
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.modelica.package import export_modelica
@@ -174,6 +174,7 @@ _HOMES = {
     ),
     "psa_casadi.errors": (
         "InputError",
+        "MachineError",
         "PsaError",
     ),
 }
@@ -245,6 +246,7 @@ __all__ = [
     "CheckReport",
     "check_fmu",
     "InputError",
+    "MachineError",
     "PsaError",
     "datasets",
     "__version__",

@@ -7,7 +7,8 @@ from typing import ParamSpec
 
 import typer
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.cli.surroundings import refused_by_the_machine, silence
+from psa_casadi.errors import InputError, MachineError, PsaError
 
 P = ParamSpec("P")
 
@@ -28,6 +29,9 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             command(*args, **options)
         except (typer.Exit, typer.Abort):
             raise
+        except BrokenPipeError as error:
+            silence()
+            raise typer.Exit(1) from error
         except InputError as error:
             if os.environ.get(DEBUG):
                 raise
@@ -53,8 +57,12 @@ def _tell_problems(problems: tuple[str, ...]) -> None:
 
 
 def _tell_failure(error: Exception) -> None:
-    if isinstance(error, PsaError):
+    if isinstance(error, (PsaError, MachineError)):
         typer.echo(f"Failed: {error}", err=True)
+        return
+    refused = refused_by_the_machine(error)
+    if refused is not None:
+        typer.echo(f"Failed: {refused}", err=True)
         return
     typer.echo(
         f"Failed: an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi,"

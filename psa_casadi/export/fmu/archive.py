@@ -45,7 +45,7 @@ def export_fmu(
     same bytes. The file is written whole or not at all.
 
     Raises InputError for an impossible name, an unknown platform or version, or a model without
-    states, and PsaError if a compiler fails.
+    states, and MachineError if a compiler fails.
     """
     identifier = name or model.name
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):

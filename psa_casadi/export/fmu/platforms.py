@@ -2,18 +2,17 @@
 
 import hashlib
 import platform
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from psa_casadi.cache import cached
 from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.sources import compiled_files
-from psa_casadi.files import atomic_path
+from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import (
     OPTIMISE,
-    cache_directory,
     compiler_command,
     run_compiler,
     zig_command,
@@ -90,7 +89,7 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
     version, so that the same model is compiled once. A machine's own compiler may change unseen.
 
-    Raises PsaError with the compiler's messages if it fails.
+    Raises MachineError with the compiler's messages if it fails.
     """
     output = identifier + target.suffix
     own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
@@ -100,25 +99,21 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
         "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
     ]  # fmt: skip
     if target.target is None:
-        return _compiled(texts, [*compiler_command(), *arguments], output)
+        with temporary_folder() as work:
+            return _compiled(work, texts, [*compiler_command(), *arguments], output).read_bytes()
     arguments = ["-target", target.target, *arguments]
     content = (version("ziglang"), arguments, sorted(texts.items()))
     digest = hashlib.sha256(repr(content).encode("utf-8")).hexdigest()[:32]
-    kept = cache_directory() / "binaries" / (digest + target.suffix)
-    try:
-        return kept.read_bytes()
-    except FileNotFoundError:
-        made = _compiled(texts, [*zig_command(), *arguments], output)
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(kept) as temporary:
-        temporary.write_bytes(made)
-    return made
+    command = [*zig_command(), *arguments]
+    kept = cached(
+        "binaries", digest + target.suffix, lambda work: _compiled(work, texts, command, output)
+    )
+    return kept.read_bytes()
 
 
-def _compiled(texts: Mapping[str, str], command: Sequence[str], output: str) -> bytes:
-    """Run a compiler in a folder of the sources; return the bytes of the file it wrote."""
-    with tempfile.TemporaryDirectory() as directory:
-        for name, text in texts.items():
-            (Path(directory) / name).write_text(text, encoding="utf-8", newline="\n")
-        run_compiler(command, Path(directory))
-        return (Path(directory) / output).read_bytes()
+def _compiled(work: Path, texts: Mapping[str, str], command: Sequence[str], output: str) -> Path:
+    """Run a compiler in a folder, with the sources; return the path of the file it wrote."""
+    for name, text in texts.items():
+        (work / name).write_text(text, encoding="utf-8", newline="\n")
+    run_compiler(command, work)
+    return work / output

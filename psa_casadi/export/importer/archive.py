@@ -1,8 +1,8 @@
 """The files of an FMU of either version, extracted, and what its description says."""
 
 import re
-import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,6 +10,7 @@ import fmpy
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer import fmi2_functions, fmi3_functions
+from psa_casadi.scratch import temporary_folder
 
 #: The functions of each version of the standard, without their prefix.
 FUNCTIONS = {2: fmi2_functions.FUNCTIONS, 3: fmi3_functions.FUNCTIONS}
@@ -27,18 +28,19 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        self._held = ExitStack()
+        folder = self._held.enter_context(temporary_folder())
         try:
-            self.directory = Path(fmpy.extract(str(path), unzipdir=self._folder.name))
+            self.directory = Path(fmpy.extract(str(path), unzipdir=str(folder)))
             self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
         except Exception as error:  # fmpy raises it for any damage
-            self._folder.cleanup()
+            self._held.close()
             problem = f"{path}: cannot be read as an FMU ({error}); export it again."
             raise InputError(problem) from error
         said = str(self.description.fmiVersion)
         interface = self.description.coSimulation or self.description.modelExchange
         if said[:2] not in ("2.", "3.") or interface is None:
-            self._folder.cleanup()
+            self._held.close()
             raise InputError(
                 f"{path}: is of FMI {said} or has no interface that is known; export it again with"
                 " --fmi 2 or --fmi 3."
@@ -55,7 +57,7 @@ class Archive:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._folder.cleanup()
+        self._held.close()
 
     @property
     def prefix(self) -> str:

@@ -28,7 +28,7 @@ class Library(Archive):
         try:
             self.library = self._load()
         except InputError:
-            self._folder.cleanup()
+            self._held.close()
             raise
         for name in FUNCTIONS[self.version]:
             if hasattr(self.library, self.prefix + name):

@@ -4,7 +4,6 @@ Source: SSP 1.0, section 4.1 (packaging).
 """
 
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from psa_casadi.export.ssp.structure import WiredParts, structure_description
 from psa_casadi.export.ssp.wiring_picture import save_wiring, wiring_svg
 from psa_casadi.files import atomic_path
 from psa_casadi.model.system.system import System
+from psa_casadi.scratch import temporary_folder
 
 __all__ = ["export_ssp", "layout_of", "save_wiring", "wiring_of"]
 
@@ -46,10 +46,10 @@ def export_ssp(
     description = structure_description(wiring, layout, bindings, stop_time)
     entries["SystemStructure.ssd"] = description.encode("utf-8")
     entries[PICTURE_ENTRY] = wiring_svg(wiring, layout).encode("utf-8")
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         for name, model in wiring.parts.items():
             fmu = export_fmu(
-                model, Path(folder) / f"{name}.fmu", name=name, include_sensor=True,
+                model, folder / f"{name}.fmu", name=name, include_sensor=True,
                 platforms=platforms,
             )  # fmt: skip
             entries[f"resources/{name}.fmu"] = fmu.read_bytes()

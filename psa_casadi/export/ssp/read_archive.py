@@ -1,6 +1,5 @@
 """An SSP archive read back: its FMUs loaded, its wires, the values of its parameter sets."""
 
-import tempfile
 import zipfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,6 +10,7 @@ from fmpy.ssp.ssd import read_ssd
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.ssp.layout import OUTSIDE, Port, Wire
+from psa_casadi.scratch import temporary_folder
 
 
 class SspArchive:
@@ -24,9 +24,7 @@ class SspArchive:
 
     def __init__(self, path: Path) -> None:
         self._held = ExitStack()
-        folder = Path(
-            self._held.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
-        )
+        folder = self._held.enter_context(temporary_folder())
         try:
             with zipfile.ZipFile(path) as archive:
                 archive.extractall(folder)

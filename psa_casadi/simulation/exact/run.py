@@ -108,7 +108,9 @@ def _compiled(structure: Structure, output: str, lanes: int) -> Path | str:
 @cache
 def _generator() -> str:
     """Return the text of what generates: another one makes other libraries."""
-    return "".join(path.read_text() for path in sorted(Path(__file__).parent.glob("*.py")))
+    return "".join(
+        path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py"))
+    )
 
 
 @cache
