@@ -1,9 +1,11 @@
 """The C compiler, and a cache of compiled models.
 
-The compiler is `$CC` or `cc` where there is one, else the one in the `ziglang` wheel.
+The compiler is `$CC` or `cc` where there is one, else the one in the `ziglang` wheel, which the
+extra `compiler` installs.
 """
 
 import hashlib
+import importlib.util
 import os
 import platform
 import shutil
@@ -22,6 +24,8 @@ from psa_casadi.errors import PsaError
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
+#: The command that installs a C compiler where the system has none.
+INSTALL_ZIG = "pip install 'psa-casadi[compiler]'"
 
 
 def sources_directory() -> Path:
@@ -55,12 +59,34 @@ def compiler_command() -> list[str]:
     if wanted:
         return wanted.split()
     found = None if platform.system() == "Windows" else shutil.which("cc")
-    return [found] if found else zig_command()
+    return [found] if found and not _only_asks_for_tools(found) else zig_command()
+
+
+@cache
+def _only_asks_for_tools(command: str) -> bool:
+    """A Mac without developer tools has a `cc` that compiles nothing, but asks to install them."""
+    if platform.system() != "Darwin" or command != "/usr/bin/cc":
+        return False
+    return subprocess.run(["xcode-select", "-p"], capture_output=True, check=False).returncode != 0
 
 
 def zig_command() -> list[str]:
-    """Return the command of the C compiler in the `ziglang` wheel."""
+    """Return the command of the C compiler in the `ziglang` wheel.
+
+    Raises PsaError where the wheel is not installed.
+    """
+    if not has_zig():
+        raise PsaError(
+            "There is no C compiler to be found, which turns a model into a fast program: run "
+            f"`{INSTALL_ZIG}`, or install the system's compiler (on Debian and Ubuntu `apt install "
+            "gcc libc6-dev`, on macOS `xcode-select --install`), or name one in CC."
+        )
     return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def has_zig() -> bool:
+    """Whether the `ziglang` wheel is installed."""
+    return importlib.util.find_spec("ziglang") is not None
 
 
 @cache
