@@ -47,7 +47,9 @@ def frame(columns: dict[str, Any]) -> Any:
     try:
         pandas = import_module("pandas")
     except ImportError as error:
-        raise ImportError("A data frame needs pandas: `pip install pandas`.") from error
+        raise ImportError(
+            "A data frame needs pandas: run `pip install 'psa-casadi[pandas]'`."
+        ) from error
     return pandas.DataFrame(columns)
 
 

@@ -54,6 +54,7 @@ def fmu(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.fmu.platforms import chosen_platforms
+    from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
     given = Given(effects)
     given.outputs({"--output": output}, [model])
@@ -81,4 +82,10 @@ def fmu(
     if left_out:
         show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
+    if not has_zig():
+        show(
+            "The binary is by this machine's compiler, for systems like this one; after"
+            f" `{INSTALL_ZIG}` it loads on older ones too.",
+            quiet,
+        )
     tell_written(output, quiet=quiet)

@@ -1,15 +1,18 @@
 """The C compiler, and the compiled models that are kept.
 
-The compiler is `$CC` or `cc` where there is one, else the one in the `ziglang` wheel.
+The compiler is `$CC` or `cc` where there is one, else the one in the `ziglang` wheel, which the
+extra `compiler` installs.
 """
 
 import ctypes
 import errno
 import hashlib
+import importlib.util
 import os
 import platform
 import shlex
 import shutil
+import subprocess
 import sys
 import threading
 from collections import defaultdict
@@ -25,7 +28,9 @@ from psa_casadi.scratch import run_child
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
-_CURE = "set CC to a working C99 compiler, or unset it and reinstall the ziglang wheel."
+#: The command that installs a C compiler where the system has none.
+INSTALL_ZIG = "pip install 'psa-casadi[compiler]'"
+_CURE = f"set CC to a working C99 compiler, or unset it and run {INSTALL_ZIG}."
 
 
 def sources_directory() -> Path:
@@ -47,7 +52,7 @@ def compiler_command() -> list[str]:
     wanted = os.environ.get("CC", "").strip()
     if not wanted:
         found = None if platform.system() == "Windows" else shutil.which("cc")
-        return [found] if found else zig_command()
+        return [found] if found and not _only_asks_for_tools(found) else zig_command()
     if shutil.which(wanted):  # a path with spaces
         return [wanted]
     try:
@@ -56,9 +61,31 @@ def compiler_command() -> list[str]:
         raise MachineError(f"CC is {wanted!r}, which is no command ({error}); {_CURE}") from error
 
 
+@cache
+def _only_asks_for_tools(command: str) -> bool:
+    """A Mac without developer tools has a `cc` that compiles nothing, but asks to install them."""
+    if platform.system() != "Darwin" or command != "/usr/bin/cc":
+        return False
+    return subprocess.run(["xcode-select", "-p"], capture_output=True, check=False).returncode != 0
+
+
 def zig_command() -> list[str]:
-    """Return the command of the C compiler in the `ziglang` wheel."""
+    """Return the command of the C compiler in the `ziglang` wheel.
+
+    Raises MachineError where the wheel is not installed.
+    """
+    if not has_zig():
+        raise MachineError(
+            "There is no C compiler to be found, which turns a model into a fast program: run "
+            f"`{INSTALL_ZIG}`, or install the system's compiler (on Debian and Ubuntu `apt install "
+            "gcc libc6-dev`, on macOS `xcode-select --install`), or name one in CC."
+        )
     return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def has_zig() -> bool:
+    """Whether the `ziglang` wheel is installed."""
+    return importlib.util.find_spec("ziglang") is not None
 
 
 @cache

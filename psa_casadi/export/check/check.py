@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ParamSpec
 
@@ -27,6 +27,7 @@ from psa_casadi.export.check.events import (
     wrong_indicators,
 )
 from psa_casadi.export.check.origin import (
+    not_compared,
     unreproducible_parts,
     wrong_dependencies,
     wrong_start_values,
@@ -108,6 +109,7 @@ def check_fmu(
         if chosen:
             chosen = [_as_exported(archive, chosen[0])]
             rows += [_count(name, check, archive, chosen[0]) for name, check in _ORIGIN.items()]
+            rows.append(_reproducible(archive, chosen[0]))
     loaded: list[Fmu] = []
     compared = False
     rows.append(_count("binary loads", _load, path, loaded))
@@ -166,6 +168,12 @@ def _figure(
     return CheckRow(name, figure, limit, figure <= limit, remark)
 
 
+def _reproducible(archive: Archive, model: Model) -> CheckRow:
+    """Return the row of the export made again; one that passes says what it did not compare."""
+    row = _count("reproducible", unreproducible_parts, archive, model)
+    return replace(row, remark=not_compared(archive)) if row.passed else row
+
+
 def _invalid(path: Path) -> list[str]:
     """Return what fmpy finds wrong with the archive and its description."""
     return [" ".join(str(problem).split()) for problem in validate_fmu(str(path))]
@@ -213,7 +221,6 @@ _DESCRIBED: dict[str, Callable[[Archive], Iterable[str]]] = {
 _ORIGIN: dict[str, Callable[[Archive, Model], Iterable[str]]] = {
     "start values": wrong_start_values,
     "dependencies of the model": wrong_dependencies,
-    "reproducible": unreproducible_parts,
 }
 _INTERFACES = {
     "co-simulation instantiates": CO_SIMULATION,

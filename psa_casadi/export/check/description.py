@@ -9,6 +9,7 @@ from psa_casadi.export.importer.archive import FUNCTIONS, Archive
 from psa_casadi.export.importer.binary_file import read_binary
 from psa_casadi.export.importer.calls import MODEL_EXCHANGE
 from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.simulation.compiler import INSTALL_ZIG
 from psa_casadi.units import parse_unit
 
 #: The newest version of the GNU C library that a binary may need.
@@ -100,7 +101,10 @@ def new_libraries(archive: Archive) -> Iterator[str]:
         for need in sorted(n for n in needs if n.startswith("GLIBC_")):
             version = need.removeprefix("GLIBC_").split(".")
             if not all(p.isdigit() for p in version) or tuple(map(int, version)) > _NEWEST_LIBC:
-                yield f"{place} needs {need}"
+                yield (
+                    f"{place} needs {need}, which older systems lack; for one that loads on them"
+                    f" run `{INSTALL_ZIG}` and export it again"
+                )
 
 
 def _functions(archive: Archive) -> frozenset[str]:

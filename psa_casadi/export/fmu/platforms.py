@@ -12,8 +12,10 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.sources import compiled_files
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import (
+    INSTALL_ZIG,
     OPTIMISE,
     compiler_command,
+    has_zig,
     run_compiler,
     zig_command,
 )
@@ -67,7 +69,8 @@ def host_platform() -> Platform:
 def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     """Return the platforms named: names of `PLATFORMS`, "host" or "all"; each once, in order.
 
-    Raises InputError for a name that is not known.
+    Raises InputError for a name that is not known, and for platforms that are not this machine's
+    where the `ziglang` compiler is not installed.
     """
     unknown = [n for n in names if n not in (*PLATFORMS, "host", "all")]
     if unknown or not names:
@@ -80,6 +83,12 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     for name in names:
         found = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
         chosen.update({p.name: p for p in found})
+    foreign = ", ".join(n for n in chosen if n != host_platform().name)
+    if foreign and not has_zig():
+        raise InputError(
+            f"The machine's own compiler makes no binary for {foreign}; run `{INSTALL_ZIG}`, or"
+            " export for the host alone."
+        )
     return tuple(chosen.values())
 
 
@@ -87,7 +96,8 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     """Compile sources to a shared library that exports only FMI functions; return its bytes.
 
     What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
-    version, so that the same model is compiled once. A machine's own compiler may change unseen.
+    version, so that the same model is compiled once. Without it, this machine's binary is made by
+    its own compiler, which may change unseen, and for its own C library.
 
     Raises MachineError with the compiler's messages if it fails.
     """
@@ -98,7 +108,7 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
         *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
         "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
     ]  # fmt: skip
-    if target.target is None:
+    if target.target is None or not has_zig():
         with temporary_folder() as work:
             return _compiled(work, texts, [*compiler_command(), *arguments], output).read_bytes()
     arguments = ["-target", target.target, *arguments]

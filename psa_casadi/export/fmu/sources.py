@@ -4,7 +4,7 @@ import hashlib
 import itertools
 import math
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -38,6 +38,9 @@ FMI_HEADERS = {
     2: ("fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h"),
     3: ("fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h"),
 }
+
+#: The files whose text is CasADi's, and differs from one version of it to another.
+FROM_CASADI = ("model.c", "model_config.h", "model_derivatives.c", "fmi_config.h")
 
 #: Warnings under which all sources compile cleanly.
 STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -97,14 +100,18 @@ def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dic
     return {n: t.replace("\r\n", "\n") for n, t in texts.items()}
 
 
-def compiled_files(texts: Sequence[str] | dict[str, str]) -> list[str]:
+def compiled_files(texts: Iterable[str]) -> list[str]:
     """Return the names that are C files, sorted."""
     return sorted(n for n in texts if n.endswith(".c"))
 
 
 def export_token(model: Model, identifier: str, fmi: int = 2) -> str:
     """Return the token (GUID) of an export: a hash of its description and its sources."""
-    texts = source_files(model, identifier, "", fmi)
+    return token_of(model, identifier, source_files(model, identifier, "", fmi), fmi)
+
+
+def token_of(model: Model, identifier: str, texts: Mapping[str, str], fmi: int) -> str:
+    """Return the token of an export with these sources, which were made with an empty token."""
     describe = model_description if fmi == 2 else model_description3
     digest = hashlib.sha256(describe(model, identifier, "", compiled_files(texts)).encode("utf-8"))
     for name, text in sorted(texts.items()):
