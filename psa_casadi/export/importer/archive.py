@@ -10,9 +10,11 @@ import fmpy
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer import fmi2_functions, fmi3_functions
+from psa_casadi.export.importer.unpack import unpack
 
 #: The functions of each version of the standard, without their prefix.
 FUNCTIONS = {2: fmi2_functions.FUNCTIONS, 3: fmi3_functions.FUNCTIONS}
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
 _LIBRARY = re.compile(r".*\.(so|dll|dylib)")
 
 
@@ -22,29 +24,41 @@ class Archive:
     `version` is 2 or 3, `description` fmpy's record of the XML, `references` and `nominals` map the
     names of variables to value references and nominal values.
 
-    Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0.
+    Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0, or must not be unpacked.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        self.directory = Path(self._folder.name) / "fmu"
         try:
-            self.directory = Path(fmpy.extract(str(path), unzipdir=self._folder.name))
+            self.directory.mkdir()
+            unpack(path, self.directory)
             self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
+            self._read()
         except Exception as error:  # fmpy raises it for any damage
             self._folder.cleanup()
+            if isinstance(error, InputError):
+                raise
             problem = f"{path}: cannot be read as an FMU ({error}); export it again."
             raise InputError(problem) from error
+
+    def _read(self) -> None:
+        """Read what the description says first; raises InputError if it is of no known kind."""
         said = str(self.description.fmiVersion)
         interface = self.description.coSimulation or self.description.modelExchange
         if said[:2] not in ("2.", "3.") or interface is None:
-            self._folder.cleanup()
             raise InputError(
-                f"{path}: is of FMI {said} or has no interface that is known; export it again with"
-                " --fmi 2 or --fmi 3."
+                f"{self.path}: is of FMI {said} or has no interface that is known; export it again"
+                " with --fmi 2 or --fmi 3."
             )
         self.version = int(said[0])
         self.identifier = str(interface.modelIdentifier)
+        if not _IDENTIFIER.fullmatch(self.identifier):  # it names the file that is loaded
+            raise InputError(
+                f"{self.path}: its model identifier {self.identifier!a} is no name in C; export it"
+                " again."
+            )
         self.references = {v.name: int(v.valueReference) for v in self.description.modelVariables}
         self.nominals = {
             v.name: 1.0 if v.nominal is None else float(v.nominal)
