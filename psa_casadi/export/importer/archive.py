@@ -3,6 +3,7 @@
 import re
 import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,27 +22,34 @@ _LIBRARY = re.compile(r".*\.(so|dll|dylib)")
 class Archive:
     """An extracted FMU; a context manager that removes the extracted files.
 
+    One that is unpacked already, in the folder `unpacked`, is left there.
+
     `version` is 2 or 3, `description` fmpy's record of the XML, `references` and `nominals` map the
     names of variables to value references and nominal values.
 
     Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0, or must not be unpacked.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
         self.path = path
-        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-        self.directory = Path(self._folder.name) / "fmu"
+        self._held = ExitStack()
         try:
-            self.directory.mkdir()
-            unpack(path, self.directory)
+            self.directory = unpacked or self._unpacked()
             self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
             self._read()
         except Exception as error:  # fmpy raises it for any damage
-            self._folder.cleanup()
+            self._held.close()
             if isinstance(error, InputError):
                 raise
             problem = f"{path}: cannot be read as an FMU ({error}); export it again."
             raise InputError(problem) from error
+
+    def _unpacked(self) -> Path:
+        """Return a temporary folder with the files of the archive."""
+        folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        place = Path(self._held.enter_context(folder))
+        unpack(self.path, place)
+        return place
 
     def _read(self) -> None:
         """Read what the description says first; raises InputError if it is of no known kind."""
@@ -69,7 +77,7 @@ class Archive:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._folder.cleanup()
+        self._held.close()
 
     @property
     def prefix(self) -> str:

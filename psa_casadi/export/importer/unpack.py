@@ -87,7 +87,7 @@ def _list_size(path: Path) -> int:
     place = tail.rfind(b"PK\5\6")
     if place < 0:
         raise zipfile.BadZipFile("it has no list of entries")
-    if tail[: place][-20:-16] == b"PK\6\7":  # the large form stands before it
+    if tail[:place][-20:-16] == b"PK\6\7":  # the large form stands before it
         return int(struct.unpack_from("<40xQ", tail, max(place - 76, 0))[0])
     return int(struct.unpack_from("<12xI", tail, place)[0])
 
