@@ -108,10 +108,10 @@ def library() -> bytes:
     return shared_library({"hostile.c": _SOURCE}, []).read_bytes()
 
 
-def hostile_fmu(path: Path, fmi: int) -> Path:
-    """Write the FMU."""
+def hostile_fmu(path: Path, fmi: int, content: bytes | None = None) -> Path:
+    """Write the FMU, with another content of its library if one is given."""
     folder = fmpy.platform_tuple if fmi == 3 else fmpy.platform
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", _DESCRIPTIONS[fmi])
-        archive.writestr(f"binaries/{folder}/h{fmpy.sharedLibraryExtension}", library())
+        archive.writestr(f"binaries/{folder}/h{fmpy.sharedLibraryExtension}", content or library())
     return path

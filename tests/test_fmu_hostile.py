@@ -119,9 +119,9 @@ def _gone(place: Path) -> bool:
 def test_memory_ends_at_its_limit(
     fmi: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row, _ = _ended(tmp_path, fmi, "step:memory", monkeypatch, memory=400 << 20)
+    row, _ = _ended(tmp_path, fmi, "step:memory", monkeypatch, memory=200 << 20)
     assert row.name == "life cycle"
-    assert "reached the memory limit of 400 MiB (--memory sets it)" in row.remark
+    assert "reached the memory limit of 200 MiB (--memory sets it)" in row.remark
 
 
 def test_what_is_printed_is_no_result_and_no_failure(

@@ -22,7 +22,7 @@ def check(
     ] = None,
     effects: EffectsOption = None,
     timeout: Annotated[
-        float, typer.Option(help="Time that the FMU's code may take in all [s].", min=0.1)
+        float, typer.Option(help="Seconds that the FMU's code may take in all.", min=0.1)
     ] = 120.0,
     memory: Annotated[
         int,
@@ -34,9 +34,10 @@ def check(
 ) -> None:
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
 
-    This RUNS THE CODE of the FMU on this machine, as every simulation with it does: in a process of
-    its own, which may crash, hang or fill its memory without harm to the table, but which can read
-    and write your files and use the network. Check an FMU that you do not trust in a container.
+    This RUNS THE CODE of the FMU, as every simulation with it does. A process
+    of its own, with limits of time and memory, keeps its faults from the table.
+    It is no sandbox: the code can read and write your files and use the
+    network. Check an FMU that you do not trust in a container.
     """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.check.check import Limits, check_fmu

@@ -12,11 +12,11 @@ import os
 import pickle
 import signal
 import sys
-from contextlib import suppress
 
 from psa_casadi.export.check.measured import measured
+from psa_casadi.export.check.memory import limit_data
 from psa_casadi.export.check.records import Writer
-from psa_casadi.export.check.task import Limits, Task
+from psa_casadi.export.check.task import Task
 
 #: How much longer than its limit it lives [s] if nobody ends it.
 _GRACE = 30.0
@@ -35,7 +35,8 @@ def main() -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.close(nothing)
-    _limit(task.limits)
+    faulthandler.dump_traceback_later(task.limits.timeout + _GRACE, exit=True)
+    limit_data(task.limits.memory)
     writer = Writer(records, task.key)
     try:
         for record in measured(task.path, task.unpacked, task.truth):
@@ -44,20 +45,6 @@ def main() -> None:
         writer.out_of_memory()
         raise
     writer.end()
-
-
-def _limit(limits: Limits) -> None:
-    """Limit time and memory of this process; no core file is left."""
-    faulthandler.dump_traceback_later(limits.timeout + _GRACE, exit=True)
-    if sys.platform == "win32":
-        return
-    import resource  # noqa: PLC0415 - there is none on Windows
-
-    for kind, wanted in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_DATA, limits.memory)):
-        most = resource.getrlimit(kind)[1]
-        size = wanted if most == resource.RLIM_INFINITY else min(wanted, most)
-        with suppress(OSError, ValueError):  # a system that does not know this limit
-            resource.setrlimit(kind, (size, size))
 
 
 if __name__ == "__main__":

@@ -12,10 +12,10 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import IO
 
 from psa_casadi.errors import PsaError
+from psa_casadi.export.check.memory import nearly_full
 from psa_casadi.export.check.records import CLOSED, Reader, SpoiltError
 from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.export.check.task import Task
@@ -96,7 +96,7 @@ class Process:
         """
         end, closed, full = time.monotonic() + _START, False, False
         while time.monotonic() < end and not (closed and self.process.poll() is not None):
-            full = full or _data_size(self.process.pid) > _FULL * task.limits.memory
+            full = full or nearly_full(self.process.pid, _FULL)
             chunk = self._chunk()
             if chunk:
                 if not reader.begun and not reader.rows:
@@ -204,15 +204,6 @@ def _read(stream: IO[bytes] | None) -> bytes:
         return os.read(_pipe(stream).fileno(), _CHUNK)
     except (OSError, ValueError):
         return b""
-
-
-def _data_size(pid: int) -> int:
-    """Return the memory that counts for the limit [bytes], 0 where the system does not tell."""
-    with suppress(OSError, ValueError):
-        for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) * 1024
-    return 0
 
 
 def _signal_name(number: int) -> str:

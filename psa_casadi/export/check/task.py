@@ -10,7 +10,7 @@ from psa_casadi.export.check.truth import Truth
 class Limits:
     """How long the foreign code may run in all [s], and how much memory it may take [bytes].
 
-    Memory is limited where the system can do so: on Linux; macOS and Windows do not.
+    Memory is limited on Linux only, and counts from what Python itself has when it starts.
     """
 
     timeout: float = 120.0
