@@ -21,11 +21,26 @@ def check(
         typer.Option(help="MODEL.json to compare with; by default the one that the FMU carries."),
     ] = None,
     effects: EffectsOption = None,
+    timeout: Annotated[
+        float, typer.Option(help="Seconds that the FMU's code may take in all.", min=0.1)
+    ] = 120.0,
+    memory: Annotated[
+        int,
+        typer.Option(
+            help="Memory that the FMU's code may take [MiB]; limited on Linux only.", min=64
+        ),
+    ] = 4096,
     quiet: Quiet = False,
 ) -> None:
-    """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails."""
+    """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
+
+    This RUNS THE CODE of the FMU, as every simulation with it does. A process
+    of its own, with limits of time and memory, keeps its faults from the table.
+    It is no sandbox: the code can read and write your files and use the
+    network. Check an FMU that you do not trust in a container.
+    """
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.check.check import check_fmu
+    from psa_casadi.export.check.check import Limits, check_fmu
     from psa_casadi.model.model_file import load_model
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
@@ -37,7 +52,8 @@ def check(
     chosen = None if model is None else given.attempt(lambda: load_model(model, given.effects))
     given.check()
     with working("checking", quiet):
-        report = check_fmu(fmu, chosen, effects=given.effects)
+        limits = Limits(timeout, memory << 20)
+        report = check_fmu(fmu, chosen, effects=given.effects, limits=limits)
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)
     if not report.passed:

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE, Instance
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.instance3 import Instance3
-from psa_casadi.model.compose import Model
 
 FloatArray = npt.NDArray[np.float64]
 _POINTS = 3
@@ -134,10 +134,10 @@ def _transposed(
     return float(np.max(np.abs(forward - backward) / largest[:, None]))
 
 
-def equation_error(fmu: Fmu, model: Model) -> float:
+def equation_error(fmu: Fmu, truth: Truth) -> float:
     """Return the largest relative difference of derivatives and outputs from the model's."""
     generator = np.random.default_rng(3)
-    unknowns = [*(f"der({n})" for n in model.state_names), *model.output_names]
+    unknowns = [*(f"der({n})" for n in truth.state_names), *truth.output_names]
     worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
     with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
@@ -145,9 +145,9 @@ def equation_error(fmu: Fmu, model: Model) -> float:
             found = evaluate(instance, point, unknowns)
             vectors = [
                 np.array([point[n] for n in names])
-                for names in (model.state_names, model.input_names, model.parameter_names)
+                for names in (truth.state_names, truth.input_names, truth.parameter_names)
             ]
-            xdot, y = model.structure.f(point["time"], *vectors, *held_values(instance))
+            xdot, y = truth.f(point["time"], *vectors, *held_values(instance))
             expected = np.concatenate([np.array(xdot).ravel(), np.array(y).ravel()])
             size = np.abs(expected) + np.abs(found) + 1e-300
             worst = max(worst, float(np.max(np.abs(found - expected) / size)))

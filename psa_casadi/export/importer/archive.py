@@ -10,43 +10,62 @@ import fmpy
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer import fmi2_functions, fmi3_functions
+from psa_casadi.export.importer.unpack import unpack
 from psa_casadi.scratch import temporary_folder
 
 #: The functions of each version of the standard, without their prefix.
 FUNCTIONS = {2: fmi2_functions.FUNCTIONS, 3: fmi3_functions.FUNCTIONS}
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
 _LIBRARY = re.compile(r".*\.(so|dll|dylib)")
 
 
 class Archive:
     """An extracted FMU; a context manager that removes the extracted files.
 
+    One that is unpacked already, in the folder `unpacked`, is left there.
+
     `version` is 2 or 3, `description` fmpy's record of the XML, `references` and `nominals` map the
     names of variables to value references and nominal values.
 
-    Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0.
+    Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0, or must not be unpacked.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
         self.path = path
         self._held = ExitStack()
-        folder = self._held.enter_context(temporary_folder())
         try:
-            self.directory = Path(fmpy.extract(str(path), unzipdir=str(folder)))
+            self.directory = unpacked or self._unpacked()
             self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
+            self._read()
         except Exception as error:  # fmpy raises it for any damage
             self._held.close()
+            if isinstance(error, InputError):
+                raise
             problem = f"{path}: cannot be read as an FMU ({error}); export it again."
             raise InputError(problem) from error
+
+    def _unpacked(self) -> Path:
+        """Return a temporary folder with the files of the archive."""
+        place = self._held.enter_context(temporary_folder())
+        unpack(self.path, place)
+        return place
+
+    def _read(self) -> None:
+        """Read what the description says first; raises InputError if it is of no known kind."""
         said = str(self.description.fmiVersion)
         interface = self.description.coSimulation or self.description.modelExchange
         if said[:2] not in ("2.", "3.") or interface is None:
-            self._held.close()
             raise InputError(
-                f"{path}: is of FMI {said} or has no interface that is known; export it again with"
-                " --fmi 2 or --fmi 3."
+                f"{self.path}: is of FMI {said} or has no interface that is known; export it again"
+                " with --fmi 2 or --fmi 3."
             )
         self.version = int(said[0])
         self.identifier = str(interface.modelIdentifier)
+        if not _IDENTIFIER.fullmatch(self.identifier):  # it names the file that is loaded
+            raise InputError(
+                f"{self.path}: its model identifier {self.identifier!a} is no name in C; export it"
+                " again."
+            )
         self.references = {v.name: int(v.valueReference) for v in self.description.modelVariables}
         self.nominals = {
             v.name: 1.0 if v.nominal is None else float(v.nominal)

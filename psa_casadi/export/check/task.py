@@ -1,0 +1,31 @@
+"""What the process with the foreign code is asked to do, and within which limits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from psa_casadi.export.check.truth import Truth
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long the foreign code may run in all [s], and how much memory it may take [bytes].
+
+    Memory is limited on Linux only, and counts from what Python itself has when it starts.
+    """
+
+    timeout: float = 120.0
+    memory: int = 4 << 30
+
+
+@dataclass(frozen=True)
+class Task:
+    """An FMU by its path (for messages) and the folder into which it was unpacked.
+
+    `key` signs the records; `truth` is what to compare with.
+    """
+
+    path: Path
+    unpacked: Path
+    truth: Truth | None
+    key: bytes
+    limits: Limits
