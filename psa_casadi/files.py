@@ -3,10 +3,13 @@
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from psa_casadi.errors import InputError
+
+#: Files that are being written.
+_TEMPORARY: set[Path] = set()
 
 
 @contextmanager
@@ -30,6 +33,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield target
         return
     temporary = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
+    _TEMPORARY.add(temporary)
     try:
         yield temporary
         if target.exists():
@@ -37,6 +41,14 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+        _TEMPORARY.discard(temporary)
+
+
+def remove_temporaries() -> None:
+    """Remove what is being written, before the process ends at once."""
+    for temporary in tuple(_TEMPORARY):
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def atomic_write(path: str | os.PathLike[str], data: str | bytes) -> None:

@@ -19,7 +19,10 @@ from pathlib import Path
 import numpy.lib.introspect
 
 from psa_casadi.errors import PsaError
+from psa_casadi.interruption import current_work
 
+#: Time [s] between two looks whether a compilation is to end.
+_LOOK = 0.1
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
 
@@ -80,14 +83,37 @@ def run_compiler(command: Sequence[str], directory: Path) -> None:
     environment = dict(os.environ)
     environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(cache_directory() / "zig"))
     environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(cache_directory() / "zig"))
-    done = subprocess.run(
-        command, cwd=directory, env=environment, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
+    code, told = _run_to_end(command, directory, environment)
+    if code:
         raise PsaError(
-            f"The C compiler failed ({' '.join(command[:3])} ...):\n{done.stderr[-4000:]}\n"
+            f"The C compiler failed ({' '.join(command[:3])} ...):\n{told[-4000:]}\n"
             "Set CC to a working C99 compiler, or reinstall the ziglang wheel."
         )
+
+
+def _run_to_end(
+    command: Sequence[str], directory: Path, environment: Mapping[str, str]
+) -> tuple[int, str]:
+    """Return the exit code of a command and what it said of errors; an interrupt ends it."""
+    with subprocess.Popen(
+        command,
+        cwd=directory,
+        env=environment,
+        text=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    ) as process:
+        while True:
+            try:
+                _, told = process.communicate(timeout=_LOOK)
+                return process.returncode, told
+            except subprocess.TimeoutExpired:
+                if current_work().stopped:
+                    process.kill()
+                    raise KeyboardInterrupt from None
+            except BaseException:
+                process.kill()
+                raise
 
 
 def shared_library(
