@@ -1,5 +1,6 @@
 #include "trajectory.h"
 
+#include <math.h>
 #include <string.h>
 
 #include "instants.h"
@@ -84,6 +85,13 @@ static int start_held(const psa_trajectory *run, psa_solver *solver, psa_held *h
     return sample_at(solver, run->u, held);
 }
 
+static int stopped(const psa_trajectory *run) { return run->stop && *run->stop; }
+
+/* After each step: one that was stopped goes no further. */
+static void end_if_stopped(void *owner, double *t_end) {
+    if (stopped(owner)) *t_end = -HUGE_VAL;
+}
+
 /* Integrate over one interval between samples; steps end at the instants inside. One at its end is taken
    with the next sample's input, which is the one after a jump where the input is held. */
 static int next_sample(const psa_trajectory *run, psa_solver *solver, psa_work *work, psa_held *held,
@@ -91,15 +99,18 @@ static int next_sample(const psa_trajectory *run, psa_solver *solver, psa_work *
     const double end = run->t[sample + 1], period = held->p[PSA_PERIOD];
     double u[PSA_NU + 1];
     psa_input input;
+    const psa_watch watch = {end_if_stopped, (void *)run};
     set_input(run, sample, &input);
     while (PSA_NS > 0 && !psa_reached(held->next, end, period)) {
-        int status = (int)psa_solver_advance(solver, work, held->next, &input, held->p, sens, NULL);
+        int status = (int)psa_solver_advance(solver, work, held->next, &input, held->p, sens, &watch);
         if (status != PSA_OK) return status;
+        if (stopped(run)) return PSA_STOPPED;
         psa_input_at(&input, solver->t, u);
         status = sample_at(solver, u, held);
         if (status != PSA_OK) return status;
     }
-    const int status = (int)psa_solver_advance(solver, work, end, &input, held->p, sens, NULL);
+    const int status = (int)psa_solver_advance(solver, work, end, &input, held->p, sens, &watch);
+    if (status == PSA_OK && stopped(run)) return PSA_STOPPED;
     if (status != PSA_OK || PSA_NS == 0 || !psa_reached(end, held->next, period)) return status;
     return sample_at(solver, run->u + (sample + 1) * PSA_NU, held);
 }

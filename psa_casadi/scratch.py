@@ -19,6 +19,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from psa_casadi.interruption import raise_if_stopped
+
 if sys.platform != "win32":
     import fcntl
 
@@ -26,6 +28,8 @@ if sys.platform != "win32":
 PREFIX = ".psa_casadi-"
 #: Age [s] after which a thing that cannot be locked counts as left.
 _OLD = 7 * 86400.0
+#: Time [s] between two looks whether the work is to end.
+_LOOK = 0.1
 #: A name beside the prefix and the random part; a file system takes 255 bytes, a letter up to 4.
 _LONGEST = 50
 
@@ -63,6 +67,7 @@ def run_child(
     """Run a program to its end; it and its children are killed if this process does not wait.
 
     Raises:
+        KeyboardInterrupt: this work is to end.
         OSError: the program cannot be started.
     """
     group = None if sys.platform == "win32" else 0
@@ -74,11 +79,20 @@ def run_child(
     with child:
         _CHILDREN.add(child)
         try:
-            said, complained = child.communicate()
+            said, complained = _heard(child)
         finally:
             _CHILDREN.discard(child)
             _kill(child)
     return subprocess.CompletedProcess(list(command), child.returncode, said, complained)
+
+
+def _heard(child: "subprocess.Popen[str]") -> tuple[str, str]:
+    """Return what a child said on its two streams until it ended."""
+    while True:
+        try:
+            return child.communicate(timeout=_LOOK)
+        except subprocess.TimeoutExpired:
+            raise_if_stopped()
 
 
 def abandon() -> None:

@@ -89,7 +89,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a model's values come from: records, package version, what was free, how sure."""
+    """Where a model's values come from: records, package version, what was free, how sure.
+
+    `interrupted` says that they are those of a search that did not come to its end.
+    """
 
     identified_from: tuple[tuple[str, str], ...] = ()
     package_version: str = ""
@@ -97,6 +100,7 @@ class Provenance:
     intervals: Mapping[str, Interval] = field(default_factory=dict)
     force_scale: str = "assumed"
     notes: tuple[str, ...] = ()
+    interrupted: bool = False
 
 
 def nominal_value(nominal: Nominal, values: Values) -> float:

@@ -1,5 +1,25 @@
 """The command `psa`; each subcommand is a small file that calls one function of the package."""
 
-from psa_casadi.cli.app import main
+import os
+import sys
 
 __all__ = ["main"]
+
+#: Exit code of a command that Ctrl-C has ended.
+INTERRUPTED = 130
+
+
+def main() -> None:
+    """Run the command line; one that was interrupted does not wait for Python's own tidying up."""
+    try:
+        from psa_casadi.cli.app import main as run
+
+        run()
+    except KeyboardInterrupt:
+        os._exit(INTERRUPTED)
+    except SystemExit as ended:
+        if ended.code == INTERRUPTED:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
+        raise

@@ -7,6 +7,8 @@ from typing import ParamSpec
 
 import typer
 
+from psa_casadi.cli import INTERRUPTED
+from psa_casadi.cli.interrupts import interrupts
 from psa_casadi.cli.surroundings import refused_by_the_machine, silence
 from psa_casadi.errors import InputError, MachineError, PsaError
 
@@ -14,24 +16,30 @@ P = ParamSpec("P")
 
 #: Set in the environment, this variable lets a failure end with its traceback.
 DEBUG = "PSA_CASADI_DEBUG"
+#: What is told of an interrupt before there was any result.
+NOTHING_KEPT = "there was no result yet, so nothing was kept."
 
 
 def guarded(command: Callable[P, None]) -> Callable[P, None]:
     """Return the command with its errors told in sentences, without a traceback.
 
     Exit code 2: what the user gave cannot be used; every mistake is listed. Exit code 1: a failure
-    that is not the user's.
+    that is not the user's. 130: interrupted; what was kept is told.
     """
 
     @functools.wraps(command)
     def run(*args: P.args, **options: P.kwargs) -> None:
         try:
-            command(*args, **options)
+            with interrupts():
+                command(*args, **options)
         except (typer.Exit, typer.Abort):
             raise
         except BrokenPipeError as error:
             silence()
             raise typer.Exit(1) from error
+        except KeyboardInterrupt as stop:
+            typer.echo(f"Interrupted: {stop if stop.args else NOTHING_KEPT}", err=True)
+            raise typer.Exit(INTERRUPTED) from None
         except InputError as error:
             if os.environ.get(DEBUG):
                 raise

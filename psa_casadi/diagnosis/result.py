@@ -219,6 +219,19 @@ class Diagnosis(Reported):
         return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
+class DiagnosisInterrupted(KeyboardInterrupt):
+    """A keyboard interrupt ended a diagnosis; `model` is the best so far, marked as interrupted.
+
+    Its effects, if it has any, were not judged. `str(error)` says what the model is.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        effects = ", ".join(c.name for c in model.effects)
+        what = f"the base model with {effects}, not judged" if effects else "the base model"
+        super().__init__(f"the best fit so far is {what}; its values are not final")
+
+
 def _misfit(m: Misfit) -> dict[str, Any]:
     """Return what is seen in one record's residual: shares of its power above the noise."""
     return {

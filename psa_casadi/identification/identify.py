@@ -16,6 +16,7 @@ from psa_casadi.identification.search.refitting import Progress, record_rms, ref
 from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
@@ -31,6 +32,9 @@ _MISSED = 1.5
 #: Rounds of fitting with every record's own residual as its noise level.
 _LEVEL_ROUNDS = 2
 
+INTERRUPTED = (
+    "The search was interrupted; this is the best fit so far, and its values are not final."
+)
 FORCE_NOTE = (
     "Force scale assumed: voltage and displacement determine the displacement only. Forces, masses"
     " and stiffnesses are right in proportion, not in size; give a stiffness to fix them."
@@ -44,7 +48,8 @@ class Identification(Reported):
     `starts` tells what became of every start of the search; `sentences` what was done to the
     records (samples masked, averaged), which is no warning. `combinations` holds what is known of
     parameters that trade off; `advice` the further records that would determine what is open.
-    `read_off` names parameters that were found without a fit (the paper's method).
+    `read_off` names parameters that were found without a fit (the paper's method). `interrupted`
+    says that a keyboard interrupt ended the search, or the advice after it.
     """
 
     model: Model
@@ -57,6 +62,7 @@ class Identification(Reported):
     combinations: tuple[Combination, ...] = ()
     advice: tuple[Advice, ...] = ()
     read_off: tuple[str, ...] = ()
+    interrupted: bool = False
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas DataFrame: value, 95 % interval, unit, meaning."""
@@ -73,6 +79,7 @@ class Identification(Reported):
         return frame(columns)
 
 
+@interruptible_work()
 @one_thread_of_algebra()
 def identify(
     records: Records,
@@ -108,16 +115,23 @@ def identify(
         progress=progress,
     )
     best = _with_own_levels(found.best, experiments, progress)
+    if best.interrupted:
+        current_work().wrap_up()
     determined = determinacy(
         best, experiments, not_unique=found.not_unique, assumed=assumed_ratio(best, experiments)
     )
     open_ones = free_combinations(best.model, determined, force_scale_given=given)
-    advised: tuple[Advice, ...] = ()
+    advised: tuple[Advice, ...] | None = None
     if not best.interrupted:
-        progress("what further records would tell")
-        advised = advice(best, experiments, determined, force_scale_given=given)
+        try:
+            progress("what further records would tell")
+            advised = advice(best, experiments, determined, force_scale_given=given)
+        except KeyboardInterrupt:
+            current_work().wrap_up()
     return Identification(
-        model=with_provenance(best.model, determined, given_records, given),
+        model=with_provenance(
+            best.model, determined, given_records, given, interrupted=best.interrupted
+        ),
         fit=best,
         determinacy=determined,
         experiments=experiments,
@@ -125,12 +139,18 @@ def identify(
         starts=found.starts,
         sentences=tuple(s for _, said in ready for s in said),
         combinations=open_ones,
-        advice=advised,
+        advice=advised or (),
+        interrupted=advised is None,
     )
 
 
 def with_provenance(
-    model: Model, found: Determinacy, records: Sequence[Record], stiffness_given: bool
+    model: Model,
+    found: Determinacy,
+    records: Sequence[Record],
+    stiffness_given: bool,
+    *,
+    interrupted: bool = False,
 ) -> Model:
     """Return a fitted model that says from which records it comes and how sure its values are."""
     c_p = model.values.get("C_p", 0.0)
@@ -142,12 +162,27 @@ def with_provenance(
         free=found.names,
         intervals={**told, **found.intervals},
         force_scale="given" if stiffness_given else "assumed",
+        interrupted=interrupted,
         notes=(
+            *((INTERRUPTED,) if interrupted else ()),
             *(() if stiffness_given else (FORCE_NOTE,)),
             *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
     return replace(model, provenance=provenance)
+
+
+def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
+    """Return the model of the best fit so far, marked as that of a search that was interrupted."""
+    provenance = Provenance(
+        identified_from=tuple((r.name, r.sha256) for r in records),
+        package_version=__version__,
+        free=best.unknowns.names,
+        force_scale="given" if stiffness_given else "assumed",
+        notes=(INTERRUPTED, *(() if stiffness_given else (FORCE_NOTE,))),
+        interrupted=True,
+    )
+    return replace(best.model, provenance=provenance)
 
 
 def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
@@ -161,7 +196,10 @@ def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Pro
         if best.interrupted or change < 0.02:
             break
         progress("base fit with every record's own noise level")
-        best = refit(best, experiments, best.unknowns.names, sigma=levels)
+        try:
+            best = refit(best, experiments, best.unknowns.names, sigma=levels)
+        except KeyboardInterrupt:
+            return replace(best, interrupted=True, converged=False)
     return best
 
 
@@ -170,9 +208,7 @@ def _warnings(
 ) -> tuple[str, ...]:
     sentences = []
     if best.interrupted:
-        sentences.append(
-            "The search was interrupted; this is the best fit so far, and its values are not final."
-        )
+        sentences.append(INTERRUPTED)
     elif not best.converged:
         sentences.append("The fit was cut off before it converged; its values are not final.")
     sentences += _disagreement(searched)

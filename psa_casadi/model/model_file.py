@@ -57,6 +57,7 @@ def dumps(model: Model) -> str:
         "effects": [_reference(c) for c in model.effects],
         "parameters": parameters,
         **({"starts": starts} if starts else {}),
+        **({"interrupted": True} if origin.interrupted else {}),
         "force_scale": origin.force_scale,
         "notes": list(origin.notes),
         "identified_from": [{"record": n, "sha256": h} for n, h in origin.identified_from],
@@ -135,6 +136,7 @@ def _provenance(content: dict[str, Any], given: dict[str, Any]) -> Provenance:
         intervals={n: Interval(*e["interval"]) for n, e in given.items() if e.get("interval")},
         force_scale=content.get("force_scale", "assumed"),
         notes=tuple(content.get("notes", ())),
+        interrupted=content.get("interrupted", False),
     )
 
 
@@ -195,6 +197,10 @@ def _origin_problems(content: dict[str, Any], given: Any, source: str) -> list[s
         for key in ("name", "description", "force_scale", "package_version")
         if not isinstance(content.get(key, ""), str)
     ]
+    if not isinstance(content.get("interrupted", False), bool):
+        problems.append(
+            f"{source}: 'interrupted' is {content['interrupted']!r}; give true or false."
+        )
     notes = content.get("notes", [])
     if not isinstance(notes, list) or not all(isinstance(n, str) for n in notes):
         problems.append(f"{source}: 'notes' is {notes!r}; give a list of texts.")

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import Problems, PsaError
+from psa_casadi.interruption import flag_address
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import fingerprint, generate_c
 from psa_casadi.simulation.compiler import generated_library
@@ -26,6 +27,8 @@ FloatArray = npt.NDArray[np.float64]
 SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")
 _STAGES = 6
 _POINTER = ctypes.c_void_p
+#: Status of a run that an interrupt has ended.
+_STOPPED = 4
 _REASONS = {
     1: "the step size became too small",
     2: "the model returned a value that is not finite",
@@ -48,7 +51,8 @@ class _Run(ctypes.Structure):
         ("steps_most", ctypes.c_long),
         ("x", _POINTER), ("z", _POINTER), ("y", _POINTER),
         ("count", ctypes.c_int), ("which", _POINTER), ("s0", _POINTER), ("output", ctypes.c_int),
-        ("dy", _POINTER), ("work", _POINTER), ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
+        ("dy", _POINTER), ("work", _POINTER), ("stop", _POINTER),
+        ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
         ("evaluations", ctypes.c_long), ("t_failed", ctypes.c_double), ("culprit", ctypes.c_int),
     ]  # fmt: skip
 
@@ -126,10 +130,13 @@ def run(
         steps_limit=steps_limit,
         steps_most=steps_most,
         count=count,
+        stop=flag_address(),
         output=model.output_names.index(output) if count else 0,
         **{name: array.ctypes.data for name, array in arrays.items()},
     )
     status = _library(model.structure).psa_run(ctypes.byref(request))
+    if status == _STOPPED:
+        raise KeyboardInterrupt
     if status:
         state = (*model.state_names, *model.sampled_names, "none")[request.culprit]
         raise SimulationError(
