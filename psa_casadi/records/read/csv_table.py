@@ -69,7 +69,7 @@ def load_text(path: str | os.PathLike[str]) -> CsvText:
     if start == len(lines):
         raise InputError(f"{path}: holds no header and no data; export the record again.")
     delimiter = max(",;\t", key=lines[start].count)
-    header = next(csv.reader([lines[start]], delimiter=delimiter, skipinitialspace=True))
+    header = _split(lines[start], delimiter, spaced=True)
     digest = hashlib.sha256(data).hexdigest()
     return CsvText(
         str(path), digest, tuple(header), delimiter, tuple(lines[start + 1 :]), start + 2
@@ -119,9 +119,17 @@ def _decimal_point(text: CsvText, fields: Mapping[str, Field]) -> str:
 
 
 def _cells(text: CsvText, row: str) -> list[str]:
-    if '"' in row:
-        return next(csv.reader([row], delimiter=text.delimiter))
-    return row.split(text.delimiter)
+    return _split(row, text.delimiter)
+
+
+def _split(row: str, delimiter: str, *, spaced: bool = False) -> list[str]:
+    """Return the cells of a row; `spaced` says that a space may stand before a quoted one."""
+    if '"' not in row and not spaced:
+        return row.split(delimiter)
+    try:
+        return next(csv.reader([row], delimiter=delimiter, skipinitialspace=spaced))
+    except csv.Error:  # a cell of more than 128 KiB, as where a quote never ends
+        return row.split(delimiter)
 
 
 def _parse_at_once(text: CsvText, indices: Sequence[int]) -> Numbers | None:
