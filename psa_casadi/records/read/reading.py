@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.checks import (
     Located,
@@ -122,7 +123,7 @@ def _record(samples: Samples) -> Record:
     }
     in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
     return Record(
-        name=Path(samples.path).stem,
+        name=plain(Path(samples.path).stem),
         time=columns["time"],
         voltage=columns["voltage"],
         displacement=columns.get("displacement"),
