@@ -46,9 +46,16 @@ def atomic_write(path: str | os.PathLike[str], data: str | bytes) -> None:
     """Write `data` to `path`, whole or not at all; text is written as UTF-8 with its own line ends.
 
     Raises:
-        InputError: `path` cannot be written to; the sentence says why.
+        InputError: `path` cannot be written to, or the text cannot be; the sentence says why.
     """
-    content = data.encode("utf-8", "replace") if isinstance(data, str) else data
+    try:
+        content = data.encode() if isinstance(data, str) else data
+    except UnicodeEncodeError as error:
+        found = ord(error.object[error.start])
+        raise InputError(
+            f"{path}: cannot write, the text has the character U+{found:04X}, which UTF-8 does not"
+            " have; remove it from names and descriptions."
+        ) from error
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 

@@ -30,6 +30,11 @@ def with_row(row: int, text: str) -> list[str]:
         ("time [V],voltage [V],displacement [um]", r"'time': the unit 'V' does not measure time"),
         ("time [s],voltage [V],displacement [V]", r"not measure length; .* um, nm, pm, counts\."),
         (f"{HEADER},Voltage [mV]", r"column 4: 'voltage' stands twice .*\(first as column 2\)"),
+        (
+            f"time [s],voltage [V],displacement [um{'9' * 500}]",
+            r"line 1, column 'displacement': 'um9{58}' is not a unit string; write symbols",
+        ),
+        ("time [s],voltage [kV99],displacement [um]", r"'voltage': .*kV99' is not a unit string"),
         ("0,1,2", r"line 1: found '0,1,2', expected a header; write .*'time \[s\],voltage \[V\]"),
     ],
 )
@@ -64,6 +69,14 @@ def test_mistakes_of_a_row(tmp_path: Path, row: str, expected: str) -> None:
     assert expected in problems[0]
     assert problems[0].endswith(".")
     assert ";" in problems[0]
+
+
+def test_a_quote_that_never_ends_is_told_as_a_mistake(tmp_path: Path) -> None:
+    rows = with_row(4, '0.004,"' + "9" * 200_000 + ",1")
+    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
+    assert "line 6, column 'voltage': found '\"999" in problem
+    header = f'{HEADER},"{"x" * 200_000}'
+    assert read_record(write(tmp_path / "b.csv", header, *(f"{row},1" for row in ROWS))).n == 20
 
 
 def test_one_file_has_one_decimal_sign(tmp_path: Path) -> None:

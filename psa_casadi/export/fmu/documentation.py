@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 
+from psa_casadi.characters import check_text
 from psa_casadi.export.common.icon import ICONS, drawing_of, svg
 from psa_casadi.export.common.markup import force_scale, generation_tool, what_it_is
 from psa_casadi.export.common.variable_table import Variable, variable_table
@@ -46,7 +47,8 @@ already follow from the inputs set there, which may be set again before the step
 def documentation(model: Model, *, reference_run: bool = True) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
-    `reference_run` says whether the archive holds one, with its notes.
+    `reference_run` says whether the archive holds one, with its notes. Raises InputError for a
+    character that HTML cannot carry.
     """
     table = variable_table(model)
     name = html.escape(model.name)
@@ -71,6 +73,7 @@ def documentation(model: Model, *, reference_run: bool = True) -> str:
     ]
     head = f'<meta charset="utf-8"><title>{name}</title><style>\n{_STYLE}</style>'
     body = "\n".join(p for p in parts if p)
+    check_text(body, "The page on the model")
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
 
 

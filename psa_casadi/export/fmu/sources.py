@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Expression
+from psa_casadi.export.common.markup import xml_text
 from psa_casadi.export.common.variable_table import Variable, variable_table
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
@@ -231,5 +232,4 @@ def _build_description(identifier: str, names: Sequence[str]) -> str:
     for name in names:
         ET.SubElement(group, "SourceFile", {"name": name})
     ET.SubElement(configuration, "Library", {"name": "m"})
-    ET.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+    return xml_text(root)

@@ -1,6 +1,5 @@
 """From the bytes of a CSV file to named columns of numbers, with every mistake located."""
 
-import csv
 import hashlib
 import math
 import os
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import Field
 from psa_casadi.records.read.file_bytes import read_bytes, unpacked
-from psa_casadi.records.read.layout import layout
+from psa_casadi.records.read.layout import cells_of, layout
 from psa_casadi.units import FloatArray
 
 
@@ -43,7 +42,7 @@ class CsvText:
 
     def numbered(self) -> "CsvText":
         """Return the text of a file without a header with one that counts the columns from 1."""
-        cells = _cells(self, self.rows[0])
+        cells = cells_of(self.rows[0], self.delimiter)
         return replace(self, header=tuple(str(k) for k in range(1, len(cells) + 1)))
 
 
@@ -125,18 +124,12 @@ def _decimal_point(text: CsvText, fields: Mapping[str, Field]) -> str:
     for row in text.rows:
         if "." not in row and "," not in row:
             continue
-        cells = _cells(text, row)
+        cells = cells_of(row, text.delimiter)
         for field in fields.values():
             found = _DECIMAL.fullmatch(cells[field.index]) if field.index < len(cells) else None
             if found:
                 return found[1]
     return "."
-
-
-def _cells(text: CsvText, row: str) -> list[str]:
-    if '"' in row:
-        return next(csv.reader([row], delimiter=text.delimiter))
-    return row.split(text.delimiter)
 
 
 def _parse_at_once(text: CsvText, indices: Sequence[int]) -> Numbers | None:
@@ -171,7 +164,7 @@ def _parse_by_cell(text: CsvText, fields: Mapping[str, Field], problems: Problem
     for line, row in enumerate(text.rows, text.first_line):
         if not row.strip():
             continue
-        cells = _cells(text, row)
+        cells = cells_of(row, text.delimiter)
         if len(cells) != len(text.header):
             problems.add(_wrong_count(text, line, len(cells)))
             continue

@@ -1,21 +1,26 @@
 """The bytes of a record's file, or a sentence that says why there are none."""
 
 import gzip
+import io
 import os
 import zlib
 from pathlib import Path
 
 from psa_casadi.errors import InputError
 
+#: The most bytes that a record may have, in its file or unpacked in memory.
+MOST_BYTES = 2**30
+
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """Return the content of a file that is meant to hold a record.
 
     Raises:
-        InputError: the file is missing, a directory, unreadable or empty.
+        InputError: the file is missing, a directory, unreadable, empty or larger than `MOST_BYTES`.
     """
     try:
-        data = Path(path).read_bytes()
+        with Path(path).open("rb") as stream:
+            data = stream.read(MOST_BYTES + 1)
     except FileNotFoundError:
         raise InputError(
             f"{path}: there is no such file; check the name and the directory it is in."
@@ -26,20 +31,37 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check that you may read it."
         ) from error
+    check_size(path, len(data), "holds")
     if not data.strip():
         raise InputError(f"{path}: the file is empty; export the record again.")
     return data
+
+
+def check_size(path: str | os.PathLike[str], size: int, what: str) -> None:
+    """Refuse more than `MOST_BYTES`; `what` begins the sentence, such as "its columns hold".
+
+    Raises:
+        InputError: `size` is larger.
+    """
+    if size > MOST_BYTES:
+        raise InputError(
+            f"{path}: {what} more than {MOST_BYTES / 2**30:.3g} GiB, the most that is read as one "
+            f"record; leave out arrays that are not needed, or split the record."
+        )
 
 
 def unpacked(data: bytes, path: str | os.PathLike[str]) -> bytes:
     """Return the content of a gzipped file, of any other the data itself.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: the file is damaged, or its content is larger than `MOST_BYTES`.
     """
     if not data.startswith(b"\x1f\x8b"):
         return data
     try:
-        return gzip.decompress(data)
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
+            content = stream.read(MOST_BYTES + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
+    check_size(path, len(content), "holds")
+    return content

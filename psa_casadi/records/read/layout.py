@@ -42,11 +42,11 @@ def layout(lines: Sequence[str]) -> Layout | None:
     place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)))
     delimiter = delimiter_of(lines[start if place is None else place].lstrip("#"))
     if place is None:
-        header = cells_of(lines[start], delimiter)
+        header = cells_of(lines[start], delimiter, spaced=True)
         if len(header) > 1 and all(_NUMBER.fullmatch(c) for c in header):
             return Layout((), delimiter, start, start)
         return Layout(tuple(header), delimiter, start, start + 1)
-    header = cells_of(lines[place].lstrip("# "), delimiter)
+    header = cells_of(lines[place].lstrip("# "), delimiter, spaced=True)
     below = place + 1
     if below < len(lines):
         units = units_row(cells_of(lines[below].lstrip("# "), delimiter))
@@ -56,13 +56,19 @@ def layout(lines: Sequence[str]) -> Layout | None:
     return Layout(tuple(header), delimiter, place, below)
 
 
-def cells_of(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line; the delimiter " " stands for any number of spaces."""
+def cells_of(line: str, delimiter: str, *, spaced: bool = False) -> list[str]:
+    """Return the cells of a line; the delimiter " " stands for any number of spaces.
+
+    `spaced` says that a space may stand before a quoted cell.
+    """
     if delimiter == " ":
         return _SPACES.split(_BEFORE_UNIT.sub("", line.strip()))
-    if '"' in line:
-        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
-    return line.split(delimiter)
+    if '"' not in line:
+        return line.split(delimiter)
+    try:
+        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=spaced), [])
+    except csv.Error:  # a cell of more than 128 KiB, as where a quote never ends
+        return line.split(delimiter)
 
 
 def delimiter_of(line: str) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from psa_casadi.errors import Problems
 from psa_casadi.records.read.columns import ColumnMap, parse_header
 from psa_casadi.records.read.csv_table import load_text, parse_numbers
+from psa_casadi.records.read.layout import cells_of
 from psa_casadi.records.read.samples import Samples
 
 
@@ -30,7 +31,7 @@ def read_csv(
     text = load_text(path)
     if not text.header and all(source.array.isdecimal() for source in wanted.values()) and wanted:
         text = text.numbered()
-    header = text.header or text.rows[0].split(text.delimiter)
+    header = text.header or cells_of(text.rows[0], text.delimiter)
     fields = parse_header(header, required, text.where_header, problems, wanted)
     if not fields:
         return None

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TypeGuard, cast
 
+from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.checks import (
     Located,
@@ -194,7 +195,7 @@ def _record(samples: Samples, source: str | None = None) -> Record:
     }
     in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
     return Record(
-        name=Path(samples.path).stem if source is None else samples.path,
+        name=plain(Path(samples.path).stem if source is None else samples.path),
         time=columns["time"],
         voltage=columns["voltage"],
         displacement=columns.get("displacement"),
