@@ -9,20 +9,28 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.errors import InputError
 from psa_casadi.model.structure import Structure, structure_of
-from psa_casadi.variables import Input, Parameter, Provenance, State, nominal_value
+from psa_casadi.variables import (
+    Input,
+    Parameter,
+    Provenance,
+    Publication,
+    State,
+    nominal_value,
+)
 
 __all__ = ["Model", "Structure", "compose"]
 
 
 @dataclass(frozen=True)
 class Model:
-    """A composed model with parameter values (SI units) and where they come from."""
+    """A composed model with parameter values (SI units), their origin, and who publishes it."""
 
     structure: Structure
     values: Mapping[str, float]
     name: str = "psa"
     description: str = ""
     provenance: Provenance = field(default_factory=Provenance)
+    publication: Publication = field(default_factory=Publication)
 
     @property
     def components(self) -> tuple[Component, ...]:

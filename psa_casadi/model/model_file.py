@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.own_effects import declaration_hash, known_effects
-from psa_casadi.variables import Interval, Provenance
+from psa_casadi.variables import Interval, Provenance, Publication
 
 FORMAT = "psa_casadi.model/1"
+_PUBLISHED = tuple(f.name for f in fields(Publication))
 
 
 #: What a diagnosis may add beside the effects of the table.
@@ -48,11 +50,12 @@ def dumps(model: Model) -> str:
             "interval": [interval.low, interval.high] if interval else None,
             "free": p.name in origin.free,
         }
-    starts = model.own_starts()
+    starts, stated = model.own_starts(), model.publication.stated
     content = {
         "format": FORMAT,
         "name": model.name,
         "description": model.description,
+        **({"publication": stated} if stated else {}),
         "components": [c.name for c in model.components if c.gain is None],
         "effects": [_reference(c) for c in model.effects],
         "parameters": parameters,
@@ -105,7 +108,8 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
         ).with_starts(content.get("starts", {}))
     except InputError as error:
         raise InputError([f"{source}: {problem}" for problem in error.problems]) from error
-    return model.with_values({}, provenance=_provenance(content, given))
+    published = Publication(**content.get("publication", {}))
+    return model.with_values({}, provenance=_provenance(content, given), publication=published)
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
@@ -206,6 +210,13 @@ def _origin_problems(content: dict[str, Any], given: Any, source: str) -> list[s
         for r in records
     ):
         problems.append(f"{source}: 'identified_from' must list a record and its sha256 each.")
+    published = content.get("publication", {})
+    if not isinstance(published, dict) or not all(
+        name in _PUBLISHED and isinstance(text, str) for name, text in published.items()
+    ):
+        problems.append(
+            f"{source}: 'publication' is {published!r}; give texts for {', '.join(_PUBLISHED)}."
+        )
     starts = content.get("starts", {})
     if not isinstance(starts, dict) or not all(
         isinstance(v, int | float) and not isinstance(v, bool) for v in starts.values()

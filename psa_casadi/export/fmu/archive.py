@@ -8,6 +8,7 @@ from pathlib import Path
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
+from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.model_description import model_description
@@ -82,6 +83,7 @@ def _companions(model: Model, fmi: int) -> dict[str, bytes]:
         entries = {}
     page = documentation(model, reference_run=bool(entries))
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
+    entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])
     entries |= {"model.png": drawing} if fmi == 2 else terminal_entries(model)
     if not foreign_components(model):

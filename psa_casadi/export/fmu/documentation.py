@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from psa_casadi.export.common.icon import ICONS, drawing_of, svg
 from psa_casadi.export.common.markup import force_scale, generation_tool, what_it_is
+from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.variable_table import Variable, variable_table
 from psa_casadi.export.fmu.reference_results import FOLDER, NOTES
 from psa_casadi.model.compose import Model
@@ -57,6 +58,7 @@ def documentation(model: Model, *, reference_run: bool = True) -> str:
         f"<p>{html.escape(what_it_is(model))}</p>",
         f'<p class="note">{html.escape(scale)}</p>' if scale else "",
         *(f"<p>{html.escape(note)}</p>" for note in model.provenance.notes),
+        _publication(model),
         "<h2>Use</h2>",
         f"<p>{_USE}</p>",
         _sampling(model, table),
@@ -72,6 +74,13 @@ def documentation(model: Model, *, reference_run: bool = True) -> str:
     head = f'<meta charset="utf-8"><title>{name}</title><style>\n{_STYLE}</style>'
     body = "\n".join(p for p in parts if p)
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
+
+
+def _publication(model: Model) -> str:
+    """Return author, version, copyright and licence, as far as the model states them."""
+    said = (f"{name}: {text}" for name, text in model.publication.stated.items())
+    line = "; ".join(html.escape(text) for text in said)
+    return f"<p>{line}</p>" if line else ""
 
 
 def _rows(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
@@ -150,7 +159,10 @@ def _parameters(model: Model, table: Sequence[Variable]) -> str:
 
 
 def _files(reference_run: bool) -> str:
-    entries = [("sources/README.txt", "how to compile the sources: one line, no other library")]
+    entries = [
+        ("sources/README.txt", "how to compile the sources: one line, no other library"),
+        (LICENSE_ENTRY, "the terms of the model, and the notices of the C code"),
+    ]
     if reference_run:
         entries += [
             (NOTES, "a run to try an importer on, with the outputs to expect"),

@@ -4,7 +4,7 @@ Source: SSP 1.0, section 5 (system structure description) and section 4.4 (commo
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import (
@@ -17,11 +17,14 @@ from psa_casadi.export.common.markup import (
 from psa_casadi.export.ssp.layout import OUTSIDE, Box, Layout, Port, Wire
 from psa_casadi.model.compose import Model
 from psa_casadi.units import parse_unit
+from psa_casadi.variables import Publication
 
 SSD = "http://ssp-standard.org/SSP1/SystemStructureDescription"
 SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
 SSV_TYPE = "application/x-ssp-parameter-set"
 SSM_TYPE = "application/x-ssp-parameter-mapping"
+#: What SSP calls otherwise than FMI does.
+_PUBLISHED = {"version": "fileversion"}
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,7 @@ class WiredParts:
     name: str
     parts: Mapping[str, Model]
     wires: tuple[Wire, ...]
+    publication: Publication = field(default_factory=Publication)
 
     def unit(self, port: Port) -> str:
         """Return the unit of a port; that of the system is the unit of what it is wired to."""
@@ -68,10 +72,11 @@ def structure_description(
     """Return the XML text of SystemStructure.ssd; FMUs are `resources/<part>.fmu`."""
     ET.register_namespace("ssd", SSD)
     ET.register_namespace("ssc", SSC)
+    said = {_PUBLISHED.get(name, name): text for name, text in wiring.publication.stated.items()}
+    attributes = {"version": "1.0", "name": wiring.name, **said}
     root = _element(
-        None, "SystemStructureDescription",
-        {"version": "1.0", "name": wiring.name, "generationTool": generation_tool()},
-    )  # fmt: skip
+        None, "SystemStructureDescription", {**attributes, "generationTool": generation_tool()}
+    )
     system = _element(root, "System", {"name": wiring.name, "description": _about(wiring)})
     _connectors(system, OUTSIDE, wiring, layout)
     _bindings(system, OUTSIDE, bindings)
