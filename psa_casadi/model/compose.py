@@ -110,6 +110,11 @@ class Model:
         every = _starting(self.structure)
         return {v.name: v.start for v in every if v.start != declared.get(v.name, v.start)}
 
+    @property
+    def starts_itself(self) -> bool:
+        """Whether it has starts of its own for states or the voltage: a state to begin in."""
+        return not {"voltage", *self.state_names}.isdisjoint(self.own_starts())
+
     def with_declared_starts(self) -> "Model":
         """Return the model with the start values that its components declare."""
         return (
@@ -121,7 +126,7 @@ class Model:
     def with_starts(self, starts: Mapping[str, float]) -> "Model":
         """Return the model with other start values of states and inputs (SI units).
 
-        They are what an exported model starts from; `simulate` begins where its samples put it.
+        They are what a simulation, an exported FMU and a Modelica package start from.
         Raises InputError for a name that is neither, or a value that is not finite.
         """
         if not starts:

@@ -38,6 +38,7 @@ from psa_casadi.export.check.structure import (
     directional_error,
     equation_error,
     incomplete_dependencies,
+    wrong_start,
 )
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.export.importer.archive import Archive
@@ -132,6 +133,7 @@ def _measured(fmu: Fmu, model: Sequence[Model]) -> Iterator[CheckRow]:
     if fmu.version == 3:
         yield _figure("adjoint derivatives", _ADJOINT_LIMIT, adjoint_error, fmu)
     for chosen in model:
+        yield _count("start of a run", wrong_start, fmu, chosen)
         yield _count("event indicators of the model", wrong_indicators, fmu, chosen)
         yield _figure("equations", _EQUATION_LIMIT, equation_error, fmu, chosen)
         yield from _trajectories(fmu, chosen)

@@ -55,7 +55,7 @@ def reference_entries(model: Model) -> dict[str, bytes]:
 
     Raises SimulationError if the model cannot be simulated with its own values.
     """
-    times, inputs = _inputs(model)
+    times, inputs = reference_inputs(model)
     start = np.array([s.start for s in model.structure.states])
     outputs = _rounded(run(model, times, inputs, start, rtol=_OWN_TOLERANCE).y)
     texts = {
@@ -78,7 +78,7 @@ def _segment(model: Model) -> float:
     return 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
 
 
-def _inputs(model: Model) -> tuple[FloatArray, FloatArray]:
+def reference_inputs(model: Model) -> tuple[FloatArray, FloatArray]:
     """Return times (n,) and inputs (n, nu): from start to start + nominal, each shape shifted.
 
     A temperature moves by a tenth of its nominal.
