@@ -12,6 +12,7 @@ from pathlib import Path
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.export.ssp.layout import OUTSIDE, Layout, Port, Wire, arrange
 from psa_casadi.export.ssp.parameters import parameter_files
+from psa_casadi.export.ssp.steps import master_step
 from psa_casadi.export.ssp.structure import WiredParts, structure_description
 from psa_casadi.export.ssp.wiring_picture import save_wiring, wiring_svg
 from psa_casadi.files import atomic_path
@@ -47,7 +48,9 @@ def export_ssp(
     wiring = _published(wiring_of(system), publication)
     layout = layout_of(wiring)
     entries, bindings = parameter_files(wiring.parts, wiring.name)
-    description = structure_description(wiring, layout, bindings, stop_time)
+    description = structure_description(
+        wiring, layout, bindings, stop_time, master_step(wiring, stop_time)
+    )
     entries["SystemStructure.ssd"] = description.encode("utf-8")
     entries[PICTURE_ENTRY] = wiring_svg(wiring, layout).encode("utf-8")
     with tempfile.TemporaryDirectory() as folder:
