@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
     from psa_casadi.simulation.stepper import run
     from psa_casadi.simulation.timings import Timings, timed
-    from psa_casadi.variables import Input, Output, Parameter, State
+    from psa_casadi.variables import Input, Output, Parameter, Publication, State
 
 #: Where each public name lives.
 _HOMES = {
@@ -136,6 +136,7 @@ _HOMES = {
         "Input",
         "Output",
         "Parameter",
+        "Publication",
         "State",
     ),
     "psa_casadi.model.model_file": (
@@ -211,6 +212,7 @@ __all__ = [
     "Input",
     "Output",
     "Parameter",
+    "Publication",
     "State",
     "load_model",
     "save_model",

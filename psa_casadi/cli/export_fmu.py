@@ -7,8 +7,12 @@ from typing import Annotated
 import typer
 
 from psa_casadi.cli.screen import (
+    AuthorOption,
+    CopyrightOption,
     EffectsOption,
     HistoryOption,
+    LicenseOption,
+    ModelVersionOption,
     PartOption,
     Quiet,
     RestOption,
@@ -47,6 +51,10 @@ def fmu(
     history: HistoryOption = None,
     sweep: SweepOption = 1.0,
     rest: RestOption = 0.0,
+    author: AuthorOption = None,
+    version: ModelVersionOption = None,
+    copyright_: CopyrightOption = None,
+    license_: LicenseOption = None,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -62,6 +70,9 @@ def fmu(
     targets = given.attempt(lambda: chosen_platforms(wanted))
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
+    chosen = given.published(
+        chosen, author=author, version=version, copyright=copyright_, license=license_
+    )
     given.check()
     if chosen is None or targets is None:
         return

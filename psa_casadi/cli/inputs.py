@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -154,6 +155,19 @@ class Given:
         if model is None or voltage is None or self._problems:
             return model
         return self.attempt(lambda: settled_at(model, voltage, turns, **durations))
+
+    def published(self, model: Model | None, **said: str | None) -> Model | None:
+        """Return a model that states what the options say, else what it stated before.
+
+        `said` are fields of `Publication`; a text may not be empty or have line breaks.
+        """
+        for name, text in said.items():
+            if text is not None and (not text.strip() or not text.isprintable()):
+                self.add(f"--{name} is {text!r}; give a text of one line, or leave it out.")
+        if model is None:
+            return None
+        given = {name: text for name, text in said.items() if text is not None}
+        return replace(model, publication=replace(model.publication, **given))
 
     def stiffness(self, value: float | None) -> None:
         """Demand a positive stiffness, if one is given."""

@@ -78,6 +78,29 @@ StartVoltageOption = Annotated[
 ]
 
 
+AuthorOption = Annotated[
+    str | None, typer.Option("--author", help="Author to state; by default the model file's.")
+]
+
+ModelVersionOption = Annotated[
+    str | None,
+    typer.Option("--version", help="Version of the model to state; by default the model file's."),
+]
+
+CopyrightOption = Annotated[
+    str | None,
+    typer.Option("--copyright", help="Copyright of the model; by default the model file's."),
+]
+
+LicenseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--license",
+        help="Licence of the model; by default the model file's. The C code stays BSD 3-Clause.",
+    ),
+]
+
+
 class Origin(StrEnum):
     """What the records are."""
 

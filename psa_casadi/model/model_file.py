@@ -15,7 +15,7 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file_checks import FORMAT, check_content, name_of
 from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.strict_json import json_text, parse_json, read_json_text, shown
-from psa_casadi.variables import Interval, Provenance
+from psa_casadi.variables import Interval, Provenance, Publication
 
 #: What a diagnosis may add beside the effects of the table.
 _BESIDE = {c.name: c for c in (*MODAL_SERIES.values(), *PATCHES.values())}
@@ -46,11 +46,12 @@ def dumps(model: Model) -> str:
             "interval": [interval.low, interval.high] if interval else None,
             "free": p.name in origin.free,
         }
-    starts = model.own_starts()
+    starts, stated = model.own_starts(), model.publication.stated
     content = {
         "format": FORMAT,
         "name": model.name,
         "description": model.description,
+        **({"publication": stated} if stated else {}),
         "components": [c.name for c in model.components if c.gain is None],
         "effects": [_reference(c) for c in model.effects],
         "parameters": parameters,
@@ -103,7 +104,8 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
     except InputError as error:
         raise InputError([f"{source}: {problem}" for problem in error.problems]) from error
     ordered = {p.name: given[p.name] for p in model.structure.parameters}
-    return model.with_values({}, provenance=_provenance(content, ordered))
+    published = Publication(**content.get("publication", {}))
+    return model.with_values({}, provenance=_provenance(content, ordered), publication=published)
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:

@@ -1,6 +1,7 @@
 """What is checked of the content of MODEL.json before a model is made of it."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 from psa_casadi.component import Component
@@ -8,8 +9,10 @@ from psa_casadi.components import COMPONENTS
 from psa_casadi.errors import Problems
 from psa_casadi.model.own_effects import declaration_hash
 from psa_casadi.strict_json import shown
+from psa_casadi.variables import Publication
 
 FORMAT = "psa_casadi.model/1"
+_PUBLISHED = tuple(f.name for f in fields(Publication))
 
 
 def check_content(content: Any, source: str, effects: Mapping[str, Component]) -> None:
@@ -98,6 +101,14 @@ def _origin_problems(content: dict[str, Any], given: Any, source: str) -> list[s
         for r in records
     ):
         problems.append(f"{source}: 'identified_from' must list a record and its sha256 each.")
+    published = content.get("publication", {})
+    if not isinstance(published, dict) or not all(
+        name in _PUBLISHED and isinstance(text, str) for name, text in published.items()
+    ):
+        problems.append(
+            f"{source}: 'publication' is {shown(published)}; give texts for"
+            f" {', '.join(_PUBLISHED)}."
+        )
     starts = content.get("starts", {})
     if not isinstance(starts, dict) or not all(
         isinstance(v, int | float) and not isinstance(v, bool) for v in starts.values()

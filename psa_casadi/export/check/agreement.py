@@ -107,13 +107,24 @@ def truth_of(model: Model, version: int) -> Truth:
     names = model.output_names or model.state_names
     truth = Truth(
         model.state_names, model.input_names, model.parameter_names, model.output_names,
-        tuple(s.switches), s.f, switches, bool(model.sampled_names), names,
+        tuple(s.switches), s.f, switches, _starts(model), bool(model.sampled_names), names,
         "reference" if has_reference(model) else "simulator", np.ones(len(names)), (),
     )  # fmt: skip
     try:
         return _with_runs(truth, model, held=version == 3)
     except BREAKDOWNS as error:
         return replace(truth, problem=str(error))
+
+
+def _starts(model: Model) -> dict[str, float]:
+    """Return the start values of states and inputs, and the outputs that follow from them."""
+    s = model.structure
+    groups = [np.array([v.start for v in group]) for group in (s.states, s.inputs)]
+    held = [np.array([v.start for v in s.sampled])] if s.sampled else []
+    y = np.array(s.f(0.0, *groups, model.parameter_vector(), *held)[1]).ravel()
+    names = (model.state_names, model.input_names, model.output_names)
+    values = (*groups, y)
+    return {n: float(v) for k, own in enumerate(names) for n, v in zip(own, values[k], strict=True)}
 
 
 def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:

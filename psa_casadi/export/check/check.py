@@ -14,8 +14,10 @@ from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import (
     inconsistent_units,
     missing_functions,
+    missing_notices,
     needless_symbols,
     new_libraries,
+    published_as,
     undefined_units,
 )
 from psa_casadi.export.check.origin import (
@@ -153,7 +155,8 @@ def _read_model(
 
 def _as_exported(archive: Archive, model: Model) -> Model:
     """Return the model as the exporter took it: whole, or without sensor and environment."""
-    return model if set(model.output_names) <= set(archive.names("output")) else model.plant()
+    whole = set(model.output_names) <= set(archive.names("output"))
+    return published_as(archive, model if whole else model.plant())
 
 
 #: What the runs of a model need, imported ahead.
@@ -164,6 +167,7 @@ _DESCRIBED: dict[str, Callable[[Archive], Iterable[str]]] = {
     "functions present": missing_functions,
     "no other symbols": needless_symbols,
     "GNU libc 2.17": new_libraries,
+    "licence inside": missing_notices,
 }
 _ORIGIN: dict[str, Callable[[Archive, Model], Iterable[str]]] = {
     "start values": wrong_start_values,

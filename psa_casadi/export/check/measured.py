@@ -19,6 +19,7 @@ from psa_casadi.export.check.structure import (
     directional_error,
     equation_error,
     incomplete_dependencies,
+    wrong_start,
 )
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
@@ -65,6 +66,8 @@ def _of_instances(fmu: Fmu, truth: Truth | None) -> Progress:
 
 
 def _of_model(fmu: Fmu, truth: Truth) -> Progress:
+    yield "start of a run"
+    yield count("start of a run", wrong_start, fmu, truth)
     yield "event indicators of the model"
     yield count("event indicators of the model", wrong_indicators, fmu, truth)
     yield "equations"

@@ -12,6 +12,8 @@ from psa_casadi.export.importer.instance3 import Instance3
 
 FloatArray = npt.NDArray[np.float64]
 _POINTS = 3
+#: Difference that rounding may make, as a share of the nominal value.
+_ROUNDING = 1e-12
 
 
 def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
@@ -132,6 +134,19 @@ def _transposed(
     forward, backward = np.array(columns).T * size, np.array(rows) * size
     largest = np.max(np.abs(forward), axis=1, initial=1e-300)
     return float(np.max(np.abs(forward - backward) / largest[:, None]))
+
+
+def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
+    """An instance that nothing was set in starts where a simulation of the model does.
+
+    That is at the start values of its states and inputs, with the outputs that follow from them.
+    """
+    for interface, kind in ((CO_SIMULATION, "co-simulation"), (MODEL_EXCHANGE, "model exchange")):
+        with fmu.start(interface) as instance:
+            found = instance.get(list(truth.starts))
+        for (name, value), there in zip(truth.starts.items(), found, strict=True):
+            if abs(there - value) > _ROUNDING * (abs(value) + fmu.nominals[name]):
+                yield f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}"
 
 
 def equation_error(fmu: Fmu, truth: Truth) -> float:

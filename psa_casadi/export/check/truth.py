@@ -30,7 +30,8 @@ class Truth:
     """The equations of a model, the runs to compare with, and why there are no more of them.
 
     `f` and `switches` take time and the vectors of states, inputs, parameters and sampled states.
-    `compared` names what the runs compare, `scale` (ny,) its size, `by` who computed it.
+    `starts` are the values of states, inputs and outputs before anything is set. `compared` names
+    what the runs compare, `scale` (ny,) its size, `by` who computed it.
     """
 
     state_names: tuple[str, ...]
@@ -40,6 +41,7 @@ class Truth:
     switch_names: tuple[str, ...]
     f: ca.Function
     switches: ca.Function
+    starts: dict[str, float]
     settled: bool
     compared: tuple[str, ...]
     by: str

@@ -55,9 +55,11 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
     for part in _parts(exported):
         lines += ["", *(f"  {line}" if line else line for line in "\n".join(part).split("\n"))]
     uses = ', uses(Modelica(version="4.0.0"))' if has_ports(exported) else ""
+    number = model.publication.version
+    version = f", version={string(number)}" if number else ""
     sampled = [_SAMPLING] if exported.sampled_names else []
     text = documentation([*about(exported), _USE + _starts(exported), *sampled])
-    whole = "\n".join([*lines, "", f"  annotation({text}{uses});", f"end {name};", ""])
+    whole = "\n".join([*lines, "", f"  annotation({text}{version}{uses});", f"end {name};", ""])
     check_text(whole, f"The Modelica package {name}")
     return whole
 
