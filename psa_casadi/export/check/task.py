@@ -5,6 +5,9 @@ from pathlib import Path
 
 from psa_casadi.export.check.truth import Truth
 
+#: What foreign code may take unless told otherwise [s], [bytes].
+TIMEOUT, MEMORY = 120.0, 4 << 30
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -13,8 +16,8 @@ class Limits:
     Memory is limited on Linux only, and counts from what Python itself has when it starts.
     """
 
-    timeout: float = 120.0
-    memory: int = 4 << 30
+    timeout: float
+    memory: int
 
 
 @dataclass(frozen=True)
