@@ -87,7 +87,10 @@ def test_a_hang_ends_at_the_time_limit(
     monkeypatch.setenv(PLACE, str(tmp_path / "place"))
     row, _ = _ended(tmp_path, 2, f"{moment}:hang", monkeypatch, timeout=1.5)
     assert row.name == DURING[moment]
-    assert "did not come back within the time limit of 1.5 s (--timeout sets it)" in row.remark
+    assert (
+        "did not come back within the time limit of 1.5 s of a check (--timeout sets it)"
+        in row.remark
+    )
     assert _gone(tmp_path / "place")
 
 

@@ -22,7 +22,7 @@ def check(
     ] = None,
     effects: EffectsOption = None,
     timeout: Annotated[
-        float, typer.Option(help="Seconds that the FMU's code may take in all.", min=0.1)
+        float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
     ] = 120.0,
     memory: Annotated[
         int,

@@ -70,8 +70,8 @@ def check_fmu(
     are left out if the FMU leaves them out. A check that breaks down is a row that did not pass;
     the others still run, except those that need an instance if there is none.
 
-    This runs the code of the FMU, in a process of its own: `timeout` [s] is what it may take in
-    all, `memory` [bytes] what it may take beside Python's own, on Linux. However that process ends,
+    This runs the code of the FMU, in a process of its own: `timeout` [s] is what each check
+    may take, `memory` [bytes] what it may take beside Python's own, on Linux. However it ends,
     its rows are kept, and the check that ran did not pass. It is no sandbox: files and network are
     open to the code. An archive that would leave its folder, has links, is damaged or a bomb is not
     unpacked, and nothing of it runs.
