@@ -7,10 +7,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from psa_casadi.export.check.check import CheckRow, Limits, check_fmu
+from psa_casadi.export.check.check import CheckRow, check_fmu
 from tests.hostile_fmus import DEED, PLACE, hostile_fmu
 from tests.tiers import slow, slow_but
 
@@ -46,12 +47,12 @@ def _own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def _ended(
-    tmp_path: Path, fmi: int, deed: str, monkeypatch: pytest.MonkeyPatch, **limits: float
+    tmp_path: Path, fmi: int, deed: str, monkeypatch: pytest.MonkeyPatch, **limits: Any
 ) -> tuple[CheckRow, list[str]]:
     """Return the last row, and the names of the rows before it; nothing may be left over."""
     monkeypatch.setenv(DEED, deed)
     path = hostile_fmu(tmp_path / "h.fmu", fmi)
-    report = check_fmu(path, limits=Limits(**{"timeout": 60.0, **limits}))  # type: ignore[arg-type]
+    report = check_fmu(path, **{"timeout": 60.0, **limits})
     assert list((tmp_path / "temporary").iterdir()) == []
     assert not report.passed
     return report.rows[-1], [row.name for row in report.rows[:-1]]
@@ -86,7 +87,10 @@ def test_a_hang_ends_at_the_time_limit(
     monkeypatch.setenv(PLACE, str(tmp_path / "place"))
     row, _ = _ended(tmp_path, 2, f"{moment}:hang", monkeypatch, timeout=1.5)
     assert row.name == DURING[moment]
-    assert "did not come back within the time limit of 1.5 s (--timeout sets it)" in row.remark
+    assert (
+        "did not come back within the time limit of 1.5 s of a check (--timeout sets it)"
+        in row.remark
+    )
     assert _gone(tmp_path / "place")
 
 

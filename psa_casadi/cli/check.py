@@ -22,7 +22,7 @@ def check(
     ] = None,
     effects: EffectsOption = None,
     timeout: Annotated[
-        float, typer.Option(help="Seconds that the FMU's code may take in all.", min=0.1)
+        float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
     ] = 120.0,
     memory: Annotated[
         int,
@@ -40,7 +40,7 @@ def check(
     network. Check an FMU that you do not trust in a container.
     """
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.check.check import Limits, check_fmu
+    from psa_casadi.export.check.check import check_fmu
     from psa_casadi.model.model_file import load_model
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
@@ -52,8 +52,7 @@ def check(
     chosen = None if model is None else given.attempt(lambda: load_model(model, given.effects))
     given.check()
     with working("checking", quiet):
-        limits = Limits(timeout, memory << 20)
-        report = check_fmu(fmu, chosen, effects=given.effects, limits=limits)
+        report = check_fmu(fmu, chosen, effects=given.effects, timeout=timeout, memory=memory << 20)
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)
     if not report.passed:

@@ -28,7 +28,7 @@ from psa_casadi.export.check.origin import (
 )
 from psa_casadi.export.check.process import started
 from psa_casadi.export.check.rows import CheckRow, count
-from psa_casadi.export.check.task import Limits, Task
+from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
 from psa_casadi.export.check.termination import cleaned_up
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.export.importer.archive import Archive
@@ -36,7 +36,7 @@ from psa_casadi.export.importer.unpack import archive_problems
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
 
-__all__ = ["CheckReport", "CheckRow", "Limits", "check_fmu"]
+__all__ = ["CheckReport", "CheckRow", "check_fmu"]
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,9 @@ def check_fmu(
     path: str | os.PathLike[str],
     model: Model | None = None,
     effects: Iterable[Component] = (),
-    limits: Limits | None = None,
+    *,
+    timeout: float = TIMEOUT,
+    memory: int = MEMORY,
 ) -> CheckReport:
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
@@ -71,10 +73,11 @@ def check_fmu(
     are left out if the FMU leaves them out. A check that breaks down is a row that did not pass;
     the others still run, except those that need an instance if there is none.
 
-    This runs the code of the FMU, in a process of its own with limits of time and memory: 120 s in
-    all and 4 GiB by default. However that process ends, its rows are kept, and the check that ran
-    did not pass. It is no sandbox: files and network are open to the code. An archive that would
-    leave its folder, has links, is damaged or a bomb is not unpacked, and nothing of it runs.
+    This runs the code of the FMU, in a process of its own: `timeout` [s] is what each check
+    may take, `memory` [bytes] what it may take beside Python's own, on Linux. However it ends,
+    its rows are kept, and the check that ran did not pass. It is no sandbox: files and network are
+    open to the code. An archive that would leave its folder, has links, is damaged or a bomb is not
+    unpacked, and nothing of it runs.
 
     Raises InputError if the file is no FMU.
     """
@@ -88,8 +91,8 @@ def check_fmu(
         with started(_INTEGRATOR if model or carried else ()) as process:
             rows += _described(archive, chosen, tuple(effects))
             truth = truth_of(chosen[0], archive.version) if chosen else None
-            task = Task(path, archive.directory, truth, secrets.token_bytes(32), limits or Limits())
-            rows += process.rows(task)
+            key, limits = secrets.token_bytes(32), Limits(timeout, memory)
+            rows += process.rows(Task(path, archive.directory, truth, key, limits))
     compared = any(row.name == "equations" for row in rows)
     return CheckReport(path, tuple(rows), compared=compared)
 

@@ -18,7 +18,7 @@ from psa_casadi.export.check.memory import limit_data
 from psa_casadi.export.check.records import Writer
 from psa_casadi.export.check.task import Task
 
-#: How much longer than its limit it lives [s] if nobody ends it.
+#: How much longer than the limit of a check it lives [s] if nobody ends it.
 _GRACE = 30.0
 _PR_SET_PDEATHSIG = 1
 
@@ -35,11 +35,11 @@ def main() -> None:
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.close(nothing)
-    faulthandler.dump_traceback_later(task.limits.timeout + _GRACE, exit=True)
     limit_data(task.limits.memory)
     writer = Writer(records, task.key)
     try:
         for record in measured(task.path, task.unpacked, task.truth):
+            faulthandler.dump_traceback_later(task.limits.timeout + _GRACE, exit=True)
             writer.write(record)
     except MemoryError:
         writer.out_of_memory()

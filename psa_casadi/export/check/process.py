@@ -82,8 +82,8 @@ class Process:
             return "the FMU disturbed the channel of the results: it was closed"
         if self.process.poll() is None:
             return (
-                f"the FMU did not come back within the time limit of {task.limits.timeout:g} s"
-                " (--timeout sets it)"
+                f"the FMU did not come back within the time limit of {task.limits.timeout:g} s of a"
+                " check (--timeout sets it)"
             )
         full = full or reader.without_memory
         return self._ended(reader, f"{task.limits.memory / 2**20:.0f} MiB" if full else "")
@@ -91,17 +91,16 @@ class Process:
     def _followed(self, reader: Reader, task: Task) -> tuple[bool, bool]:
         """Read records up to the end of the process, of the pipe or of the time.
 
-        Return whether the pipe was closed, and whether the memory was full. The time of the foreign
-        code counts from the first record, which comes before any of it.
+        Return whether the pipe was closed, and whether the memory was full. Time counts from the
+        record before, and that of the first check from the one that comes before it.
         """
         end, closed, full = time.monotonic() + _START, False, False
         while time.monotonic() < end and not (closed and self.process.poll() is not None):
             full = full or nearly_full(self.process.pid, _FULL)
             chunk = self._chunk()
             if chunk:
-                if not reader.begun and not reader.rows:
-                    end = time.monotonic() + task.limits.timeout
                 reader.feed(chunk)
+                end = time.monotonic() + task.limits.timeout
             if self.process.poll() is not None:
                 self._end_group()
             if (chunk == b"" and not closed) or self.process.poll() is not None:

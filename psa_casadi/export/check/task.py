@@ -5,16 +5,19 @@ from pathlib import Path
 
 from psa_casadi.export.check.truth import Truth
 
+#: What foreign code may take unless told otherwise [s], [bytes].
+TIMEOUT, MEMORY = 120.0, 4 << 30
+
 
 @dataclass(frozen=True)
 class Limits:
-    """How long the foreign code may run in all [s], and how much memory it may take [bytes].
+    """How long a check of the foreign code may take [s], and how much memory all of them [bytes].
 
     Memory is limited on Linux only, and counts from what Python itself has when it starts.
     """
 
-    timeout: float = 120.0
-    memory: int = 4 << 30
+    timeout: float
+    memory: int
 
 
 @dataclass(frozen=True)
