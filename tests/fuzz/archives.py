@@ -1,29 +1,23 @@
-"""FMUs as archives: hostile zips and damaged descriptions, opened here and checked by the command."""
+"""FMUs as archives that are unpacked and described: hostile zips, damaged descriptions."""
 
 import io
-import json
 import stat
-import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from random import Random
-from typing import Any
 
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.export.fmu.archive import write_archive
-from psa_casadi.export.fmu.platforms import compile_library, host_platform
 from psa_casadi.export.importer.archive import Archive
 from tests.fmu_models import entries
-from tests.fuzz.binaries import damaged_library
-from tests.fuzz.commands import left_files, misbehaved, psa
 from tests.fuzz.mutators import WORDS, damaged_bytes, damaged_words
 from tests.fuzz.target import FALSE_PASS, LEFT_OVER, Found, Target
 
 ROOM = "archives"
-_STACK, _XML = "P-885.51", "modelDescription.xml"
+STACK, _XML = "P-885.51", "modelDescription.xml"
 _NAMES = ("../evil", "../../evil", "/tmp/psa_fuzz_evil", "C:\\evil", "..\\evil", "a/../../evil", "",
           ".", "..", "/", "a\0b", "x" * 300, "a/" * 200 + "b", "CON", "ä\u202e", _XML + "/", _XML,
           "binaries", "binaries/linux64", "resources/model.json", "sources/\n", " ")  # fmt: skip
@@ -33,15 +27,15 @@ _NAMES = ("../evil", "../../evil", "/tmp/psa_fuzz_evil", "C:\\evil", "..\\evil",
 def _small(fmi: int) -> dict[str, bytes]:
     """Return an FMU without what is long: description, model, a binary that is none."""
     kept = ("modelDescription.xml", "resources/")
-    found = {n: c for n, c in entries(_STACK, fmi).items() if n.startswith(kept)}
+    found = {n: c for n, c in entries(STACK, fmi).items() if n.startswith(kept)}
     return {**found, "binaries/linux64/P_885_51.so": b"\x7fELF" + bytes(60)}
 
 
 def _zip(rng: Random) -> bytes:
-    return _hostile(_small(rng.choice((2, 3))), rng)
+    return hostile(_small(rng.choice((2, 3))), rng)
 
 
-def _hostile(content: dict[str, bytes], rng: Random) -> bytes:
+def hostile(content: dict[str, bytes], rng: Random) -> bytes:
     """Return an archive that is damaged, or made to harm who unpacks it."""
     if rng.random() < 0.003:
         return _bomb(dict(content), rng)
@@ -155,13 +149,15 @@ def _look_at(archive: Archive) -> None:
     """Ask for all that the description says."""
     for causality in ("parameter", "input", "output", "local"):
         archive.names(causality)
-    archive.states(), archive.sampled(), archive.indicators(), archive.indicator_count()  # noqa: B018
-    list(archive.binaries()), archive.host_binary(), archive.step_size  # noqa: B018
+    archive.states(), archive.sampled(), archive.indicators(), archive.indicator_count()
+    list(archive.binaries()), archive.host_binary(), archive.step_size
 
 
 _ENTITIES = (
     '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">'
-    + "".join(f'<!ENTITY {b} "{"&" + a + ";"}{("&" + a + ";") * 9}">' for a, b in zip("abcdefgh", "bcdefghi"))
+    + "".join(
+        f'<!ENTITY {b} "{"&" + a + ";"}{("&" + a + ";") * 9}">' for a, b in pairwise("abcdefghi")
+    )
     + "]>",
     '<!DOCTYPE x [<!ENTITY e SYSTEM "file:///etc/hostname">]>',
     '<!DOCTYPE x SYSTEM "http://127.0.0.1:9/x.dtd">',
@@ -189,7 +185,9 @@ def damaged_xml(data: bytes, rng: Random) -> bytes:
                 parent.append(etree.fromstring(etree.tostring(element)))
             case 6:
                 element.tag = rng.choice(("x", rng.choice(every).tag, "Float64", "Real"))
-    text: bytes = etree.tostring(root, xml_declaration=True, encoding=rng.choice(("UTF-8", "UTF-16")))
+    text: bytes = etree.tostring(
+        root, xml_declaration=True, encoding=rng.choice(("UTF-8", "UTF-16"))
+    )
     if rng.random() < 0.05:
         text = text.replace(b"<fmi", rng.choice(_ENTITIES).encode() + b"<fmi", 1)
         text = text.replace(b'description="', b'description="&i;&e;', 1)
@@ -200,7 +198,9 @@ def damaged_xml(data: bytes, rng: Random) -> bytes:
 
 def _attribute(value: str, rng: Random) -> str:
     if rng.random() < 0.5:
-        found = rng.choice((*WORDS, "4294967296", "-1", "true", "2.0", "3.0", "1.0", "3.0-rc", "99"))
+        found = rng.choice(
+            (*WORDS, "4294967296", "-1", "true", "2.0", "3.0", "1.0", "3.0-rc", "99")
+        )
     else:
         found = damaged_words(value, rng, WORDS)
     return "".join(c for c in found if c.isprintable() and c.isascii())[:300]
@@ -208,10 +208,11 @@ def _attribute(value: str, rng: Random) -> str:
 
 def _description(rng: Random) -> bytes:
     content = _small(rng.choice((2, 3)))
-    return _stored({**content, _XML: damaged_xml(content[_XML], rng)})
+    return stored({**content, _XML: damaged_xml(content[_XML], rng)})
 
 
-def _stored(content: dict[str, bytes]) -> bytes:
+def stored(content: dict[str, bytes]) -> bytes:
+    """Return an archive of entries as they are."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in content.items():
@@ -219,117 +220,10 @@ def _stored(content: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def _whole(rng: Random) -> bytes:
-    """Return a whole FMU that is hostile, or damaged in its description, model, sources, binary."""
-    content = dict(entries(_STACK, rng.choice((2, 3))))
-    kind = rng.randrange(5)
-    if kind == 0:
-        return _hostile(content, rng)
-    starts = ("", "modelDescription.xml", "resources/", "sources/", "binaries/")[kind]
-    name = rng.choice([n for n in content if n.startswith(starts)])
-    damage = {1: damaged_xml, 4: damaged_library}.get(kind, damaged_bytes)
-    content[name] = damage(content[name], rng)
-    return _stored(content)
-
-
-def _check(data: bytes, folder: Path) -> Iterator[Found]:
-    """Let the command check an FMU: it ends, in order, and passes none that differs where it counts."""
-    path = folder / "x.fmu"
-    path.write_bytes(data)
-    ended = psa(["check", path], folder, limit_s=_LIMIT_S)
-    yield from misbehaved(ended, (0, 1, 2), "psa check")
-    yield from left_files(folder, "psa check")
-    if ended.code == 0 and (what := _difference(path)):
-        yield Found(FALSE_PASS, f"psa check passes an FMU with {what}")
-    if ended.code == 0 and "FAIL" in ended.out:
-        yield Found(FALSE_PASS, "psa check ends with 0 in spite of a row that failed")
-
-
-def _difference(path: Path) -> str:
-    """Return what makes an FMU another one than was exported; of a binary, that it is cut off.
-
-    A byte of a binary that nothing runs or reads makes no difference that a check could see.
-    """
-    with zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
-        found = {n: archive.read(n) for n in names}
-    sound = next((e for e in (entries(_STACK, 2), entries(_STACK, 3)) if set(e) <= set(found)), {})
-    if not sound or len(names) != len(set(names)):
-        return "entries that are missing or there twice"
-    for name, content in sound.items():
-        if found[name] != content and not name.startswith(("binaries/", "documentation", "extra")):
-            return f"another {name.split('/')[0]}"
-        if name.startswith("binaries/") and len(found[name]) != len(content):
-            return "a binary of another length"
-    return ""
-
-
-#: C that runs as soon as the binary is loaded, or where a function of the standard is called.
-_HARM = {
-    "exit": "_exit(0);",
-    "abort": "abort();",
-    "endless": "for (;;) pause();",
-    "busy": "volatile int x = 0; for (;;) ++x;",
-    "null": "*(volatile int *)0 = 0;",
-    "stop": "raise(SIGSTOP);",
-    "term": "raise(SIGTERM);",
-    "quiet": "close(0); close(1); close(2);",
-    "flood": "for (int i = 0; i < 100000; ++i) puts(\"all 33 checks passed\");",
-    "stay": "if (!fork()) { setsid(); sleep(3); _exit(0); }",
-    "memory": "for (;;) { char *p = malloc(1 << 24); if (!p) abort(); memset(p, 1, 1 << 24); }",
-    "stack": "char a[1 << 16]; memset(a, 1, sizeof a); harm();",
-    "chdir": "chdir(\"/\"); unsetenv(\"TMPDIR\");",
-}  # fmt: skip
-_HARMLESS = ("quiet", "flood", "stay", "chdir")  # the FMU works in spite of them
-_PLACES = ("load", "instantiate", "step")
-_LIMIT_S = 300.0
-
-
-def _harm(rng: Random) -> bytes:
-    case = {"harm": rng.choice(list(_HARM)), "at": rng.choice(_PLACES), "fmi": rng.choice((2, 3))}
-    return json.dumps(case).encode()
-
-
-@cache
-def harmful(harm: str, at: str, fmi: int) -> bytes:
-    """Return an FMU whose binary does harm when it is loaded, instantiated or stepped."""
-    content = dict(entries(_STACK, fmi))
-    texts = {n.removeprefix("sources/"): c.decode() for n, c in content.items() if n.startswith("sources/")}
-    mark = "__attribute__((constructor)) " if at == "load" else ""
-    includes = "".join(f"#include <{h}.h>\n" for h in ("stdlib", "stdio", "string", "signal", "unistd"))
-    code = (
-        f"#define _GNU_SOURCE\n{includes}"
-        f"{mark}void harm(void); void harm(void) {{ {_HARM[harm]} }}\n"
-    )
-    text = texts["instance.c"]
-    if at != "load":
-        function = {"instantiate": "void psa_instance_start(", "step": "psa_result psa_do_step("}[at]
-        body = text.index("{", text.index(function)) + 1
-        text = text[:body] + " harm();" + text[body:]
-    texts["instance.c"] = code + text
-    library = compile_library(texts, _STACK.replace("-", "_").replace(".", "_"), host_platform())
-    binary = next(n for n in content if n.startswith("binaries/"))
-    return _stored({**content, binary: library})
-
-
-def _check_harm(data: bytes, folder: Path) -> Iterator[Found]:
-    case = json.loads(data)
-    path = folder / "harm.fmu"
-    path.write_bytes(harmful(**case))
-    what = f"psa check of an FMU that does '{case['harm']}' at {case['at']}"
-    ended = psa(["check", path], folder, limit_s=_LIMIT_S)
-    yield from misbehaved(ended, (0, 1, 2), what)
-    yield from left_files(folder, what)
-    if ended.code == 0 and case["harm"] not in _HARMLESS:
-        yield Found(FALSE_PASS, f"{what} ends with 0")
-
-
 TARGETS = (
     Target("zips", ROOM, ".fmu", _zip, _open, 2.0, prepare=lambda: (_small(2), _small(3))),
-    Target("descriptions", ROOM, ".fmu", _description, _open, 2.0,
-           prepare=lambda: (_small(2), _small(3))),
-    Target("checks", ROOM, ".fmu", _whole, _check, 3.0, 2 * _LIMIT_S, None,
-           lambda: (entries(_STACK, 2), entries(_STACK, 3))),
-    Target("harm", ROOM, ".json", _harm, _check_harm, 2.0, 2 * _LIMIT_S, None,
-           lambda: (entries(_STACK, 2), entries(_STACK, 3))),
+    Target(
+        "descriptions", ROOM, ".fmu", _description, _open, 2.0,
+        prepare=lambda: (_small(2), _small(3)),
+    ),
 )  # fmt: skip

@@ -76,6 +76,4 @@ def _parse(data: bytes, folder: Path) -> Iterator[Found]:
         yield Found(FALSE_PASS, "more names are exported than the library has bytes")
 
 
-TARGETS = (
-    Target("binaries", "archives", ".bin", _library, _parse, 2.0, prepare=libraries),
-)
+TARGETS = (Target("binaries", "archives", ".bin", _library, _parse, 2.0, prepare=libraries),)

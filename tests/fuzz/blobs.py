@@ -15,7 +15,10 @@ from tests.fuzz.target import FALSE_PASS, Found, Target
 ROOM = "blobs"
 _STACKS = ("P-885.51", "every_effect")
 _KINDS = tuple(
-    (name, fmi, kind) for name in _STACKS for fmi in (2, 3) for kind in (CO_SIMULATION, MODEL_EXCHANGE)
+    (name, fmi, kind)
+    for name in _STACKS
+    for fmi in (2, 3)
+    for kind in (CO_SIMULATION, MODEL_EXCHANGE)
 )
 _STEP = 1e-5
 #: Numbers that a state may not hold, and some that it may.

@@ -10,11 +10,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.fuzz.target import FOREIGN, HANG, LEFT_OVER, WRONG_EXIT, Found
+from psa_casadi.simulation.compiler import cache_directory
+from tests.fuzz.target import CRASH, FOREIGN, HANG, LEFT_OVER, WRONG_EXIT, Found
 
 PSA = (sys.executable, "-m", "psa_casadi.cli")
 #: Root of the checkout, where the package is found from any directory.
 ROOT = Path(__file__).resolve().parents[2]
+_FAULTS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
 
 
 @dataclass(frozen=True)
@@ -46,21 +48,21 @@ class Around:
 def psa(
     arguments: Sequence[str | Path],
     folder: Path,
-    around: Around = Around(),  # noqa: B008 - it is frozen
+    around: Around = Around(),
     *,
     limit_s: float = 60.0,
     stop: tuple[int, float] | None = None,
 ) -> Ended:
-    """Run a command with its own temporary folder `folder/tmp`; `stop` sends a signal after a time."""
+    """Run a command with `folder/tmp` for what is temporary; `stop` is a signal and when [s]."""
     (folder / "tmp").mkdir(exist_ok=True)
     streams = {"stdin": subprocess.DEVNULL, **around.streams}
     with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
-        running = subprocess.Popen(  # noqa: PLW1509 - single-threaded here
+        running = subprocess.Popen(
             [*around.program, *map(str, arguments)],
             env=_environment(folder, around),
             cwd=around.directory or folder,
             start_new_session=True,
-            preexec_fn=around.first,
+            preexec_fn=around.first,  # noqa: PLW1509 - this process has one thread
             **{"stdout": out, "stderr": err, **streams},  # type: ignore[call-overload]
         )
         hung = _wait(running, limit_s, stop)
@@ -72,8 +74,10 @@ def psa(
         left = tuple(_group(running.pid))
     with contextlib.suppress(ProcessLookupError):
         os.killpg(running.pid, signal.SIGKILL)
-    texts = ((folder / n).read_text(encoding="utf-8", errors="replace") for n in ("out", "err"))
-    return Ended(running.returncode, *texts, hung=hung, left=left)
+    said, told = (
+        (folder / n).read_text(encoding="utf-8", errors="replace") for n in ("out", "err")
+    )
+    return Ended(running.returncode, said, told, hung, left)
 
 
 def _environment(folder: Path, around: Around) -> dict[str, str]:
@@ -82,6 +86,9 @@ def _environment(folder: Path, around: Around) -> dict[str, str]:
         "TMPDIR": str(folder / "tmp"),
         "PYTHONPATH": str(ROOT),
         "OPENBLAS_NUM_THREADS": "1",
+        # what the compiler keeps for itself is not made anew for each empty cache
+        "ZIG_GLOBAL_CACHE_DIR": str(cache_directory() / "zig"),
+        "ZIG_LOCAL_CACHE_DIR": str(cache_directory() / "zig"),
         **around.environment,
     }
     return {name: value for name, value in found.items() if value is not None}
@@ -115,7 +122,7 @@ def _group(session: int) -> Iterator[int]:
 
 
 def misbehaved(ended: Ended, codes: Sequence[int], what: str) -> Iterator[Found]:
-    """Yield what is wrong with an end: another exit code, a traceback, a blamed package, no reason."""
+    """Yield what is wrong with an end: exit code, traceback, blame of the package, no reason."""
     if ended.hung:
         yield Found(HANG, f"{what}: no end within the limit")
         return
@@ -123,6 +130,8 @@ def misbehaved(ended: Ended, codes: Sequence[int], what: str) -> Iterator[Found]
         yield Found(FOREIGN, f"{what}: a traceback: {_last(ended.err)}")
     elif "fault of psa_casadi" in ended.err:
         yield Found(FOREIGN, f"{what}: it blames itself: {_last(ended.err)}")
+    elif ended.code not in codes and -ended.code in _FAULTS:
+        yield Found(CRASH, f"{what}: {signal.Signals(-ended.code).name}: {_last(ended.err)}")
     elif ended.code not in codes:
         yield Found(WRONG_EXIT, f"{what}: exit code {ended.code}: {_last(ended.err)}")
     elif ended.code > 0 and not ended.err.strip() and not ended.out.strip():

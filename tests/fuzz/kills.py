@@ -1,4 +1,4 @@
-"""Commands ended by a signal at some moment: whole files or none, nothing left, the right exit code."""
+"""Commands ended by a signal: whole files or none, nothing left behind, the right exit code."""
 
 import json
 import math
@@ -60,7 +60,9 @@ def small_record() -> str:
     rows = ["time [s],voltage [V],displacement [um]"]
     for k in range(400):
         turn = 0.016 * k
-        rows.append(f"{0.002 * k:.4f},{50 - 50 * math.cos(turn):.4f},{5 - 5 * math.cos(turn - 0.1):.5f}")
+        rows.append(
+            f"{0.002 * k:.4f},{50 - 50 * math.cos(turn):.4f},{5 - 5 * math.cos(turn - 0.1):.5f}"
+        )
     return "\n".join(rows) + "\n"
 
 
@@ -70,8 +72,8 @@ def given_files() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "small.csv").write_text(small_record())
-        fmu = ["export", "fmu", "--stack", "P-885.51", "-o", folder / "s.fmu"]
-        for arguments in (fmu, ["identify", folder / "small.csv", "-o", folder / "given.json"]):
+        fmu = ("export", "fmu", "--stack", "P-885.51", "-o", "s.fmu")
+        for arguments in (fmu, ("identify", "small.csv", "-o", "given.json")):
             ended = psa(arguments, folder)
             if ended.code:
                 raise RuntimeError(f"no file to begin with: {ended.err}")
@@ -101,7 +103,9 @@ def _run(work: Work, folder: Path, stop: tuple[int, float] | None) -> Ended:
 
 def _case(rng: Random) -> bytes:
     case = {
-        "command": rng.choice(("identify", "diagnose", "diagnose", "export fmu", "check", "simulate")),
+        "command": rng.choice(
+            ("identify", "diagnose", "diagnose", "export fmu", "check", "simulate")
+        ),
         "signal": rng.choice(("SIGTERM", "SIGINT", "SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")),
         "at": round(rng.uniform(0.02, 1.05), 3),  # share of the usual time
         "warm": rng.random() < 0.3,
@@ -202,6 +206,4 @@ _PARSERS: dict[str, Callable[[Path], str]] = {
     ".mo": _text_ends(";"),
 }  # fmt: skip
 
-TARGETS = (
-    Target("kills", ROOM, ".json", _case, _kill, 1.0, 4 * _LIMIT_S, None, given_files),
-)
+TARGETS = (Target("kills", ROOM, ".json", _case, _kill, 1.0, 4 * _LIMIT_S, None, given_files),)

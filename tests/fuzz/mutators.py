@@ -16,7 +16,7 @@ WORDS = (
     "None", "null", "#", "# x", '"', '""', "'", '"1"', '"a\nb"', "\t", ";", ",", ":", "=", "[", "]",
     "[s]", "[]", "[ms]", "[kV]", "[nm]", "[counts]", "[degC]", "time", "voltage", "displacement",
     "time [s]", "time [ms]", "voltage [V]", "displacement [um]", "load_force [N]", "current [mA]",
-    "temperature [degC]", "1/0", "m/(s)", "1e999999", "９", "٣", "−1", "µm", "Ω", "\u200b", "\ufeff",
+    "temperature [degC]", "1/0", "m/(s)", "1e999999", "９", "٣", "−1", "µm", "\u200b", "\ufeff",
     "\0", "\x1a", "\r", "\x0b", "\x85", "\u2028", "A" * 300, "9" * 400, "\ud7ff", "𝟗", "../x", "/",
 )  # fmt: skip
 
@@ -103,36 +103,46 @@ def damaged_table(text: str, rng: Random, words: Sequence[str] = WORDS) -> str:
     mark = max(",;\t", key=lines[0].count)
     for _ in range(rng.choice((1, 1, 2, 3))):
         row = rng.choice((0, rng.randrange(len(lines)), rng.randrange(len(lines))))
-        cells = lines[row].split(mark)
-        column = rng.randrange(len(cells))
-        match rng.randrange(9):
-            case 0 | 1 | 2:
-                cells[column] = rng.choice(words)
-            case 3:
-                cells[column] = _damaged_word(cells[column], rng, words)
-            case 4:
-                cells.insert(column, rng.choice(words))
-            case 5:
-                del cells[column]
-            case 6:
-                cells = lines[rng.randrange(len(lines))].split(mark)
-            case 7:
-                cells.reverse()
-            case 8:
-                for k in range(len(lines)):
-                    other = lines[k].split(mark)
-                    if column < len(other) and k != row:
-                        other[column] = cells[column] if k else rng.choice(words)
-                        lines[k] = mark.join(other)
-        lines[row] = mark.join(cells)
+        if rng.random() < 0.1:
+            _fill_column(lines, mark, rng, words)
+        lines[row] = mark.join(_damaged_cells(lines[row].split(mark), rng, words))
+        if rng.random() < 0.1:
+            lines[row] = rng.choice(lines)
     end = rng.choice(("\n", "\n", "\n", "\r\n", "\r", "\n\n", " \n"))
     found = end.join(lines)
     return found.replace(mark, rng.choice(",;\t |")) if rng.random() < 0.1 else found
 
 
+def _fill_column(lines: list[str], mark: str, rng: Random, words: Sequence[str]) -> None:
+    """Put one word, or one word after the other, into all cells of a column but the header's."""
+    column, word = rng.randrange(4), rng.choice(words)
+    for k, line in enumerate(lines[1:], 1):
+        cells = line.split(mark)
+        if column < len(cells):
+            cells[column] = word if rng.random() < 0.9 else rng.choice(words)
+            lines[k] = mark.join(cells)
+
+
+def _damaged_cells(cells: list[str], rng: Random, words: Sequence[str]) -> list[str]:
+    column = rng.randrange(len(cells))
+    match rng.randrange(8):
+        case 0 | 1 | 2:
+            cells[column] = rng.choice(words)
+        case 3 | 4:
+            cells[column] = _damaged_word(cells[column], rng, words)
+        case 5:
+            cells.insert(column, rng.choice(words))
+        case 6:
+            del cells[column]
+        case 7:
+            cells.reverse()
+    return cells
+
+
 def _damaged_word(word: str, rng: Random, words: Sequence[str]) -> str:
     place = rng.randrange(len(word) + 1)
-    return word[:place] + rng.choice((*words, *"0123456789.,-+eE")) + word[place + rng.choice((0, 1)) :]
+    put: str = rng.choice((*words, *"0123456789.,-+eE"))
+    return word[:place] + put + word[place + rng.choice((0, 1)) :]
 
 
 def damaged_words(text: str, rng: Random, words: Sequence[str]) -> str:
@@ -165,7 +175,7 @@ _VALUES: tuple[Any, ...] = (
 
 
 def damaged_json(tree: Any, rng: Random) -> bytes:
-    """Return the JSON of a tree with nodes changed, removed, renamed, repeated; or its text damaged."""
+    """Return the JSON of a tree with nodes changed, removed, renamed or repeated; or other text."""
     tree = json.loads(json.dumps(tree))
     raw = None
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
@@ -220,4 +230,6 @@ def _rename(holder: Any, key: Any, rng: Random) -> None:
 def _nudged(value: Any, rng: Random) -> Any:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value) if rng.random() < 0.5 else [value]
-    return rng.choice((-value, value * 1e30, value * 1e-30, value * (1 + 1e-12), str(value), [value]))
+    return rng.choice(
+        (-value, value * 1e30, value * 1e-30, value * (1 + 1e-12), str(value), [value])
+    )

@@ -20,6 +20,12 @@ class Found:
     sentence: str
 
 
+class Draw(Random):
+    """A generator of random numbers that knows the turn of its input, to go through a table."""
+
+    turn: int = 0
+
+
 #: Does something with an input in an empty folder, yields what must not be. An error of the package
 #: says that the input was refused, which is right; any other error is a failure.
 Attack = Callable[[bytes, Path], Iterator[Found]]
@@ -38,7 +44,7 @@ class Target:
     name: str
     room: str
     suffix: str
-    make: Callable[[Random], bytes]
+    make: Callable[[Draw], bytes]
     attack: Attack
     share: float = 1.0
     limit_s: float = 10.0
@@ -46,6 +52,8 @@ class Target:
     prepare: Callable[[], object] = lambda: None
 
 
-def generator(seed: int, target: str, index: int) -> Random:
+def generator(seed: int, target: str, index: int) -> Draw:
     """Return the generator of one input; it depends on nothing else."""
-    return Random(f"{seed}/{target}/{index}")
+    drawn = Draw(f"{seed}/{target}/{index}")
+    drawn.turn = index
+    return drawn

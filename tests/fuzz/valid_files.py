@@ -4,7 +4,7 @@ import io
 import struct
 import zlib
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def _mat(arrays: dict[str, Any], version: Any, **options: Any) -> bytes:
     from scipy.io import savemat  # noqa: PLC0415 - slow to import
 
     buffer = io.BytesIO()
-    savemat(buffer, arrays, format=version, **options)
+    savemat(cast(Any, buffer), arrays, format=version, **options)
     data = buffer.getvalue()
     # its first line has the date
     return data if version == "4" else b"MATLAB 5.0 MAT-file".ljust(116) + data[116:]

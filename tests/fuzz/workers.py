@@ -189,9 +189,7 @@ def _attack_all(block: Block, folder: Path, place: mmap.mmap) -> None:
     _PROGRESS.pack_into(place, 0, block.first + done, time.monotonic(), done, accepted, 1)
 
 
-def _failures_of(
-    target: Target, data: bytes, index: int, folder: Path
-) -> Iterator[Failure | None]:
+def _failures_of(target: Target, data: bytes, index: int, folder: Path) -> Iterator[Failure | None]:
     """Yield what one input did; None says that it was accepted."""
     work = folder / "work"
     work.mkdir(exist_ok=True)
