@@ -4,9 +4,14 @@ import ctypes
 import struct
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from psa_casadi.components import BASE
+from psa_casadi.export.check.calls import parameter_changes
+from psa_casadi.export.check.structure import directional_error, incomplete_dependencies
+from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     ERROR,
@@ -16,8 +21,10 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
+from psa_casadi.model.compose import compose
 from tests import sampled_fmus
-from tests.fmu_models import exported
+from tests.fmu_models import exported, model_named
+from tests.tiers import slow
 
 STACK = "P-885.51"
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
@@ -163,3 +170,14 @@ def test_a_parameter_out_of_its_bounds_is_refused(fmi: int, interface: int) -> N
             instance.set({"n": 4.0})
         assert instance.get(["n", "tau"]) == pytest.approx([4.0, 1e-4])
         assert instance.get(["m_B"])[0] > 0.0
+
+
+@slow
+def test_the_check_keeps_the_bounds(tmp_path: Path) -> None:
+    """A model whose parameters stand at their bounds passes, whatever the check moves."""
+    edges = {"n": 4.0, "G": 1e4, "u_rated": 1e-3, "tau": 1.0}
+    model = compose(BASE, {**model_named(STACK).values, **edges})
+    with Fmu(export_fmu(model, tmp_path / "edges.fmu", fmi=3)) as fmu:
+        assert [fmu.bounds[n] for n in ("n", "m_B")] == [(1.0, 4.0), (1e-9, 1e3)]
+        assert not [*parameter_changes(fmu), *incomplete_dependencies(fmu)]
+        assert directional_error(fmu) < 1e-4
