@@ -63,7 +63,7 @@ psa_result psa_directional_derivative(psa_instance *instance, const unsigned *un
     }
     const psa_result sampled = psa_sample_now(instance);
     if (sampled != PSA_FINE) return sampled;
-    psa_input_at(&state->input, state->solver.t, u);
+    psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, in.t, in.x, in.u, in.p,
                               out.xdot, out.y, out.z))
         return psa_say(instance, PSA_DISCARD, "The model cannot be differentiated here.");
@@ -118,7 +118,7 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
     for (int i = 0; i < PSA_NZ; ++i) out.z[i] *= state->facing[i];
     const psa_result sampled = psa_sample_now(instance);
     if (sampled != PSA_FINE) return sampled;
-    psa_input_at(&state->input, state->solver.t, u);
+    psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_adjoint(state->solver.t, state->solver.x, u, state->p, out.xdot, out.y, out.z, &in.t,
                           in.x, in.u, in.p))
         return psa_say(instance, PSA_DISCARD, "The model cannot be differentiated here.");

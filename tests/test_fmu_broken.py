@@ -137,8 +137,8 @@ CORE = {
     ),
     "a step beside the communication point": (
         "instance.c",
-        "target = point + size;",
-        "target = point + 0.999 * size;",
+        "{size + (point - now), point + size};",
+        "{0.999 * size + (point - now), point + size};",
         {"co-simulation, step 0.01 s"},
     ),
 }

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import Problems, PsaError
+from psa_casadi.errors import InputError, Problems, PsaError
 from psa_casadi.interruption import flag_address
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import fingerprint, generate_c
@@ -26,6 +26,8 @@ FloatArray = npt.NDArray[np.float64]
 #: The files of `fmu_src` that integrate a model.
 SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")
 _STAGES = 6
+#: As in instants.c: further from 0 a double does not tell the sample instants apart.
+_MOST_PERIODS = 1e13
 _POINTER = ctypes.c_void_p
 #: Status of a run that an interrupt has ended.
 _STOPPED = 4
@@ -118,6 +120,7 @@ def run(
     arrays = _arrays(model, values or model.values, (t, u, x0), unknowns, s0)
     arrays["z0"] = _doubles(_sampled_starts(model) if z0 is None else z0)
     _check(model, arrays, hold)
+    _check_instants(model, arrays)
     nx = len(model.state_names)
     arrays["x0"] = arrays["x0"] if nx else np.zeros(1)  # C has one unused state
     count = len(unknowns)
@@ -219,3 +222,16 @@ def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> N
     if hold not in ("linear", "zero"):
         problems.add(f"The hold '{hold}' does not exist; use 'linear' or 'zero'.")
     problems.raise_if_any()
+
+
+def _check_instants(model: Model, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    period = model.structure.period
+    if not period:
+        return
+    seconds = float(arrays["p"][model.parameter_names.index(period)])
+    furthest = float(np.abs(arrays["t"]).max())
+    if furthest > _MOST_PERIODS * seconds:
+        raise InputError(
+            f"Sample periods of {seconds:g} s ('{period}') cannot be counted up to {furthest:g} s:"
+            " a double does not tell them apart there. Count the time from a nearer start."
+        )

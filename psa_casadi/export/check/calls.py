@@ -172,11 +172,15 @@ def parameter_changes(fmu: Fmu) -> Problems:
 
 
 def _changed(fmu: Fmu) -> dict[str, float]:
-    """Return all parameters, each 3 % from its start."""
+    """Return all parameters, each 3 % from its start, to the side that its bounds allow."""
     with fmu.open(CO_SIMULATION) as slave:
         slave.setup()
         names = fmu.names("parameter")
-        return {n: 1.03 * v for n, v in zip(names, slave.get(names), strict=True)}
+        changed, bounds = {}, fmu.bounds
+        for name, value in zip(names, slave.get(names), strict=True):
+            low, high = bounds[name]
+            changed[name] = next(c for c in (1.03 * value, 0.97 * value, value) if low <= c <= high)
+        return changed
 
 
 def _run_changed(fmu: Fmu, starts: dict[str, float], when: int) -> FloatArray:

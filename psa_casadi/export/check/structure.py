@@ -17,13 +17,19 @@ _ROUNDING = 1e-12
 
 
 def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
-    """Return values of time, states, inputs and parameters; no gain is 0, all keep their bounds."""
+    """Return values of time, states, inputs and parameters; no gain is 0, all keep their bounds.
+
+    Parameters stay so far inside that they can be moved by 1 % and differentiated.
+    """
     point = {"time": float(generator.uniform(0.1, 1.0))}
+    bounds = fmu.bounds
     for v in fmu.description.modelVariables:
         if v.causality == "parameter":
             start = float(v.start) or 0.1 * fmu.nominals[v.name]
             value = start * generator.uniform(0.95, 1.05)
-            point[v.name] = min(max(value, float(v.min or -np.inf)), float(v.max or np.inf))
+            low, high = bounds[v.name]
+            margin = min(0.02 * max(abs(value), fmu.nominals[v.name]), 0.25 * (high - low))
+            point[v.name] = min(max(value, low + margin), high - margin)
     for name in (*fmu.states(), *fmu.names("input")):
         point[name] = float(fmu.nominals[name] * generator.uniform(-1.0, 1.0))
     return point

@@ -26,8 +26,8 @@ from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
 #: The hand-written files of `fmu_src` that every FMU consists of, C files first.
 LOGIC = (
     "derivatives.c", "instance.c", "instants.c", "linear.c", "log.c", "model_adjoint.c",
-    "model_casadi.c", "model_directional.c", "sampling.c", "snapshot.c", "solver.c",
-    "step_derivatives.c", "values.c",
+    "model_casadi.c", "model_directional.c", "sampling.c", "snapshot.c", "snapshot_fault.c",
+    "solver.c", "step_derivatives.c", "values.c",
     "fmi_data.h", "instance.h", "instants.h", "linear.h", "model.h", "solver.h",
 )  # fmt: skip
 #: The files of `fmu_src` that speak one version of FMI.

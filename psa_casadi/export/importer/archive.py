@@ -1,5 +1,6 @@
 """The files of an FMU of either version, extracted, and what its description says."""
 
+import math
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -92,6 +93,17 @@ class Archive:
     def step_size(self) -> float:
         """Step size of the default experiment [s], 1 ms if there is none."""
         return float(getattr(self.description.defaultExperiment, "stepSize", None) or 1e-3)
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """The least and the greatest value of each variable, infinite where there is no bound."""
+        return {
+            v.name: (
+                -math.inf if v.min is None else float(v.min),
+                math.inf if v.max is None else float(v.max),
+            )
+            for v in self.description.modelVariables
+        }
 
     def names(self, causality: str) -> list[str]:
         """Return the names of the variables of one causality, in the order of the description."""
