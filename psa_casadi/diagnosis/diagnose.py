@@ -16,12 +16,14 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
-from psa_casadi.identification.start.ordinary import chosen_start, refuse_stuck
+from psa_casadi.identification.start.doubts import refuse_few, refuse_still, refuse_stuck
+from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
-from psa_casadi.records.quality.suspects import cleaned
+from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, in_one_order
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
@@ -60,8 +62,9 @@ def diagnose(
         with stage("preparing"):
             table = list(effects if effects is not None else known_effects().values())
             ordered, apart = in_one_order(given), in_one_order(kept)
-            experiments = divided([cleaned(r) for r in ordered], [cleaned(r) for r in apart])
-            start, scale_given = chosen_start(ordered, model, stiffness)
+            clean, said = _cleaned(ordered)
+            experiments = divided(clean, [cleaned(r) for r in apart])
+            start, scale_given = chosen_start(clean, model, stiffness)
             refuse_stuck([e.record for e in experiments])
             known = {e.name for e in table}
             searched = (*table, *(c for c in start.effects if c.more_of in known))
@@ -71,11 +74,25 @@ def diagnose(
         so_far: list[Fit] = []
         task = Task(experiments, tuple(table), method, progress, so_far.append)
         try:
-            return _diagnose(start, task, scale_given)
+            found = _diagnose(start, task, scale_given)
+            return replace(found, notes=(*found.notes, *said))
         except KeyboardInterrupt:
             if not so_far:
                 raise
             raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
+
+
+def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
+    """Return the records without suspect samples, and where a sensor was saturated.
+
+    Raises InputError where hardly a sample is left.
+    """
+    refuse_still(records)
+    found = [suspects(r) for r in records]
+    clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
+    saturated = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
+    refuse_few(records, clean, saturated)
+    return clean, saturated
 
 
 def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:

@@ -13,6 +13,13 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
 from psa_casadi.identification.search.refitting import Progress, record_rms, refit
+from psa_casadi.identification.start.doubts import (
+    doubtful_sign,
+    doubtful_time,
+    doubtful_unit,
+    refuse_few,
+    refuse_still,
+)
 from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
@@ -99,8 +106,10 @@ def identify(
     InputError, SimulationError.
     """
     given_records = records_given(records)
+    refuse_still(given_records)
     ready = [prepared(r) for r in given_records]
     fitted = [r for r, _ in ready]
+    refuse_few(given_records, fitted, [s for _, said in ready for s in said])
     experiments = tuple(whole(r) for r in fitted)
     start, given = chosen_start(fitted, model, stiffness)
     linear = None
@@ -135,7 +144,7 @@ def identify(
         fit=best,
         determinacy=determined,
         experiments=experiments,
-        warnings=_warnings(best, determined, found, experiments),
+        warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
         sentences=tuple(s for _, said in ready for s in said),
         combinations=open_ones,
@@ -222,6 +231,11 @@ def _warnings(
         verb = "is" if len(alone) == 1 else "are"
         sentences.append(f"{names} {verb} not determined by these records.")
     return (*sentences, *_missed(best, experiments))
+
+
+def _doubts(records: Sequence[Record]) -> list[str]:
+    """Say what of the records is unlike a stack's: unit, time, sign."""
+    return [s for doubt in (doubtful_unit, doubtful_time, doubtful_sign) if (s := doubt(records))]
 
 
 def _disagreement(searched: Search) -> list[str]:
