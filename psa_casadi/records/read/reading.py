@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.checks import (
@@ -121,6 +123,11 @@ def _record(samples: Samples) -> Record:
         name: to_si(samples.values[:, k], unit)
         for k, (name, unit) in enumerate(samples.units.items())
     }
+    if not (np.diff(columns["time"]) > 0.0).all():
+        raise InputError(
+            f"{samples.path}: instants are the same in seconds; give the time from the start of"
+            " the record, in a unit in which neighbours differ by more than the last digit."
+        )
     in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
     return Record(
         name=plain(Path(samples.path).stem),
