@@ -234,6 +234,23 @@ def test_a_huge_array_of_version_7_3_is_refused_before_it_is_read(case: str) -> 
     assert "more than 1 GiB, the most that is read as one record" in refusal(hdf5(HUGE[case]))
 
 
+def _inflating(file: Any) -> None:
+    dataset = file.create_dataset("t", (1000,), "f8", chunks=(1000,), compression="gzip")
+    dataset.id.write_direct_chunk((0,), zlib.compress(bytes(2**22)))
+
+
+def _pressed(file: Any) -> None:
+    file.create_dataset("t", data=T, chunks=(24,), compression="lzf")
+
+
+def test_pieces_of_version_7_3_have_the_size_that_they_state() -> None:
+    assert "a piece of the array '/t' is larger than it states" in refusal(hdf5(_inflating))
+    assert "'/t' is packed in a way that MATLAB does not use" in refusal(hdf5(_pressed))
+    options = {"chunks": (10,), "compression": "gzip", "shuffle": True, "fletcher32": True}
+    good = hdf5(lambda f: f.create_dataset("t", data=T, **options))
+    np.testing.assert_array_equal(load_arrays("a.mat", good)["t"], T)
+
+
 def test_links_of_version_7_3_are_not_followed(tmp_path: Path) -> None:
     assert list(load_arrays("a.mat", hdf5(_elsewhere))) == ["t"]
     assert "is reached twice" in refusal(hdf5(_twice))
