@@ -20,11 +20,11 @@ def check_text(text: str, what: str) -> None:
     Raises:
         InputError: there is one; the sentence names it and shows what stands before it.
     """
-    if found := barred(text):
-        before = text[: next(_BARRED.finditer(text)).start()][-40:]
+    if found := _BARRED.search(text):
+        before = " ".join(text[max(0, found.start() - 40) : found.start()].split())
         raise InputError(
-            f"{what} has the character {found} after '{before}', which no document can carry;"
-            " remove it from the names, descriptions and notes of the model."
+            f"{what} has the character {barred(found[0])} after '{before}', which no document can"
+            " carry; remove it from the names, descriptions and notes of the model."
         )
 
 

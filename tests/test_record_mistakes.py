@@ -57,6 +57,7 @@ def test_mistakes_of_the_header(tmp_path: Path, header: str, expected: str) -> N
         ("nan,1,1", "line 6, column 'time': found no value, expected a number"),
         ("0.004,inf,1", "line 6, column 'voltage': found inf, expected a finite number"),
         ("0.004,1,-inf", "line 6, column 'displacement': found -inf, expected a finite number"),
+        ("0.004,1e101,1", "line 6, column 'voltage': found 1e+101, expected a measured number"),
         ("0.003,1,1", "line 6, column 'time': time stands still (from 0.003 in line 5 to 0.003)"),
         ("0.002,1,1", "line 6, column 'time': time goes back (from 0.003 in line 5 to 0.002)"),
         ("0.004,1", "line 6: found 2 cells, expected 3 as in the header"),
@@ -141,6 +142,14 @@ def test_too_few_samples_and_no_displacement_are_refused(tmp_path: Path) -> None
     empty = [row.rsplit(",", 1)[0] + "," for row in ROWS]
     (problem,) = problems_of(write(tmp_path / "c.csv", HEADER, *empty))
     assert "column 'displacement': found no valid values in 20 rows" in problem
+
+
+def test_instants_that_are_one_in_seconds_are_refused(tmp_path: Path) -> None:
+    rows = [f"{k}e-323,{k},{k}" for k in range(1, 21)]
+    assert read_record(write(tmp_path / "a.csv", HEADER, *rows)).n == 20
+    header = HEADER.replace("[s]", "[ms]")
+    (problem,) = problems_of(write(tmp_path / "b.csv", header, *rows))
+    assert "instants are the same in seconds" in problem
 
 
 def test_a_constant_voltage_is_refused_only_for_a_fit(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import math
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,6 +12,10 @@ from psa_casadi.errors import InputError
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.mat_level5 import Tree
 
+#: Filters of HDF5 that MATLAB writes, or that leave the size as it is: shuffle, checksum.
+_DEFLATE = 1
+_FILTERS = {_DEFLATE, 2, 3}
+_CHECKSUM = 4
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -75,8 +80,26 @@ def _check(path: str, datasets: list[Any]) -> None:
             raise InputError(
                 f"{path}: the array '{d.name}' lies in another file; save the values themselves."
             )
-        piece = math.prod(d.chunks or (0,)) * d.dtype.itemsize
-        check_size(path, piece, f"a piece of the array '{d.name}' holds")
+        if d.chunks:
+            size = math.prod(d.chunks) * d.dtype.itemsize
+            check_size(path, size, f"a piece of the array '{d.name}' holds")
+            _check_pieces(d, size)
+
+
+def _check_pieces(dataset: Any, size: int) -> None:
+    """Demand that every piece is unpacked to its size: HDF5 makes room for whatever comes."""
+    plan = dataset.id.get_create_plist()
+    filters = [plan.get_filter(k)[0] for k in range(plan.get_nfilters())]
+    if not _FILTERS.issuperset(filters) or len(set(filters)) < len(filters):
+        raise ValueError(f"the array '{dataset.name}' is packed in a way that MATLAB does not use")
+    places: list[tuple[int, ...]] = []
+    dataset.id.chunk_iter(lambda piece: places.append(piece.chunk_offset))
+    for place in places if _DEFLATE in filters else ():
+        skipped, packed = dataset.id.read_direct_chunk(place)
+        if skipped & (1 << filters.index(_DEFLATE)):
+            continue
+        if len(zlib.decompressobj().decompress(packed, size + _CHECKSUM + 1)) > size + _CHECKSUM:
+            raise ValueError(f"a piece of the array '{dataset.name}' is larger than it states")
 
 
 def _tree(group: Any) -> dict[str, Tree]:

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TypeGuard, cast
 
+import numpy as np
+
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.checks import (
@@ -193,6 +195,11 @@ def _record(samples: Samples, source: str | None = None) -> Record:
         name: to_si(samples.values[:, k], unit)
         for k, (name, unit) in enumerate(samples.units.items())
     }
+    if not (np.diff(columns["time"]) > 0.0).all():
+        raise InputError(
+            f"{samples.path}: instants are the same in seconds; give the time from the start of"
+            " the record, in a unit in which neighbours differ by more than the last digit."
+        )
     in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
     return Record(
         name=plain(Path(samples.path).stem if source is None else samples.path),
