@@ -182,6 +182,6 @@ def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     assert [c.tag.partition("}")[2] for c in root[0]][-2:] == ["Connections", "Annotations"]
     wiring = wiring_of(pushed_stage() if name == "pushed_stage" else closed_loop())
     step = float(found[1])
-    assert 0.0 < step <= 0.2 * stable_step(wiring, rates=False)
+    assert 0.0 < step <= 0.05 * stable_step(wiring, rates=False)
     assert step <= 1e-3 * float(root.find("{*}DefaultExperiment").get("stopTime"))
     assert f"{step:.0e}"[0] in "125"

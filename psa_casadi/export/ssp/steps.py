@@ -112,10 +112,10 @@ def stable_step(wiring: WiredParts, *, rates: bool) -> float:
 def master_step(wiring: WiredParts, stop_time: float) -> float:
     """Return a communication step [s] for a master that holds the inputs: 1, 2 or 5 times 10^k.
 
-    It is at most a fifth of what stays stable, for an error of the coupling that is small too, and
-    a thousandth of the time that is simulated.
+    It is at most a twentieth of what stays stable, as the error of the coupling is of first order,
+    and a thousandth of the time that is simulated.
     """
-    longest = min(stable_step(wiring, rates=False) / 5.0, stop_time / 1000.0)
+    longest = min(stable_step(wiring, rates=False) / 20.0, stop_time / 1000.0)
     size = 10.0 ** math.floor(math.log10(longest))
     return max(round(k * size, 15) for k in (1.0, 2.0, 5.0) if k * size <= longest)
 
