@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from psa_casadi.errors import InputError
+from psa_casadi.files import why_not_written
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.own_effects import own_effects
@@ -195,12 +196,11 @@ class Given:
             self._writable(path)
 
     def _writable(self, path: Path) -> None:
-        folder = path.resolve().parent
-        if path.is_dir():
-            self.add(f"{path}: cannot write, this is a directory; name a file in it.")
-        elif not folder.is_dir():
+        reason = why_not_written(path)
+        if reason:
+            self.add(reason)
+        elif not os.access(path.resolve().parent, os.W_OK):
             self.add(
-                f"{path}: cannot write, the directory {folder} does not exist; create it first."
+                f"{path}: cannot write, {path.resolve().parent} may not be written to; choose"
+                " another place."
             )
-        elif not os.access(folder, os.W_OK):
-            self.add(f"{path}: cannot write, {folder} may not be written to; choose another place.")

@@ -1,0 +1,326 @@
+"""What the machine refuses is told as such, and a command that is ended leaves nothing behind."""
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from psa_casadi import cache
+from psa_casadi.cli.app import app
+from psa_casadi.cli.failures import guarded
+from psa_casadi.components import BASE
+from psa_casadi.errors import InputError, MachineError
+from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.model.compose import compose
+from psa_casadi.model.model_file import dumps
+from psa_casadi.scratch import PREFIX
+from psa_casadi.simulation import compiler
+from tests.record_files import HEADER, ROWS, write
+
+posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
+PSA = [sys.executable, "-m", "psa_casadi.cli"]
+MODEL = dumps(compose(BASE))
+FAULT = "This is a fault of psa_casadi"
+
+
+def shell(line: str, **variables: str) -> "subprocess.CompletedProcess[str]":
+    """Run a line of bash in which `psa` is the command."""
+    start = f'psa() {{ "{sys.executable}" -m psa_casadi.cli "$@"; }}; set -o pipefail; '
+    return subprocess.run(
+        ["bash", "-c", start + line], capture_output=True, encoding="utf-8", check=False,
+        env={**os.environ, **variables}, timeout=60,
+    )  # fmt: skip
+
+
+STREAMS = {
+    "nobody reads on": ("psa effects | true", 1, ""),
+    "output closed": ("psa effects >&-", 0, ""),
+    "all streams closed": ("psa effects slow_creep <&- >&- 2>&-", 0, ""),
+    "output on a full disk": ("psa effects >/dev/full", 1, "Failed: the disk is full"),
+    "help on a full disk": ("psa --help >/dev/full", 1, "Failed: the disk is full"),
+}
+
+
+@posix
+@pytest.mark.parametrize("case", STREAMS)
+def test_output_that_cannot_be_written(case: str) -> None:
+    line, code, said = STREAMS[case]
+    done = shell(line)
+    assert done.returncode == code, done.stderr
+    assert done.stderr.startswith(said)
+    assert len(done.stderr.splitlines()) == bool(said), done.stderr
+
+
+@posix
+def test_letters_that_the_terminal_lacks_do_not_end_a_command() -> None:
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = shell("psa stacks", PYTHONIOENCODING="ascii", **plain)
+    assert done.returncode == 0, done.stderr
+    assert "P-885.51" in done.stdout
+    name = os.fsdecode(b"\xff.csv")  # a name of a file that is no text
+    assert shell(f"psa identify '{name}' -o m.json").stderr.startswith("Error: ")
+
+
+def ended_by(error: BaseException) -> tuple[int, str]:
+    """Return the exit code of a command that meets an error, and what it says."""
+
+    def command() -> None:
+        raise error
+
+    single = typer.Typer(pretty_exceptions_enable=False)
+    single.command()(guarded(command))
+    result = CliRunner().invoke(single, [])
+    return result.exit_code, result.output
+
+
+REFUSED: dict[str, tuple[BaseException, str]] = {
+    "disk full": (OSError(errno.ENOSPC, "x", "/a/b"), "the disk is full (/a/b); free some space"),
+    "read only": (OSError(errno.EROFS, "x"), "may only be read; choose a place"),
+    "no access": (PermissionError(errno.EACCES, "x", "/a"), "denies access (/a); change"),
+    "too many files": (OSError(errno.EMFILE, "x"), "too many files are open; raise"),
+    "name too long": (OSError(errno.ENAMETOOLONG, "x"), "name is too long; choose"),
+    "memory": (MemoryError(), "too little memory; close"),
+    "memory of C++": (RuntimeError("std::bad_alloc"), "too little memory; close"),
+    "threads": (RuntimeError("can't start new thread"), "no more threads may be started"),
+    "no temporary folder": (
+        FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"),
+        "set TMPDIR to one",
+    ),
+    "package missing": (
+        ModuleNotFoundError("No module named 'casadi'", name="casadi"),
+        "the installation is not complete (No module named 'casadi'); install",
+    ),
+    "compiler": (MachineError("The C compiler x cannot be started."), "The C compiler x cannot"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_the_machine_refuses_is_no_fault_of_the_package(case: str) -> None:
+    error, said = REFUSED[case]
+    code, output = ended_by(error)
+    assert code == 1
+    assert output.startswith("Failed: ")
+    assert said in output
+    assert "fault" not in output
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        KeyError("x"),
+        ValueError("x"),
+        FileNotFoundError(errno.ENOENT, "x"),
+        ImportError("cannot import name", name="psa_casadi.files"),
+    ],
+)
+def test_a_fault_of_the_package_is_called_one(error: Exception) -> None:
+    code, output = ended_by(error)
+    assert code == 1
+    assert FAULT in output
+
+
+@pytest.fixture
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(cache, "_REFUSED", set())
+    return tmp_path / "cache"
+
+
+COMPILERS = {
+    "nothing-of-this-name": r"The C compiler nothing-of-this-name cannot be started .*unset",
+    "/": r"The C compiler / cannot be started \(Permission denied\)",
+    "cc '": r"CC is \"cc '\", which is no command",
+    "true": r"The C compiler true wrote no library; set CC",
+    "sh -c 'kill -9 $$'": r"failed .*killed by signal 9; too little memory",
+}
+
+
+@posix
+@pytest.mark.parametrize("command", COMPILERS)
+def test_a_compiler_that_does_not_work(
+    command: str, empty_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", command)
+    with pytest.raises(MachineError, match=COMPILERS[command]):
+        compiler.shared_library({"a.c": "int a;"}, ())
+    assert not list(empty_cache.rglob("*.so"))
+
+
+@posix
+def test_a_compiler_may_have_arguments_and_spaces(
+    tmp_path: Path, empty_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = write(tmp_path / "my cc", "#!/bin/sh", 'echo "$@" > ../../said; exec cc "$@"')
+    script.chmod(0o700)
+    monkeypatch.setenv("CC", str(script))
+    compiler.shared_library({"a.c": "int a;"}, ())
+    monkeypatch.setenv("CC", f"'{script}' -D'X=\"a b\"'")
+    compiler.shared_library({"a.c": "int a;"}, ())
+    assert '-DX="a b" -std' in (empty_cache / "said").read_text()
+
+
+@posix
+def test_a_compiler_on_a_full_disk_is_no_broken_one(
+    tmp_path: Path, empty_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = write(tmp_path / "full", "#!/bin/sh", "echo 'x: No space left on device' >&2; exit 1")
+    script.chmod(0o700)
+    monkeypatch.setenv("CC", str(script))
+    with pytest.raises(OSError, match="No space left"):
+        compiler.shared_library({"a.c": "int a;"}, ())
+    assert not list(empty_cache.rglob("*.so"))
+
+
+def test_files_that_cannot_be_written_are_named(tmp_path: Path) -> None:
+    fits, too_long = tmp_path / ("n" * 246 + ".json"), tmp_path / ("n" * 251 + ".json")
+    atomic_write(fits, "text")
+    assert fits.read_text() == "text"
+    atomic_write(tmp_path / ("µ" * 120 + ".json"), f"a name such as {os.fsdecode(bytes([255]))}")
+    with pytest.raises(InputError, match="File name too long"):
+        atomic_write(too_long, "text")
+    model = write(tmp_path / "model.json", MODEL)
+    result = CliRunner().invoke(app, ["export", "fmu", "--model", str(model), "-o", str(too_long)])
+    assert result.exit_code == 2
+    assert "File name too long" in result.output
+
+
+@posix
+def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"No space left on device.*choose another place"):
+        atomic_write("/dev/full", "text")
+
+    def fill() -> None:
+        with atomic_path(tmp_path / "x.fmu") as path:
+            path.write_text("half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (tmp_path / "x.fmu").write_text("old")
+    with pytest.raises(InputError, match=r"x\.fmu: cannot write \(No space left"):
+        fill()
+    assert (tmp_path / "x.fmu").read_text() == "old"
+    assert os.listdir(tmp_path) == ["x.fmu"]
+
+
+#: A compiler that has a child of its own and never ends.
+NEVER_ENDS = ["#!/bin/sh", "sleep 100 &", 'echo $! > "$COMPILING"', "wait"]
+
+
+@contextmanager
+def compiling(folder: Path) -> Iterator["tuple[subprocess.Popen[str], int]"]:
+    """Yield a command that waits for its compiler, and the process of the compiler's child."""
+    t = np.linspace(0.0, 1.0, 200)
+    rows = [f"{a:.4f},{50 * np.sin(6 * a):.6f},{np.sin(6 * a - 0.1):.6f}" for a in t]
+    record = write(folder / "record.csv", HEADER, *rows)
+    slow = write(folder / "never_ends", *NEVER_ENDS)
+    slow.chmod(0o700)
+    told = folder / "pid"
+    (folder / "tmp").mkdir()
+    changes = {"CC": str(slow), "COMPILING": str(told), "TMPDIR": str(folder / "tmp"),
+               "PSA_CASADI_CACHE": str(folder / "cache")}  # fmt: skip
+    command = subprocess.Popen(
+        [*PSA, "identify", str(record), "-o", str(folder / "m.json"), "-q"],
+        env={**os.environ, **changes}, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        for _ in range(3000):
+            if told.exists() and told.read_text().endswith("\n"):
+                break
+            time.sleep(0.01)
+        yield command, int(told.read_text())
+    finally:
+        command.kill()
+        command.communicate()
+
+
+def runs(pid: int) -> bool:
+    state = Path(f"/proc/{pid}/stat")
+    try:
+        os.kill(pid, 0)
+        return not (state.exists() and state.read_text().rsplit(")", 1)[1].split()[0] == "Z")
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
+def left_over(folder: Path) -> list[Path]:
+    return [*folder.rglob(f"{PREFIX}*"), *(folder / "tmp").iterdir(), *folder.glob("m.json")]
+
+
+@posix
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_command_that_is_told_to_end_leaves_nothing(name: str, tmp_path: Path) -> None:
+    number = getattr(signal, name)
+    with compiling(tmp_path) as (command, child):
+        assert left_over(tmp_path)
+        command.send_signal(number)
+        assert command.wait(10) == 128 + number
+        assert not left_over(tmp_path)
+        for _ in range(100):
+            if not runs(child):
+                break
+            time.sleep(0.01)
+        assert not runs(child)
+
+
+@posix
+def test_what_a_killed_command_left_goes_with_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with compiling(tmp_path) as (command, child):
+        command.kill()
+        command.wait(10)
+        assert left_over(tmp_path)
+        os.kill(child, signal.SIGKILL)
+    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
+    compiler.shared_library({"a.c": "int a;"}, ())
+    assert not left_over(tmp_path)
+
+
+@posix
+def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(tmp_path: Path) -> None:
+    record = write(tmp_path / "record.csv", HEADER, *ROWS)
+    model = write(tmp_path / "model.json", MODEL)
+    where = {"CC": "nothing-of-this-name", "PSA_CASADI_CACHE": str(tmp_path / "cache")}
+    for line in (f"identify '{record}'", f"simulate --model '{model}' --input '{record}'"):
+        done = shell(f"psa {line} -q -o '{tmp_path}/out'", **where)
+        assert done.returncode == 1
+        assert done.stderr.startswith("Failed: The C compiler nothing-of-this-name cannot be")
+
+
+@posix
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("prlimit") is None, reason="no prlimit")
+def test_a_command_with_too_little_memory_says_so(tmp_path: Path) -> None:
+    record = write(tmp_path / "record.csv", HEADER, *ROWS)
+    done = shell(f"ulimit -v 150000; psa identify '{record}' -q -o '{tmp_path}/m.json'")
+    assert done.returncode == 1
+    assert "there is too little memory" in done.stderr
+    assert FAULT not in done.stderr
+
+
+@posix
+@pytest.mark.slow
+def test_a_command_without_home_cache_temporary_folder_and_docstrings(tmp_path: Path) -> None:
+    record = write(tmp_path / "record.csv", HEADER, *ROWS)
+    output = tmp_path / "m.json"
+    done = shell(
+        f"unset HOME; psa simulate --model '{write(tmp_path / 'model.json', MODEL)}'"
+        f" --input '{record}' -o '{output}'",
+        PSA_CASADI_CACHE="/dev/null/cache", TMPDIR=str(tmp_path / "no"), MPLCONFIGDIR="/dev/null",
+        PYTHONOPTIMIZE="2", LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    told = [line for line in done.stderr.splitlines() if "cache" in line]
+    assert len(told) == 1
+    assert "The cache folder /dev/null/cache/models cannot be used (Not a directory)" in told[0]
+    assert output.read_text(encoding="utf-8").startswith("time")
