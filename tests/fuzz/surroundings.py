@@ -195,7 +195,8 @@ SURROUNDINGS: dict[str, Surroundings] = {
     "unknown terminal": Surroundings(_kept(TERM="no-such-terminal", FORCE_COLOR="1")),
     "CC missing": Surroundings(_kept(CC="/nowhere/cc"), ("cc", "compiler")),
     "CC with a space": Surroundings(
-        _compiler(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc "$@"\n', "my tools"), ("cc", "compiler")
+        _compiler(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc "$@"\n', "my tools"),
+        ("cc", "compiler"),
     ),
     "CC fails": Surroundings(_compiler("#!/bin/sh\nexit 1\n"), ("cc", "compiler")),
     "CC is no program": Surroundings(_compiler("\0\1\2"), ("cc", "compiler")),

@@ -79,7 +79,7 @@ class Worker:
 
     def trace(self) -> str:
         """Return the Python calls that were under way at a crash or a hang."""
-        return (self.folder / "trace").read_text(errors="replace")[-4000:]
+        return (self.folder / "trace").read_text(errors="replace")[:6000]
 
     def clean(self) -> None:
         """Remove what the process left, which is counted already."""
