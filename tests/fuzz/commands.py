@@ -121,8 +121,13 @@ def _group(session: int) -> Iterator[int]:
                 yield int(entry.name)
 
 
-def misbehaved(ended: Ended, codes: Sequence[int], what: str) -> Iterator[Found]:
-    """Yield what is wrong with an end: exit code, traceback, blame of the package, no reason."""
+def misbehaved(
+    ended: Ended, codes: Sequence[int], what: str, *, mute: bool = False
+) -> Iterator[Found]:
+    """Yield what is wrong with an end: exit code, traceback, blame of the package, no reason.
+
+    A `mute` one has nowhere to say a reason.
+    """
     if ended.hung:
         yield Found(HANG, f"{what}: no end within the limit")
         return
@@ -134,7 +139,7 @@ def misbehaved(ended: Ended, codes: Sequence[int], what: str) -> Iterator[Found]
         yield Found(CRASH, f"{what}: {signal.Signals(-ended.code).name}: {_last(ended.err)}")
     elif ended.code not in codes:
         yield Found(WRONG_EXIT, f"{what}: exit code {ended.code}: {_last(ended.err)}")
-    elif ended.code > 0 and not ended.err.strip() and not ended.out.strip():
+    elif ended.code > 0 and not mute and not ended.err.strip() and not ended.out.strip():
         yield Found(WRONG_EXIT, f"{what}: exit code {ended.code} without a word")
     if ended.left:
         yield Found(LEFT_OVER, f"{what}: {len(ended.left)} processes go on")

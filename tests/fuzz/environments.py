@@ -56,7 +56,8 @@ def _surrounded(chosen: Surroundings, case: dict[str, str], folder: Path) -> Ite
     ended = _run(work.arguments, work.outputs, folder, chosen.output, around)
     for stream in around.streams.values():
         os.close(stream)
-    yield from misbehaved(ended, (0, 1, 2) if chosen.words else (0,), what)
+    mute = "stderr" in around.streams
+    yield from misbehaved(ended, (0, 1, 2) if chosen.words else (0,), what, mute=mute)
     said = (ended.err + ended.out).lower()
     if ended.code in (1, 2) and not any(word in said for word in chosen.words):
         tail = " ".join(ended.err.split())[-200:]

@@ -108,7 +108,6 @@ def _case(rng: Random) -> bytes:
         ),
         "signal": rng.choice(("SIGTERM", "SIGINT", "SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")),
         "at": round(rng.uniform(0.02, 1.05), 3),  # share of the usual time
-        "warm": rng.random() < 0.3,
         "old": rng.random() < 0.5,
     }
     return json.dumps(case).encode()
@@ -127,8 +126,6 @@ def _killed(case: dict[str, object], folder: Path) -> Iterator[Found]:
     work, name = WORKS[str(case["command"])], str(case["signal"])
     given(folder)
     usual = _usual_s(str(case["command"]))
-    if case["warm"]:
-        _run(work, folder, None)
     for output in work.outputs:
         (folder / output).unlink(missing_ok=True)
         if case["old"]:

@@ -126,15 +126,14 @@ def _gone(folder: Path) -> Around:
     return replace(_kept()(folder), first=first)
 
 
-def _compiler(text: str) -> Prepare:
-    """Let CC name a program: its text, or no such one; its path has a space."""
+def _compiler(text: str, where: str = "tools") -> Prepare:
+    """Let CC name a program by its text."""
 
     def prepare(folder: Path) -> Around:
-        path = folder / "my tools" / "cc"
+        path = folder / where / "cc"
         path.parent.mkdir()
-        if text:
-            path.write_text(text)
-            path.chmod(0o755)
+        path.write_text(text)
+        path.chmod(0o755)
         return _kept(CC=str(path))(folder)
 
     return prepare
@@ -196,7 +195,8 @@ SURROUNDINGS: dict[str, Surroundings] = {
     "unknown terminal": Surroundings(_kept(TERM="no-such-terminal", FORCE_COLOR="1")),
     "CC missing": Surroundings(_kept(CC="/nowhere/cc"), ("cc", "compiler")),
     "CC with a space": Surroundings(
-        _compiler(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc "$@"\n'), ("cc", "compiler")
+        _compiler(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc "$@"\n', "my tools"),
+        ("cc", "compiler"),
     ),
     "CC fails": Surroundings(_compiler("#!/bin/sh\nexit 1\n"), ("cc", "compiler")),
     "CC is no program": Surroundings(_compiler("\0\1\2"), ("cc", "compiler")),

@@ -79,7 +79,7 @@ class Worker:
 
     def trace(self) -> str:
         """Return the Python calls that were under way at a crash or a hang."""
-        return (self.folder / "trace").read_text(errors="replace")[-4000:]
+        return (self.folder / "trace").read_text(errors="replace")[:6000]
 
     def clean(self) -> None:
         """Remove what the process left, which is counted already."""
@@ -105,9 +105,10 @@ def start(block: Block) -> Worker:
     _PROGRESS.pack_into(place, 0, block.first, time.monotonic(), 0, 0, 0)
     sys.stdout.flush()
     sys.stderr.flush()
+    parent = os.getpid()
     pid = os.fork()
     if not pid:
-        _in_the_child(block, folder, place)
+        _in_the_child(block, folder, place, parent)
     return Worker(block, pid, folder, place)
 
 
@@ -147,13 +148,13 @@ def _last(worker: Worker, index: int, code: int, *, hangs: bool) -> Failure:
     return Failure(name, kind, f"{said}, in {where}", index, f"{said} {where}", trace)
 
 
-def _in_the_child(block: Block, folder: Path, place: mmap.mmap) -> None:
+def _in_the_child(block: Block, folder: Path, place: mmap.mmap, parent: int) -> None:
     """Attack the inputs and end the process; nothing of the parent's runs on."""
     try:
         with (folder / "trace").open("w") as trace:
             faulthandler.enable(trace, all_threads=False)
             faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
-            _attack_all(block, folder, place)
+            _attack_all(block, folder, place, parent)
             faulthandler.disable()
         code = 0
     except BaseException:  # noqa: BLE001 - whatever it is, the parent must hear of it
@@ -162,7 +163,7 @@ def _in_the_child(block: Block, folder: Path, place: mmap.mmap) -> None:
     os._exit(code)
 
 
-def _attack_all(block: Block, folder: Path, place: mmap.mmap) -> None:
+def _attack_all(block: Block, folder: Path, place: mmap.mmap, parent: int) -> None:
     own = folder / "tmp"
     own.mkdir()
     os.environ["TMPDIR"], tempfile.tempdir = str(own), str(own)
@@ -175,7 +176,7 @@ def _attack_all(block: Block, folder: Path, place: mmap.mmap) -> None:
     with (folder / "failures").open("a", encoding="utf-8", buffering=1) as failures:
         for index in range(block.first, block.last):
             now = time.monotonic()
-            if now > until and not block.again:
+            if (now > until and not block.again) or os.getppid() != parent:
                 break
             _PROGRESS.pack_into(place, 0, index, now, done, accepted, 0)
             data = block.target.make(generator(block.seed, block.target.name, index))
