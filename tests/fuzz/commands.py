@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from psa_casadi.simulation.compiler import cache_directory
+from psa_casadi.cache import cache_directory
 from tests.fuzz.target import CRASH, FOREIGN, HANG, LEFT_OVER, WRONG_EXIT, Found
 
 PSA = (sys.executable, "-m", "psa_casadi.cli")
