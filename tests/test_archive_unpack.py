@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.importer import archive as importer
 from psa_casadi.export.importer import unpack as limits
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems, unpack
@@ -149,6 +150,14 @@ def test_a_description_that_names_a_library_elsewhere(tmp_path: Path) -> None:
         archive.writestr("modelDescription.xml", text)
     with pytest.raises(InputError, match="is no name in C"):
         Archive(path)
+
+
+def test_a_description_that_would_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importer, "LONGEST_TEXT", 100)
+    with pytest.raises(InputError, match=r"modelDescription\.xml has more than"):
+        Archive(_archive(tmp_path / "h.fmu"))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

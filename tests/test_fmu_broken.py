@@ -240,6 +240,14 @@ def test_sources_and_model_that_are_not_those_of_the_binary(fmi: int, tmp_path: 
     assert not report.compared
 
 
+@slow
+def test_a_folder_in_place_of_a_source(tmp_path: Path) -> None:
+    path, name = tmp_path / "b.fmu", "sources/solver.c"
+    files = {f"{n}/x" if n == name else n: c for n, c in entries(STACK, 2).items()}
+    write_archive(path, files)
+    assert set(_failures(check_fmu(path))) == {ALWAYS}
+
+
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_another_model(fmi: int) -> None:
     report = check_fmu(exported(STACK, fmi), model_named("manipulator"))

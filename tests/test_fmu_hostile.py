@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from psa_casadi.cli.app import app
 from psa_casadi.export.check.check import CheckRow, check_fmu
 from tests.hostile_fmus import DEED, PLACE, hostile_fmu
 from tests.tiers import slow, slow_but
@@ -67,6 +69,17 @@ def test_every_way_to_end_is_told_apart(
     assert DEEDS[deed] in row.remark
     assert "units defined" in before, "rows that were finished before are kept"
     assert ("co-simulation instantiates" in before) == (moment == "step")
+
+
+def test_the_command_fails_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ended with exit code 0, and without a word."""
+    monkeypatch.setenv(DEED, "load:exit")
+    path = hostile_fmu(tmp_path / "h.fmu", 2)
+    done = CliRunner().invoke(app, ["check", str(path), "--timeout", "30", "--memory", "512"])
+    assert done.exit_code == 1
+    assert "binary loads" in done.stdout.splitlines()[-1]
+    assert "the FMU ended its process with exit code 0 before the checks were done" in done.stdout
+    assert "RUNS THE CODE" in CliRunner().invoke(app, ["check", "--help"]).stdout
 
 
 @slow

@@ -39,6 +39,7 @@ class Process:
     said: bytes = b""
     _chunks: queue.Queue[bytes] = field(default_factory=queue.Queue)
     _threads: list[threading.Thread] = field(default_factory=list)
+    _group_ended: bool = False
 
     def rows(self, task: Task) -> list[CheckRow]:
         """Give it the task; return the rows it finished, and how it ended unless that was well.
@@ -155,7 +156,9 @@ class Process:
                     _pipe(pipe).close()
 
     def _end_group(self) -> None:
-        if sys.platform != "win32":
+        """End what the process started, once: its number may be another's afterwards."""
+        if sys.platform != "win32" and not self._group_ended:
+            self._group_ended = True
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.process.pid, signal.SIGKILL)
 

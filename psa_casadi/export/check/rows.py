@@ -8,7 +8,8 @@ from psa_casadi.errors import PsaError
 
 #: What a check may raise on an FMU that is not as expected; the row then did not pass.
 BREAKDOWNS = (
-    PsaError, ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
+    PsaError, ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError,
+    ValueError,
 )  # fmt: skip
 _LONGEST = 4000
 

@@ -16,6 +16,9 @@ from psa_casadi.scratch import temporary_folder
 
 #: The functions of each version of the standard, without their prefix.
 FUNCTIONS = {2: fmi2_functions.FUNCTIONS, 3: fmi3_functions.FUNCTIONS}
+#: Longest text that is read as a whole [bytes], and which these are.
+LONGEST_TEXT = 64 << 20
+_TEXTS = ("modelDescription.xml", "resources/model.json")
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
 _LIBRARY = re.compile(r".*\.(so|dll|dylib)")
 
@@ -36,6 +39,7 @@ class Archive:
         self._held = ExitStack()
         try:
             self.directory = unpacked or self._unpacked()
+            self._require_readable()
             self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
             self._read()
         except Exception as error:  # fmpy raises it for any damage
@@ -50,6 +54,16 @@ class Archive:
         place = self._held.enter_context(temporary_folder())
         unpack(self.path, place)
         return place
+
+    def _require_readable(self) -> None:
+        """Raise InputError if a text is so long that what is read of it would fill the memory."""
+        for name in _TEXTS:
+            place = self.directory / name
+            if place.is_file() and place.stat().st_size > LONGEST_TEXT:
+                raise InputError(
+                    f"{self.path}: {name} has more than {LONGEST_TEXT >> 20} MiB and is not read;"
+                    " export the FMU again."
+                )
 
     def _read(self) -> None:
         """Read what the description says first; raises InputError if it is of no known kind."""
