@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import Field
-from psa_casadi.records.read.file_bytes import read_bytes
+from psa_casadi.records.read.file_bytes import check_size, read_bytes
 from psa_casadi.units import FloatArray
+
+#: Bytes in memory of the fewest columns that a record has: a time and one number.
+_LEAST_ON_A_LINE = 16
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,12 @@ def load_text(path: str | os.PathLike[str]) -> CsvText:
     The delimiter is the one of comma, semicolon and tab that the header holds most often.
 
     Raises:
-        InputError: the file is missing, a directory, empty, unreadable, not text, or only comments.
+        InputError: the file is missing, a directory, empty, unreadable, too large, not text, or
+            only comments.
     """
     data = read_bytes(path)
+    lines_at_most = max(data.count(b"\n"), data.count(b"\r"))
+    check_size(path, _LEAST_ON_A_LINE * lines_at_most, "its lines need")
     text = _decode(data, str(path)).replace("\r\n", "\n").replace("\r", "\n")
     lines = text.split("\n")
     start = 0
