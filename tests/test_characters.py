@@ -41,15 +41,15 @@ WRITERS: dict[str, Callable[[Model], str]] = {
 }
 
 
-def described(text: str) -> Model:
+def described(text: str, name: str = "odd_gain") -> Model:
     """A stack with a text in its description, its notes and the description of a parameter."""
     odd = Component(
         "odd",
         f"an effect {text}",
         "none",
-        lambda s: Equations(add={"displacement": s.odd_gain * s.u}),
-        parameters=(Parameter("odd_gain", 0.0, "m/V", (-1.0, 1.0), f"a gain {text}"),),
-        gain="odd_gain",
+        lambda s: Equations(add={"displacement": getattr(s, name) * s.u}),
+        parameters=(Parameter(name, 0.0, "m/V", (-1.0, 1.0), f"a gain {text}"),),
+        gain=name,
     )
     model = replace(compose((*BASE, odd)), name="stack", description=f"a stack {text}")
     return replace(model, provenance=replace(model.provenance, notes=(f"a note {text}",)))
@@ -88,6 +88,13 @@ def test_no_fmu_and_no_system_is_left_of_a_refused_model(tmp_path: Path) -> None
     with pytest.raises(InputError, match=r"U\+000B"):
         export_ssp(replace(system, name="a\x0bb"), tmp_path / "a.ssp")
     assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("name", ['a"b', "a\\b", "a\nb", "a\0"])
+def test_a_name_that_c_would_read_otherwise_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError) as caught:
+        export_fmu(described("", name), tmp_path / "a.fmu")
+    assert f"is named {name!r}; quotes, backslashes and control" in str(caught.value)
 
 
 def test_a_text_that_is_no_utf_8_is_not_written(tmp_path: Path) -> None:

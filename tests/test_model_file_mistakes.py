@@ -116,10 +116,16 @@ def test_a_name_twice_is_no_choice_of_the_last() -> None:
 
 
 def test_many_mistakes_are_listed_up_to_twenty() -> None:
-    text = edited(lambda c: c.update(effects=[f"e{k}" for k in range(500)]))
-    problems = sentences(lambda: loads(text))
-    assert len(problems) == 21
-    assert problems[-1] == "... and 480 more"
+    for text in (
+        edited(lambda c: c["parameters"].update({f"p{k}": {"interval": 1} for k in range(500)})),
+        edited(lambda c: c.update(starts={f"x{k}": 1.0 for k in range(500)})),
+    ):
+        problems = sentences(lambda t=text: loads(t))  # type: ignore[misc]
+        assert len(problems) == 21
+        assert problems[-1].startswith("... and 48")
+    text = edited(lambda c: c.update(components=["drive"] * 10_000))
+    (problem,) = sentences(lambda: loads(text))
+    assert "'components' lists 10000 names, but there are only" in problem
 
 
 UNWRITABLE: dict[str, Callable[[Model], Model]] = {

@@ -4,6 +4,7 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record, read_records
+from psa_casadi.records.read import file_bytes
 from tests.record_files import HEADER, ROWS, write
 
 
@@ -150,6 +151,14 @@ def test_instants_that_are_one_in_seconds_are_refused(tmp_path: Path) -> None:
     header = HEADER.replace("[s]", "[ms]")
     (problem,) = problems_of(write(tmp_path / "b.csv", header, *rows))
     assert "instants are the same in seconds" in problem
+
+
+def test_lines_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "a.csv", HEADER, *ROWS, *[""] * 1000)
+    assert read_record(path).n == 20
+    monkeypatch.setattr(file_bytes, "MOST_BYTES", 10_000)
+    (problem,) = problems_of(path)
+    assert "its lines need more than" in problem
 
 
 def test_a_constant_voltage_is_refused_only_for_a_fit(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from psa_casadi.effects.patches import PATCHES
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.model_file_checks import FORMAT, check_content, name_of
+from psa_casadi.model.model_file_checks import FORMAT, check_content, first_ones, name_of
 from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.strict_json import json_text, parse_json, read_json_text, shown
 from psa_casadi.variables import Interval, Provenance, Publication
@@ -102,7 +102,8 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
             description=content.get("description", ""),
         ).with_starts(content.get("starts", {}))
     except InputError as error:
-        raise InputError([f"{source}: {problem}" for problem in error.problems]) from error
+        said = first_ones(f"{source}: {problem}" for problem in error.problems)
+        raise InputError(said) from error
     ordered = {p.name: given[p.name] for p in model.structure.parameters}
     published = Publication(**content.get("publication", {}))
     return model.with_values({}, provenance=_provenance(content, ordered), publication=published)

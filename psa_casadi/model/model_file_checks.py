@@ -1,12 +1,12 @@
 """What is checked of the content of MODEL.json before a model is made of it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
 from psa_casadi.component import Component
 from psa_casadi.components import COMPONENTS
-from psa_casadi.errors import Problems
+from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.own_effects import declaration_hash
 from psa_casadi.strict_json import shown
 from psa_casadi.variables import Publication
@@ -21,10 +21,16 @@ def check_content(content: Any, source: str, effects: Mapping[str, Component]) -
     `effects` are those that it may name. Raises InputError that names every unknown name, missing
     or bad value, at most 20 of them.
     """
+    if problems := first_ones(_problems(content, source, effects)):
+        raise InputError(problems)
+
+
+def first_ones(sentences: Iterable[str]) -> tuple[str, ...]:
+    """Return the first 20 sentences and a count of the others."""
     problems = Problems()
-    for sentence in _problems(content, source, effects):
+    for sentence in sentences:
         problems.add(sentence)
-    problems.raise_if_any()
+    return problems.sentences()
 
 
 def name_of(effect: Any) -> Any:
@@ -46,6 +52,11 @@ def _problems(content: Any, source: str, effects: Mapping[str, Component]) -> li
         if not isinstance(names, list):
             problems.append(f"{source}: '{key}' is missing; it must list names.")
             continue
+        if len(names) > len(table):
+            return [
+                f"{source}: '{key}' lists {len(names)} names, but there are only {len(table)}; name"
+                " none twice."
+            ]
         for reference in names:
             name = name_of(reference)
             if isinstance(name, str) and name in table:

@@ -103,6 +103,12 @@ def _refuse(model: Model, table: list[Variable]) -> None:
         f"Two variables of '{model.name}' are named '{name}', which FMI does not allow; rename one."
         for name in sorted({n for n in names if names.count(n) > 1})
     ]
+    problems += [
+        f"A variable of '{model.name}' is named {name!r}; quotes, backslashes and control"
+        " characters cannot stand in the sources of an FMU: rename it."
+        for name in names
+        if re.search(r'["\\\x00-\x1f\ud800-\udfff]', name)
+    ]
     if not (model.structure.states or model.structure.sampled):
         problems.append(f"The model '{model.name}' has no state; add a component that has one.")
     if problems:

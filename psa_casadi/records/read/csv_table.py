@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import Field
-from psa_casadi.records.read.file_bytes import read_bytes, unpacked
+from psa_casadi.records.read.file_bytes import check_size, read_bytes, unpacked
 from psa_casadi.records.read.layout import cells_of, layout
 from psa_casadi.units import FloatArray
+
+#: Bytes in memory of the fewest columns that a record has: a time and one number.
+_LEAST_ON_A_LINE = 16
 
 
 @dataclass(frozen=True)
@@ -66,10 +69,14 @@ def load_text(path: str | os.PathLike[str]) -> CsvText:
     number of spaces.
 
     Raises:
-        InputError: the file is missing, a directory, empty, unreadable, not text, or only comments.
+        InputError: the file is missing, a directory, empty, unreadable, too large, not text, or
+            only comments.
     """
     data = read_bytes(path)
-    text = _decode(unpacked(data, path), str(path)).replace("\r\n", "\n").replace("\r", "\n")
+    content = unpacked(data, path)
+    lines_at_most = max(content.count(b"\n"), content.count(b"\r"))
+    check_size(path, _LEAST_ON_A_LINE * lines_at_most, "its lines need")
+    text = _decode(content, str(path)).replace("\r\n", "\n").replace("\r", "\n")
     lines = text.split("\n")
     found = layout(lines)
     if found is None:

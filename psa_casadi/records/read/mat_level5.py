@@ -155,7 +155,9 @@ def _array(content: memoryview, order: str, depth: int = 0) -> tuple[str, Tree]:
 def _numbers(parts: _Parts, kind: int, shape: list[int]) -> NDArray[np.generic]:
     stored, content = parts.next(*_STORED)
     given, held = np.dtype(parts.order + _STORED[stored]), np.dtype(_CLASSES[kind])
-    if held.kind != "f" and (given.kind == "f" or given.itemsize > held.itemsize):
+    # floats are stored as integers to save room, integers as smaller ones
+    room = 4 if held.kind == "f" and given.kind != "f" else held.itemsize
+    if given.itemsize > room or (given.kind == "f") > (held.kind == "f"):
         raise ValueError(f"an array of {held.name} is stored as {given.name}")
     if len(content) != math.prod(shape) * given.itemsize:
         raise ValueError(f"an array of the dimensions {shape[:8]} has {len(content)} bytes")
