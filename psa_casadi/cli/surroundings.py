@@ -1,14 +1,16 @@
 """What a command stands on: its streams, the signals that end it, what the machine can refuse."""
 
+import atexit
 import contextlib
 import errno
 import io
 import os
 import signal
 import sys
+import tempfile
 from types import FrameType
 
-from psa_casadi.scratch import abandon
+from psa_casadi.scratch import abandon, temporary_folder
 
 #: What the operating system refuses: what happened, and what to do.
 _REFUSALS = {
@@ -32,7 +34,16 @@ _MEMORY = ("bad_alloc", "failed to map segment", "Cannot allocate memory", "cann
 
 
 def prepare() -> None:
-    """Give a command streams that can be written to, and signals that end it tidily."""
+    """Give a command streams that can be written to, and an end that leaves nothing behind."""
+    _open_streams()
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _end)
+    _take_temporary_folder()
+
+
+def _open_streams() -> None:
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
             os.fstat(descriptor)
@@ -43,10 +54,18 @@ def prepare() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, _end)
+
+
+def _take_temporary_folder() -> None:
+    """Let all temporary files, those of other packages and programs too, lie in a folder of ours.
+
+    Where none can be made, the first to need one says so.
+    """
+    with contextlib.suppress(OSError):
+        held = contextlib.ExitStack()
+        folder = str(held.enter_context(temporary_folder()))
+        atexit.register(held.close)
+        tempfile.tempdir = os.environ["TMPDIR"] = folder
 
 
 def silence() -> None:
