@@ -23,6 +23,7 @@ _REFUSALS = {
     errno.EPERM: ("the system denies access", "change its permissions, or choose another place"),
     errno.EMFILE: ("too many files are open", "raise the limit (ulimit -n)"),
     errno.ENFILE: ("too many files are open", "close other programs"),
+    errno.EFBIG: ("a file is larger than may be", "raise the limit (ulimit -f)"),
     errno.ENAMETOOLONG: ("a file's name is too long", "choose a shorter name or folder"),
     errno.ENOMEM: ("there is too little memory", "close other programs, or raise its limit"),
     errno.EAGAIN: ("no more processes may be started", "close others, or raise the limit"),
