@@ -24,7 +24,7 @@ from psa_casadi.errors import InputError, MachineError
 from psa_casadi.files import atomic_path, atomic_write
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps
-from psa_casadi.scratch import PREFIX
+from psa_casadi.scratch import PREFIX, temporary_folder
 from psa_casadi.simulation import compiler
 from tests.record_files import HEADER, ROWS, write
 
@@ -46,14 +46,18 @@ def shell(line: str, **variables: str) -> "subprocess.CompletedProcess[str]":
 STREAMS = {
     "nobody reads on": ("psa effects | true", 1, ""),
     "output closed": ("psa effects >&-", 0, ""),
-    "all streams closed": ("psa effects slow_creep <&- >&- 2>&-", 0, ""),
+    "all streams closed": ("psa --help <&- >&- 2>&-", 0, ""),
     "output on a full disk": ("psa effects >/dev/full", 1, "Failed: the disk is full"),
     "help on a full disk": ("psa --help >/dev/full", 1, "Failed: the disk is full"),
 }
+SLOW_STREAMS = ("output closed", "output on a full disk")
 
 
 @posix
-@pytest.mark.parametrize("case", STREAMS)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=[pytest.mark.slow] if c in SLOW_STREAMS else []) for c in STREAMS],
+)
 def test_output_that_cannot_be_written(case: str) -> None:
     line, code, said = STREAMS[case]
     done = shell(line)
@@ -65,11 +69,26 @@ def test_output_that_cannot_be_written(case: str) -> None:
 @posix
 def test_letters_that_the_terminal_lacks_do_not_end_a_command() -> None:
     plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    done = shell("psa stacks", PYTHONIOENCODING="ascii", **plain)
-    assert done.returncode == 0, done.stderr
-    assert "P-885.51" in done.stdout
-    name = os.fsdecode(b"\xff.csv")  # a name of a file that is no text
-    assert shell(f"psa identify '{name}' -o m.json").stderr.startswith("Error: ")
+    code = "from psa_casadi.cli.surroundings import prepare; prepare()"
+    done = shell(
+        f"""'{sys.executable}' -c '{code}; print("5 \\u00b5m, \\udcff.csv")'""",
+        PYTHONIOENCODING="ascii", **plain,
+    )  # fmt: skip
+    assert done.stdout == "5 ?m, ?.csv\n", done.stderr
+
+
+@posix
+@pytest.mark.parametrize("end", ["", "os._exit(0)", "os.kill(os.getpid(), 15)"])
+def test_temporary_files_of_other_packages_go_too(end: str, tmp_path: Path) -> None:
+    """With the command that made them, or with the next."""
+    code = "import os, tempfile; from psa_casadi.cli.surroundings import prepare; prepare()"
+    for last in (end, ""):
+        script = f"{code}; print(tempfile.mkdtemp(), os.environ['TMPDIR']); {last}"
+        done = shell(f"'{sys.executable}' -uc '{script}'".replace("['", '["').replace("']", '"]'),
+                     TMPDIR=str(tmp_path))  # fmt: skip
+        assert all(p.startswith(f"{tmp_path}/{PREFIX}") for p in done.stdout.split()), done.stderr
+        assert len(done.stdout.split()) == 2
+        assert bool(os.listdir(tmp_path)) == ("_exit" in last)
 
 
 def ended_by(error: BaseException) -> tuple[int, str]:
@@ -257,7 +276,7 @@ def left_over(folder: Path) -> list[Path]:
 
 
 @posix
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.slow)])
 def test_a_command_that_is_told_to_end_leaves_nothing(name: str, tmp_path: Path) -> None:
     number = getattr(signal, name)
     with compiling(tmp_path) as (command, child):
@@ -282,19 +301,18 @@ def test_what_a_killed_command_left_goes_with_the_next(
         assert left_over(tmp_path)
         os.kill(child, signal.SIGKILL)
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
-    compiler.shared_library({"a.c": "int a;"}, ())
+    with temporary_folder(tmp_path / "tmp"):  # as every command makes one
+        compiler.shared_library({"a.c": "int a;"}, ())
     assert not left_over(tmp_path)
 
 
 @posix
 def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(tmp_path: Path) -> None:
     record = write(tmp_path / "record.csv", HEADER, *ROWS)
-    model = write(tmp_path / "model.json", MODEL)
     where = {"CC": "nothing-of-this-name", "PSA_CASADI_CACHE": str(tmp_path / "cache")}
-    for line in (f"identify '{record}'", f"simulate --model '{model}' --input '{record}'"):
-        done = shell(f"psa {line} -q -o '{tmp_path}/out'", **where)
-        assert done.returncode == 1
-        assert done.stderr.startswith("Failed: The C compiler nothing-of-this-name cannot be")
+    done = shell(f"psa identify '{record}' -q -o '{tmp_path}/m.json'", **where)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Failed: The C compiler nothing-of-this-name cannot be started")
 
 
 @posix

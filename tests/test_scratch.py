@@ -141,7 +141,10 @@ def ended(pid: int) -> bool:
     return False
 
 
-def test_to_abandon_removes_everything_at_once(tmp_path: Path) -> None:
+def test_to_abandon_removes_everything_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scratch, "_MADE", set())
     with temporary_folder(tmp_path) as folder, temporary_file(tmp_path, "a.csv") as file:
         (folder / "deep" / "deeper").mkdir(parents=True)
         file.write_text("half")

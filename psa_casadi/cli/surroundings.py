@@ -1,14 +1,16 @@
 """What a command stands on: its streams, the signals that end it, what the machine can refuse."""
 
+import atexit
 import contextlib
 import errno
 import io
 import os
 import signal
 import sys
+import tempfile
 from types import FrameType
 
-from psa_casadi.scratch import abandon
+from psa_casadi.scratch import abandon, temporary_folder
 
 #: What the operating system refuses: what happened, and what to do.
 _REFUSALS = {
@@ -21,6 +23,7 @@ _REFUSALS = {
     errno.EPERM: ("the system denies access", "change its permissions, or choose another place"),
     errno.EMFILE: ("too many files are open", "raise the limit (ulimit -n)"),
     errno.ENFILE: ("too many files are open", "close other programs"),
+    errno.EFBIG: ("a file is larger than may be", "raise the limit (ulimit -f)"),
     errno.ENAMETOOLONG: ("a file's name is too long", "choose a shorter name or folder"),
     errno.ENOMEM: ("there is too little memory", "close other programs, or raise its limit"),
     errno.EAGAIN: ("no more processes may be started", "close others, or raise the limit"),
@@ -32,7 +35,16 @@ _MEMORY = ("bad_alloc", "failed to map segment", "Cannot allocate memory", "cann
 
 
 def prepare() -> None:
-    """Give a command streams that can be written to, and signals that end it tidily."""
+    """Give a command streams that can be written to, and an end that leaves nothing behind."""
+    _open_streams()
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _end)
+    _take_temporary_folder()
+
+
+def _open_streams() -> None:
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
             os.fstat(descriptor)
@@ -43,10 +55,18 @@ def prepare() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, _end)
+
+
+def _take_temporary_folder() -> None:
+    """Let all temporary files, those of other packages and programs too, lie in a folder of ours.
+
+    Where none can be made, the first to need one says so.
+    """
+    with contextlib.suppress(OSError):
+        held = contextlib.ExitStack()
+        folder = str(held.enter_context(temporary_folder()))
+        atexit.register(held.close)
+        tempfile.tempdir = os.environ["TMPDIR"] = folder
 
 
 def silence() -> None:
