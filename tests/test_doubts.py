@@ -162,6 +162,13 @@ def test_what_is_flat_for_other_reasons_is_not_a_saturated_sensor(
     assert not suspects(Record("as it is", time, voltage, y)).ends
 
 
+def test_a_coarse_sensor_is_named(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    time, voltage, y = given
+    quantum = np.ptp(y) / 9.0
+    found = diagnose([Record("r", time, voltage, quantum * np.round(y / quantum))], effects=TABLE)
+    assert "r: the sensor resolves 9 steps over the whole range." in found.notes[-1]
+
+
 def test_hardly_a_reading_left_is_refused_with_the_reason(
     given: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:

@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from psa_casadi.cli import design_input_runs
 from psa_casadi.cli.app import app
+from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.effects import EFFECTS
@@ -191,6 +193,33 @@ def test_a_command_says_what_it_kept(
     if m.exists():
         cut = "finished" not in told
         assert load_model(m).provenance.interrupted == cut
+
+
+def test_a_solver_does_not_take_an_interrupt_for_its_own_failure() -> None:
+    """IPOPT ends at an interrupt as at a failure, which other starts would make up for."""
+    with interruptible_work() as work:
+        work.stop()
+        with pytest.raises(KeyboardInterrupt):
+            design_mechanism(stack_model("PTBS200"), damping=0.7, starts=2)
+
+
+def test_a_designed_voltage_is_kept_without_its_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+
+    def cut(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(design_input_runs, "_on_fmu", cut)
+    time = np.arange(40) * 1e-3
+    path = {"time [s]": time, "displacement [um]": 5.0 - 5.0 * np.cos(150.0 * time)}
+    write_record(tmp_path / "path.csv", path)
+    voltage = tmp_path / "v.csv"
+    given = ["design", "input", "--fast", "--stack", "P-885.51", "-o", str(voltage)]
+    ended = CliRunner().invoke(app, [*given, "--target", str(tmp_path / "path.csv")])
+    assert ended.exit_code == 130
+    assert f"the voltage was designed before. Kept: {voltage}." in ended.stderr
+    assert voltage.exists()
 
 
 def interrupted(

@@ -1,6 +1,7 @@
 """The command `psa`; each subcommand is a small file that calls one function of the package."""
 
 import os
+import signal
 import sys
 
 __all__ = ["main"]
@@ -16,6 +17,8 @@ def main() -> None:
 
         run()
     except KeyboardInterrupt:
+        sys.stderr.write("Interrupted: nothing was begun.\n")
+        sys.stderr.flush()
         os._exit(INTERRUPTED)
     except SystemExit as ended:
         if ended.code == INTERRUPTED:
@@ -23,3 +26,5 @@ def main() -> None:
             sys.stderr.flush()
             os._exit(INTERRUPTED)
         raise
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done; Python tidies up

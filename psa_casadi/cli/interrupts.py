@@ -31,7 +31,12 @@ def interrupts() -> Iterator[None]:
             return
         ours, theirs = socket.socketpair()
         theirs.setblocking(False)
-        handler = signal.signal(signal.SIGINT, _raise)
+
+        def interrupt(number: int, frame: FrameType | None) -> None:
+            work.stop()  # a solver that takes the exception for its own failure ends all the same
+            raise KeyboardInterrupt
+
+        handler = signal.signal(signal.SIGINT, interrupt)
         wakeup = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         watcher = threading.Thread(target=_watch, args=(ours, work), daemon=True)
         watcher.start()
@@ -43,10 +48,6 @@ def interrupts() -> Iterator[None]:
             theirs.close()
             watcher.join()
             ours.close()
-
-
-def _raise(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def _watch(woken: socket.socket, work: Work) -> None:

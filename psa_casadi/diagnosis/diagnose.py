@@ -30,6 +30,12 @@ from psa_casadi.simulation.timings import stage
 
 #: So many further stuck readings are worth a second search.
 MORE = 3
+#: Steps of a sensor over a record's range below which it is coarse, and what is said then.
+COARSE = 32
+COARSE_NOTE = (
+    "{}: the sensor resolves {:.0f} steps over the whole range. They are what the model's error is"
+    " made of: nothing that is smaller can be told from them."
+)
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
@@ -83,16 +89,19 @@ def diagnose(
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
-    """Return the records without suspect samples, and where a sensor was saturated.
+    """Return the records without suspect samples, and where a sensor was saturated or coarse.
 
     Raises InputError where hardly a sample is left.
     """
     refuse_still(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
-    saturated = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
-    refuse_few(records, clean, saturated)
-    return clean, saturated
+    said = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
+    refuse_few(records, clean, said)
+    for r, own in zip(records, found, strict=True):
+        if own.quantum is not None and r.range_m < COARSE * own.quantum:
+            said.append(COARSE_NOTE.format(r.name, r.range_m / own.quantum))
+    return clean, said
 
 
 def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
