@@ -66,6 +66,7 @@ def test_damaged_inputs(target: str, tmp_path: Path) -> None:
 
 
 @slow
+@pytest.mark.xdist_group("fuzz")  # they share the files that commands are given
 @pytest.mark.parametrize("target", COMMANDS)
 def test_commands(target: str, tmp_path: Path) -> None:
     case = json.dumps(COMMANDS[target]).encode()
