@@ -135,7 +135,8 @@ def _damage(data: bytes, where: Path) -> Iterator[Found]:
             path = folder / "cache" / kept / name
             path.write_bytes(content)
             path.chmod(0o755)
-        WAYS[case["way"]](folder / "cache" / kept / next(iter(sorted(libraries))))
+        largest = max(libraries, key=lambda name: len(libraries[name]))  # beside it: checksums
+        WAYS[case["way"]](folder / "cache" / kept / largest)
         what = f"psa {case['run']} with a library in the cache: {case['way']}"
         for turn in ("at first", "again"):
             yield from _same(

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from psa_casadi.cache import cache_directory
 from tests.fuzz.target import CRASH, FOREIGN, HANG, LEFT_OVER, WRONG_EXIT, Found
 
 PSA = (sys.executable, "-m", "psa_casadi.cli")
 #: Root of the checkout, where the package is found from any directory.
 ROOT = Path(__file__).resolve().parents[2]
+_COMPILERS_OWN = Path(os.environ.get("PSA_CASADI_CACHE", Path.home() / ".cache/psa_casadi")) / "zig"
 _FAULTS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
 
 
@@ -87,8 +87,7 @@ def _environment(folder: Path, around: Around) -> dict[str, str]:
         "PYTHONPATH": str(ROOT),
         "OPENBLAS_NUM_THREADS": "1",
         # what the compiler keeps for itself is not made anew for each empty cache
-        "ZIG_GLOBAL_CACHE_DIR": str(cache_directory() / "zig"),
-        "ZIG_LOCAL_CACHE_DIR": str(cache_directory() / "zig"),
+        "ZIG_GLOBAL_CACHE_DIR": str(_COMPILERS_OWN),
         **around.environment,
     }
     return {name: value for name, value in found.items() if value is not None}
