@@ -43,7 +43,7 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
         Variable("time", "time", 0, "s", "simulation time"),
         *(
             Variable(q.name, "state", i, q.unit, q.description, q.display_unit, q.start,
-                     nominal_value(q.nominal, values))
+                     q.told(values))
             for i, q in enumerate(s.states)
         ),
         *(
@@ -63,7 +63,7 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
         ),
         *(
             Variable(q.name, "parameter", i, q.unit, q.description, q.display_unit, values[q.name],
-                     q.typical(values), q.bounds)
+                     abs(values[q.name]) or q.typical(values), q.bounds)
             for i, q in enumerate(s.parameters)
         ),
         *(
