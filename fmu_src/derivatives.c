@@ -19,6 +19,7 @@ static double *known_place(psa_instance *instance, unsigned vr, psa_knowns *in) 
     case PSA_INPUT: return in->u + v->index;
     case PSA_PARAMETER: return in->p + v->index;
     case PSA_SAMPLED: return in->p + PSA_NP + v->index;
+    case PSA_OPTION: return &in->option;
     default:
         psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be varied.", v->name);
         return NULL;

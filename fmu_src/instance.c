@@ -94,9 +94,11 @@ const char *psa_objection(const char *name, const char *token) {
 void psa_instance_start(psa_instance *instance, psa_interface interface) {
     psa_state *const state = &instance->state;
     memset(state, 0, sizeof *state);
-    psa_solver_start(&state->solver, 0.0, psa_start_states, psa_state_nominals,
+    psa_solver_start(&state->solver, 0.0, psa_start_states, psa_state_scales,
                      STEP_SHARE * DEFAULT_TOLERANCE);
     memcpy(state->input.value, psa_start_inputs, sizeof state->input.value);
+    memcpy(state->given, psa_start_inputs, sizeof state->given);
+    memcpy(state->earlier, psa_start_inputs, sizeof state->earlier);
     memcpy(state->p, psa_start_parameters, sizeof state->p);
     for (int i = 0; i < PSA_NZ; ++i) state->facing[i] = 1.0;
     state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
@@ -184,6 +186,30 @@ static void look(void *owner, psa_end *end) {
     end->since -= back;
 }
 
+/* How the inputs move over the coming step: by the rate that the importer gave, else along the line, but
+   by no more than over the last step, which may have been much shorter. */
+static void aim_inputs(psa_state *state, double size) {
+    for (int i = 0; i < PSA_NU; ++i) {
+        if (!state->rate_given[i]) state->input.rate[i] = 0.0;
+        if (!state->rate_given[i] && state->line > 0.0) {
+            state->input.value[i] = state->given[i];
+            if (state->stride > 0.0)
+                state->input.rate[i] =
+                    state->line * (state->given[i] - state->earlier[i]) / fmax(state->stride, size);
+        }
+        state->earlier[i] = state->input.value[i];
+    }
+}
+
+/* What the next line goes through, at the end of a step. */
+static void remember_inputs(psa_state *state, double begin) {
+    const int same_clock = state->last.kind == PSA_STEP_KNOWN;
+    state->stride = same_clock ? state->solver.since : fmax(state->solver.t - begin, 0.0);
+    for (int i = 0; i < PSA_NU; ++i)
+        if (state->rate_given[i] || state->line == 0.0) state->given[i] = state->input.value[i];
+    memset(state->rate_given, 0, sizeof state->rate_given);
+}
+
 /* Keep what the coming communication step starts from, for its sensitivities. */
 static void remember(psa_state *state, psa_end end) {
     psa_last_step *const last = &state->last;
@@ -220,15 +246,14 @@ static psa_result advance(psa_instance *instance, psa_end end) {
     const double begin = solver->t;
     const int sampled = PSA_NS > 0 && state->at_instant;
     const int64_t steps = solver->steps, rejected = solver->rejected;
-    for (int i = 0; i < PSA_NU; ++i)
-        if (!state->rate_given[i]) state->input.rate[i] = 0.0;
     restart_clock(state);
+    aim_inputs(state, end.since);
     if (psa_leave_instant(instance) != PSA_FINE) return PSA_DISCARD;
     remember(state, end);
     if (sampled) state->last.kind = PSA_STEP_SAMPLED;
     instance->goal = end;
     const psa_status status = run_solver(instance);
-    memset(state->rate_given, 0, sizeof state->rate_given);
+    remember_inputs(state, begin);
     psa_arrive(instance);
     psa_whisper(instance, "Step from %.9g s to %.9g s: %ld solver steps, %ld rejected.", begin, solver->t,
             (long)(solver->steps - steps), (long)(solver->rejected - rejected));

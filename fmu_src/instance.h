@@ -80,6 +80,12 @@ typedef struct {
     double p[PSA_HELD + 1];
     psa_last_step last;
     int64_t rate_given[PSA_NU + 1]; /* the importer gave this input's rate for the next step */
+    /* The option input_line: this share of the slope between the last two values that an input was
+       given goes on over a step (0: inputs are held). A step does not change what was given. */
+    double line;
+    double given[PSA_NU + 1];   /* last */
+    double earlier[PSA_NU + 1]; /* that the last step started with */
+    double stride;              /* length of that step; 0: there is none, or an event came after it */
     /* An event indicator is facing * switch + margin. Facing changes its sign at an event, so that the
        noise of an importer's solver about a held input makes no further ones. */
     double facing[PSA_NZ + 1];
@@ -206,7 +212,7 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
 
 /* One number for each variable that can be known: a direction, or a gradient. */
 typedef struct {
-    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1];
+    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1], option; /* the option: of no effect */
 } psa_knowns;
 
 /* Change of the states at the end of the last communication step along each direction: moved is

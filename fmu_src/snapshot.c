@@ -7,7 +7,8 @@
 #define WORDS_OF_POINT \
     ((14 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_HELD + 1)) /* solver, input, parameters */
 typedef char psa_state_has_no_gaps
-    [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + (PSA_NS + 1) + 8)
+    [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + (PSA_NS + 1) + 8 + 
+                                2 + 2 * (PSA_NU + 1))
          ? 1
          : -1];
 

@@ -44,6 +44,7 @@ static double value_of(const psa_instance *instance, const psa_variable *v) {
     case PSA_OUTPUT: return instance->y[v->index];
     case PSA_INDICATOR: return instance->z[v->index];
     case PSA_SAMPLED: return sampled_value(&instance->state, v->index);
+    case PSA_OPTION: return instance->state.line;
     default: return instance->state.p[v->index];
     }
 }
@@ -82,7 +83,8 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
         !(instance->state.phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)))
         return psa_say(instance, PSA_ERROR,
                        "State '%s' can be set only before the first step.", v->name);
-    if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT && v->kind != PSA_PARAMETER)
+    if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT &&
+        v->kind != PSA_PARAMETER && v->kind != PSA_OPTION)
         return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be set.", v->name);
     if (value < v->low || value > v->high)
         return psa_say(instance, PSA_ERROR, "'%s' cannot be set to %.9g: it must be at %s %.9g.", v->name,
@@ -96,8 +98,12 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
 static void set_one(psa_instance *instance, const psa_variable *v, double value) {
     psa_state *const state = &instance->state;
     if (v->kind == PSA_INPUT) {
-        state->input.value[v->index] = value;
+        state->input.value[v->index] = state->given[v->index] = value;
         if (!state->rate_given[v->index]) state->input.rate[v->index] = 0.0;
+        return;
+    }
+    if (v->kind == PSA_OPTION) {
+        state->line = value;
         return;
     }
     if (v->kind == PSA_STATE) state->solver.x[v->index] = value;

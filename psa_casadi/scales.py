@@ -41,6 +41,12 @@ def velocity_scale(p: Values) -> float:
     return stroke_scale(p) * omega
 
 
+def usual_velocity(p: Values) -> float:
+    """Stroke over the time that a step takes: the lags and the lowest mode, together [m/s]."""
+    lags = p.get("tau", 0.0) + p.get("R_s", 0.0) * p.get("C_p", 0.0)
+    return stroke_scale(p) / (stroke_scale(p) / velocity_scale(p) + lags)
+
+
 def current_scale(p: Values) -> float:
     """Charging current at one rated voltage span per millisecond [A]."""
     return p["C_p"] * voltage_scale(p) / 1e-3

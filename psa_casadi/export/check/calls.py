@@ -238,7 +238,8 @@ def snapshots(fmu: Fmu) -> Problems:
 
 def _damaged(data: bytes) -> Iterator[tuple[bytes, str]]:
     """Yield serialised states with something wrong, and what."""
-    for place, what in ((0, "foreign"), (len(data) // 2, "damaged")):
+    damaged = ((len(data) * share // 16, "damaged") for share in range(4, 16))
+    for place, what in ((0, "foreign"), *damaged):
         yield data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :], what
     yield data[:-1], "truncated"
     yield data[:8], "truncated"

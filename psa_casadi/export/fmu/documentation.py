@@ -68,6 +68,20 @@ input derivatives (FMI 2.0) it is of second order, and steps may be as long as t
 straight."""
 
 
+_INPUTS = """\
+Over a communication step each input moves at the rate that the importer gave it for the step (FMI
+2.0: fmi2SetRealInputDerivatives); without one it is held, and a smooth signal arrives half a step
+late. FMI 3.0 has no such rates. With the parameter input_line = 1 an input goes on along the line
+through the last two values it was given (over a step longer than the last one, by as much as over
+that). Steps of 1/(200 f) then err by 0.1 % of the range of a sine of frequency f, and the error
+falls with the square of the step. What is left is that
+the signal bends: at the end of a step the line is off by the square of the step times the second
+derivative, most where the signal turns, and hysteresis remembers that it went too far. The first
+step is held, and so is the one after event mode. Values before and after a jump have no line in
+common: enter event mode at a jump, or leave the option at 0. Between 0 and 1 that share of the
+slope counts. Model exchange knows no steps and ignores the option."""
+
+
 def documentation(model: Model, *, reference_run: bool = True, step: HeldStep | None = None) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
@@ -86,6 +100,7 @@ def documentation(model: Model, *, reference_run: bool = True, step: HeldStep | 
         _publication(model),
         "<h2>Use</h2>",
         f"<p>{_USE}</p>",
+        f"<p>{_INPUTS}</p>" if model.input_names else "",
         _sampling(model, table),
         _step(step),
         "<h2>Start</h2>",

@@ -155,7 +155,9 @@ def _declared(
     def own(variable: State) -> State:
         text = f"{name}: {variable.description}"
         name_there = f"{name}_{variable.name}"
-        return replace(variable, name=name_there, description=text, nominal=size(variable.nominal))
+        usual = None if variable.usual is None else size(variable.usual)
+        there = replace(variable, name=name_there, description=text, usual=usual)
+        return replace(there, nominal=size(variable.nominal))
 
     return Component(
         name=name,
