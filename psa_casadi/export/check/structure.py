@@ -151,9 +151,18 @@ def wrong_start(fmu: Fmu, model: Model) -> Iterator[str]:
     for interface, kind in ((CO_SIMULATION, "co-simulation"), (MODEL_EXCHANGE, "model exchange")):
         with fmu.start(interface) as instance:
             found = instance.get(list(expected))
-        for (name, value), there in zip(expected.items(), found, strict=True):
-            if abs(there - value) > _ROUNDING * (abs(value) + fmu.nominals[name]):
-                yield f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}"
+        others = [
+            (name, there, value)
+            for (name, value), there in zip(expected.items(), found, strict=True)
+            if abs(there - value) > _ROUNDING * (abs(value) + fmu.nominals[name])
+        ]
+        if others:
+            name, there, value = next((o for o in others if o[0] == "voltage"), others[-1])
+            yield (
+                f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}, and"
+                f" {len(others) - 1} more values differ; compare with the model that was exported,"
+                " with its --start-voltage and --history"
+            )
 
 
 def equation_error(fmu: Fmu, model: Model) -> float:
