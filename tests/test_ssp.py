@@ -185,3 +185,8 @@ def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     assert 0.0 < step <= 0.05 * stable_step(wiring, rates=False)
     assert step <= 1e-3 * float(root.find("{*}DefaultExperiment").get("stopTime"))
     assert f"{step:.0e}"[0] in "125"
+    results = re.search(
+        r'<oms:SimulationInformation resultFile="(\w+)\.csv" loggingInterval="', text
+    )
+    assert results is not None
+    assert results[1] == wiring.name

@@ -43,7 +43,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
     save_model(STACK, made / "plain.json")
     save_model(settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
-    _run("export", "fmu", "--model", str(made / "plain.json"), "-o", str(made / "m.fmu"), *OPTIONS)
+    said = _run(
+        "export", "fmu", "--model", str(made / "plain.json"), "-o", str(made / "m.fmu"), *OPTIONS
+    )
+    assert "start: the start values of the model at 60 V" in said
     return made
 
 
@@ -95,7 +98,7 @@ def test_the_check_has_a_row_for_the_start(folder: Path) -> None:
         assert list(wrong_start(fmu, truth_of(settled, 2))) == []
         found = list(wrong_start(fmu, truth_of(plain, 2)))
         assert any("co-simulation 'voltage' starts at 60, the model at 0" in f for f in found)
-        assert any("model exchange 'displacement' starts at" in f for f in found)
+        assert any("model exchange 'voltage' starts at 60" in f for f in found)
     with Archive(folder / "m.fmu") as archive:
         assert any(
             f.startswith("'voltage' starts at 60") for f in wrong_start_values(archive, plain)

@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,6 +23,9 @@ from psa_casadi.cli.screen import (
     tell_written,
     working,
 )
+
+if TYPE_CHECKING:
+    from psa_casadi.model.compose import Model
 
 
 class FmiVersion(StrEnum):
@@ -93,6 +96,7 @@ def fmu(
     if left_out:
         show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
+    show(f"start: {start_words(kept)}", quiet)
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"
@@ -100,3 +104,13 @@ def fmu(
             quiet,
         )
     tell_written(output, quiet=quiet)
+
+
+def start_words(model: "Model") -> str:
+    """Say where an exported model starts."""
+    voltage = next((i.start for i in model.structure.inputs if i.name == "voltage"), None)
+    held = "" if voltage is None else f" at {voltage:.4g} V"
+    if model.own_starts():
+        return f"the start values of the model{held}, as its page lists them"
+    settled = "; --start-voltage starts it settled" if voltage is not None else ""
+    return f"relaxed{held}{settled}"

@@ -150,9 +150,18 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
     for interface, kind in ((CO_SIMULATION, "co-simulation"), (MODEL_EXCHANGE, "model exchange")):
         with fmu.start(interface) as instance:
             found = instance.get(list(truth.starts))
-        for (name, value), there in zip(truth.starts.items(), found, strict=True):
-            if abs(there - value) > _ROUNDING * (abs(value) + fmu.nominals[name]):
-                yield f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}"
+        others = [
+            (name, there, value)
+            for (name, value), there in zip(truth.starts.items(), found, strict=True)
+            if abs(there - value) > _ROUNDING * (abs(value) + fmu.nominals[name])
+        ]
+        if others:
+            name, there, value = next((o for o in others if o[0] == "voltage"), others[-1])
+            yield (
+                f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}, and"
+                f" {len(others) - 1} more values differ; compare with the model that was exported,"
+                " with its --start-voltage and --history"
+            )
 
 
 def equation_error(fmu: Fmu, truth: Truth) -> float:

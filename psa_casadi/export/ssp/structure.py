@@ -25,6 +25,8 @@ SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
 OMS = "https://raw.githubusercontent.com/OpenModelica/OMSimulator/master/schema/oms.xsd"
 #: Relative tolerance that its master asks of the parts.
 TOLERANCE = 1e-6
+#: Rows of its table of results.
+_ROWS = 1000
 SSV_TYPE = "application/x-ssp-parameter-set"
 SSM_TYPE = "application/x-ssp-parameter-mapping"
 #: What SSP calls otherwise than FMI does.
@@ -100,7 +102,12 @@ def structure_description(
     _connections(system, layout)
     _master(system, step)
     _units(root, {wiring.unit(port) for wire in wiring.wires for port in (wire.start, wire.end)})
-    _element(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": number(stop_time)})
+    experiment = _element(
+        root, "DefaultExperiment", {"startTime": "0.0", "stopTime": number(stop_time)}
+    )
+    interval = _decimal(stop_time / _ROWS)
+    results = {"resultFile": f"{wiring.name}.csv", "loggingInterval": interval, "bufferSize": "10"}
+    _information(experiment, results)
     return xml_text(root)
 
 
@@ -177,16 +184,21 @@ def _connections(parent: ET.Element, layout: Layout) -> None:
 
 def _master(system: ET.Element, step: float) -> None:
     """Append the annotation of a master with fixed steps, as OMSimulator writes it."""
-    listed = _element(system, "Annotations", {})
-    annotation = ET.SubElement(listed, f"{{{SSC}}}Annotation", {"type": "org.openmodelica"})
-    own = ET.SubElement(annotation, f"{{{OMS}}}Annotations")
-    information = ET.SubElement(own, f"{{{OMS}}}SimulationInformation")
+    information = _information(system, {})
     attributes = {
         "description": "oms-ma",
         "stepSize": _decimal(step),
         "relativeTolerance": _decimal(TOLERANCE),
     }
     ET.SubElement(information, f"{{{OMS}}}FixedStepMaster", attributes)
+
+
+def _information(parent: ET.Element, attributes: dict[str, str]) -> ET.Element:
+    """Append OMSimulator's annotation on a simulation."""
+    listed = _element(parent, "Annotations", {})
+    annotation = ET.SubElement(listed, f"{{{SSC}}}Annotation", {"type": "org.openmodelica"})
+    own = ET.SubElement(annotation, f"{{{OMS}}}Annotations")
+    return ET.SubElement(own, f"{{{OMS}}}SimulationInformation", attributes)
 
 
 def _decimal(value: float) -> str:
