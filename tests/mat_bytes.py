@@ -1,10 +1,15 @@
-"""MATLAB level 5 content put together element by element, in either byte order."""
+"""MATLAB level 5 content put together element by element, and whether content is refused."""
 
 import struct
 import zlib
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike
+
+from psa_casadi.errors import InputError
+from psa_casadi.records.read.mat_file import load_arrays
+from tests.mutations import sentences
 
 MATRIX, COMPRESSED = 14, 15
 DOUBLE, STRUCT = 6, 2
@@ -64,3 +69,19 @@ def structure(name: str, fields: list[tuple[str, bytes]], count: int = 1) -> byt
 def compressed(inner: bytes) -> bytes:
     """Return an element that holds another one, deflated."""
     return element(COMPRESSED, zlib.compress(inner))
+
+
+def refusal(data: bytes) -> str:
+    """Return the sentence with which a content is refused."""
+    with pytest.raises(InputError) as caught:
+        load_arrays("a.mat", data)
+    (problem,) = caught.value.problems
+    assert problem.startswith("a.mat: ")
+    return problem
+
+
+def refused(data: bytes) -> bool:
+    """Whether a content is refused as it should be; else it is read."""
+    said = sentences(lambda: load_arrays("a.mat", data))
+    assert all(p.startswith("a.mat: ") and p.endswith(".") for p in said)
+    return bool(said)

@@ -4,11 +4,9 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import h5py
 import numpy as np
 import pytest
 import scipy.io.matlab
@@ -19,9 +17,17 @@ from psa_casadi.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import file_bytes, mat_level5
 from psa_casadi.records.read.mat_file import load_arrays
-from tests.mat_bytes import COMPRESSED, compressed, element, header, matrix, structure
+from tests.mat_bytes import (
+    COMPRESSED,
+    compressed,
+    element,
+    header,
+    matrix,
+    refusal,
+    refused,
+    structure,
+)
 from tests.mutations import changed, sentences
-from tests.tiers import slow
 
 T = np.arange(24) / 8.0
 CONTENT: dict[str, Any] = {
@@ -77,14 +83,6 @@ def assert_as_scipy(data: bytes) -> None:
         np.testing.assert_array_equal(array, other[name])
 
 
-def refusal(data: bytes) -> str:
-    with pytest.raises(InputError) as caught:
-        load_arrays("a.mat", data)
-    (problem,) = caught.value.problems
-    assert problem.startswith("a.mat: ")
-    return problem
-
-
 @pytest.mark.parametrize("version", ["4", "5", "5, deflated"])
 def test_every_kind_of_array_is_read_as_scipy_reads_it(version: str) -> None:
     assert_as_scipy(content(version))
@@ -112,17 +110,17 @@ def test_both_byte_orders_and_both_kinds_of_elements(order: str, name: str) -> N
 @pytest.mark.parametrize("version", ["4", "5", "5, deflated"])
 def test_wrong_bytes_are_refused_or_read(version: str) -> None:
     data = content(version)
-    refused = sum(_refused(wrong) for wrong in changed(data, 1000, seed=1))
-    assert 200 < refused < 1000
+    count = sum(refused(wrong) for wrong in changed(data, 1000, seed=1))
+    assert 200 < count < 1000
 
 
 def test_wrong_bytes_below_the_compression_are_refused_or_read() -> None:
     inner = content("5")[128:]
-    refused = sum(
-        _refused(header() + element(COMPRESSED, zlib.compress(wrong)))
+    count = sum(
+        refused(header() + element(COMPRESSED, zlib.compress(wrong)))
         for wrong in changed(inner[: 8 + struct.unpack("<I", inner[4:8])[0]], 1000, seed=2)
     )
-    assert 200 < refused < 1000
+    assert 200 < count < 1000
 
 
 @pytest.mark.parametrize("level", ["4", "5"])
@@ -147,12 +145,6 @@ def test_no_wrong_byte_beside_the_numbers_changes_the_numbers(level: Literal["4"
     assert changes == 0
 
 
-def _refused(data: bytes) -> bool:
-    said = sentences(lambda: load_arrays("a.mat", data))
-    assert all(p.startswith("a.mat: ") and p.endswith(".") for p in said)
-    return bool(said)
-
-
 def test_a_type_that_does_not_fit_is_named() -> None:
     good = matrix("t", T)
     assert "a variable has the type 99" in refusal(header() + element(99, good))
@@ -164,6 +156,8 @@ def test_a_type_that_does_not_fit_is_named() -> None:
     wrong = matrix("t", T, stored=(9, "f4"))
     assert "an array of the dimensions [24, 1] has 96 bytes" in refusal(header() + wrong)
     assert "has the name 't\\x1b[2J'" in refusal(header() + matrix("t\x1b[2J", T))
+    flags = element(6, bytes(8 * 10**5))
+    assert "800000 bytes stand where a few integers" in refusal(header() + element(14, flags))
     assert "begins where" in refusal(header() + good[:-8])
     cut = compressed(good)
     assert "does not have the" in refusal(header() + element(COMPRESSED, cut[8:-6]))
@@ -224,79 +218,3 @@ def test_a_file_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
         (tmp_path / name).symlink_to("/dev/zero")
         with pytest.raises(InputError, match=r"holds more than .* GiB"):
             read_record(tmp_path / name)
-
-
-def hdf5(fill: Callable[[Any], object]) -> bytes:
-    stream = io.BytesIO()
-    with h5py.File(stream, "w") as file:
-        fill(file)
-    return stream.getvalue()
-
-
-def _twice(file: Any) -> None:
-    file["g/h/t"] = T
-    file["g/h/again"] = file["g"]
-
-
-def _elsewhere(file: Any) -> None:
-    file["t"] = T
-    file["other"] = h5py.ExternalLink("/etc/passwd", "/")
-    file["soft"] = h5py.SoftLink("/nowhere")
-
-
-HUGE = {
-    "stated": lambda f: f.create_dataset("t", (10**12,), "f8", chunks=(1000,)),
-    "together": lambda f: [f.create_dataset(f"t{k}", (10**8,), "f8") for k in range(2)],
-    "pieces": lambda f: f.create_dataset("t", (8,), "f8", chunks=(2**28,), maxshape=(None,)),
-    "deflated": lambda f: f.create_dataset(
-        "t", (10**10,), "f8", chunks=(10**6,), compression="gzip", fillvalue=1.0
-    ),
-}
-
-
-@pytest.mark.parametrize("case", HUGE)
-def test_a_huge_array_of_version_7_3_is_refused_before_it_is_read(case: str) -> None:
-    assert "more than 1 GiB, the most that is read as one record" in refusal(hdf5(HUGE[case]))
-
-
-def _inflating(file: Any) -> None:
-    dataset = file.create_dataset("t", (1000,), "f8", chunks=(1000,), compression="gzip")
-    dataset.id.write_direct_chunk((0,), zlib.compress(bytes(2**22)))
-
-
-def _pressed(file: Any) -> None:
-    file.create_dataset("t", data=T, chunks=(24,), compression="lzf")
-
-
-def test_pieces_of_version_7_3_have_the_size_that_they_state() -> None:
-    assert "a piece of the array '/t' is larger than it states" in refusal(hdf5(_inflating))
-    assert "'/t' is packed in a way that MATLAB does not use" in refusal(hdf5(_pressed))
-    options = {"chunks": (10,), "compression": "gzip", "shuffle": True, "fletcher32": True}
-    good = hdf5(lambda f: f.create_dataset("t", data=T, **options))
-    np.testing.assert_array_equal(load_arrays("a.mat", good)["t"], T)
-
-
-def test_links_of_version_7_3_are_not_followed(tmp_path: Path) -> None:
-    assert list(load_arrays("a.mat", hdf5(_elsewhere))) == ["t"]
-    assert "is reached twice" in refusal(hdf5(_twice))
-    outside = tmp_path / "raw"
-    outside.write_bytes(T.tobytes())
-    layout = h5py.VirtualLayout((24,), "f8")
-    layout[:] = h5py.VirtualSource(str(outside), "t", (24,))
-    for fill in (
-        lambda f: f.create_dataset("t", (24,), "f8", external=[(str(outside), 0, 192)]),
-        lambda f: f.create_virtual_dataset("t", layout),
-    ):
-        assert "the array '/t' lies in another file" in refusal(hdf5(fill))
-
-
-@slow
-def test_wrong_bytes_of_version_7_3_are_refused_or_read() -> None:
-    def fill(file: Any) -> None:
-        file["t"] = T[None, :]
-        file.create_dataset("y", data=T[None, :], chunks=(1, 8), compression="gzip", shuffle=True)
-        file["log/u"] = T
-        file["note"] = "rig 3"
-
-    refused = sum(_refused(wrong) for wrong in changed(hdf5(fill), 1000, seed=3))
-    assert 200 < refused < 1000

@@ -33,6 +33,7 @@ _STORED = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
 }  # fmt: skip
 _COMPLEX = 0x800
+_MOST_DIMENSIONS = 32
 #: Structures lie in each other no deeper than this.
 _DEEPEST = 32
 #: More names than this in one place are no record's.
@@ -120,6 +121,8 @@ class _Parts:
     def integers(self, *wanted: int) -> list[int]:
         """Return the next part as integers of 32 bits."""
         kind, content = self.next(*wanted)
+        if len(content) > 4 * _MOST_DIMENSIONS:
+            raise ValueError(f"{len(content)} bytes stand where a few integers should")
         return [int(n) for n in np.frombuffer(content, self.order + _STORED[kind])]
 
     def array(self) -> Tree:
@@ -141,7 +144,7 @@ def _array(content: memoryview, order: str, depth: int = 0) -> tuple[str, Tree]:
     if kind not in (_CELL, _STRUCT, *_CLASSES):
         raise ValueError(f"an array has the class {kind}")
     shape = parts.integers(_INT32, _UINT32)
-    if not 2 <= len(shape) <= 32 or min(shape) < 0:
+    if len(shape) < 2 or min(shape) < 0:
         raise ValueError(f"an array has the dimensions {shape[:8]}")
     name = _text(parts.next(*_NAMES)[1])
     if kind in _CLASSES:
