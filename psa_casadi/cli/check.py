@@ -23,7 +23,7 @@ def check(
     effects: EffectsOption = None,
     timeout: Annotated[
         float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
-    ] = 120.0,
+    ] = 300.0,
     memory: Annotated[
         int,
         typer.Option(

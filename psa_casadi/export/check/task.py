@@ -6,7 +6,7 @@ from pathlib import Path
 from psa_casadi.export.check.truth import Truth
 
 #: What foreign code may take unless told otherwise [s], [bytes].
-TIMEOUT, MEMORY = 120.0, 4 << 30
+TIMEOUT, MEMORY = 300.0, 4 << 30
 
 
 @dataclass(frozen=True)
