@@ -1,5 +1,6 @@
 """The benchmark `fuzz`: damaged inputs, kills and hostile surroundings, counted; none may fail."""
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -71,6 +72,7 @@ def _campaign(
         raise InputError(f"--inputs is {inputs}; give how many, at least 1.")
     each = None if inputs is None else dict.fromkeys([t.name for t in targets], inputs)
     amount = Amount(seconds if each is None else float("inf"), each, first)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it, too, ends with a table
     with working("attacking", quiet) as progress:
         return attack(targets, seed, amount, jobs=jobs, keep=keep, progress=progress)
 

@@ -3,7 +3,7 @@
 import os
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from pathlib import Path
@@ -73,7 +73,10 @@ def run(
     keep: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Tally:
-    """Attack the targets and return what was counted; `keep` is the folder for failing inputs."""
+    """Attack the targets and return what was counted; `keep` is the folder for failing inputs.
+
+    Ctrl-C ends it early, with what was counted until then.
+    """
     for target in targets:
         target.prepare()
     plan = _Plan(targets, seed, amount)
@@ -88,16 +91,14 @@ def run(
             time.sleep(_LOOK)
             for worker in list(running):
                 failures = ended(worker)
-                if failures is None:
-                    continue
-                running.remove(worker)
-                _count(tally, plan, worker)
-                for failure in failures:
-                    if failure.kind == HANG and not worker.block.again:
-                        plan.try_again(worker.block, failure.index)
-                        continue
-                    _tell(tally.note(failure), worker.block, keep, progress)
-                worker.clean()
+                if failures is not None:
+                    running.remove(worker)
+                    _count(tally, plan, worker)
+                    for new in _new(tally, plan, worker, failures):
+                        _tell(new, worker.block, keep, progress)
+                    worker.clean()
+    except KeyboardInterrupt:
+        return tally
     finally:
         for worker in running:
             os.kill(worker.pid, 9)
@@ -159,12 +160,19 @@ def _count(tally: Tally, plan: _Plan, worker: Worker) -> None:
         plan.put(worker.block, index + (not whole))
 
 
-def _tell(
-    new: Distinct | None, block: Block, keep: Path | None, progress: Callable[[str], None]
-) -> None:
-    """Save the input of a failure that is new, and tell how to see it again."""
-    if new is None:
-        return
+def _new(
+    tally: Tally, plan: _Plan, worker: Worker, failures: Sequence[Failure]
+) -> Iterator[Distinct]:
+    """Count failures and yield those of a new cause; a hang counts when it hangs again."""
+    for failure in failures:
+        if failure.kind == HANG and not worker.block.again:
+            plan.try_again(worker.block, failure.index)
+        elif (new := tally.note(failure)) is not None:
+            yield new
+
+
+def _tell(new: Distinct, block: Block, keep: Path | None, progress: Callable[[str], None]) -> None:
+    """Save the input of a failure, and tell how to see it again."""
     target, first = block.target, new.first
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)

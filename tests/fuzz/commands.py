@@ -1,6 +1,7 @@
 """A `psa` command in surroundings of its own: what it says, how it ends, what it leaves."""
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -8,10 +9,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from tests.fuzz.target import CRASH, FOREIGN, HANG, LEFT_OVER, WRONG_EXIT, Found
 
+_LIBC, _PARENT_ENDED = ctypes.CDLL(None), 1  # of Linux's prctl
 PSA = (sys.executable, "-m", "psa_casadi.cli")
 #: Root of the checkout, where the package is found from any directory.
 ROOT = Path(__file__).resolve().parents[2]
@@ -62,7 +65,7 @@ def psa(
             env=_environment(folder, around),
             cwd=around.directory or folder,
             start_new_session=True,
-            preexec_fn=around.first,  # noqa: PLW1509 - this process has one thread
+            preexec_fn=partial(_begin, around.first),  # noqa: PLW1509 - this process has one thread
             **{"stdout": out, "stderr": err, **streams},  # type: ignore[call-overload]
         )
         hung = _wait(running, limit_s, stop)
@@ -78,6 +81,14 @@ def psa(
         (folder / n).read_text(encoding="utf-8", errors="replace") for n in ("out", "err")
     )
     return Ended(running.returncode, said, told, hung, left)
+
+
+def _begin(first: Callable[[], None] | None) -> None:
+    """Let the command end with the process that started it (Linux), and do what is to be first."""
+    if sys.platform.startswith("linux"):
+        _LIBC.prctl(_PARENT_ENDED, signal.SIGKILL, 0, 0, 0)
+    if first is not None:
+        first()
 
 
 def _environment(folder: Path, around: Around) -> dict[str, str]:

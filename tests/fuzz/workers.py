@@ -149,8 +149,15 @@ def _last(worker: Worker, index: int, code: int, *, hangs: bool) -> Failure:
 
 
 def _in_the_child(block: Block, folder: Path, place: mmap.mmap, parent: int) -> None:
-    """Attack the inputs and end the process; nothing of the parent's runs on."""
+    """Attack the inputs and end the process; nothing of the parent's runs on.
+
+    Ctrl-C is for the parent; commands that are started here heed signals as ever.
+    """
     try:
+        os.setpgid(0, 0)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for which in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(which, signal.SIG_DFL)
         with (folder / "trace").open("w") as trace:
             faulthandler.enable(trace, all_threads=False)
             faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
