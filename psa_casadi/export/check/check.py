@@ -35,6 +35,7 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
+from psa_casadi.strict_json import read_json_text
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
 
@@ -150,9 +151,9 @@ def _read_model(
 ) -> Iterator[str]:
     """Append the model that the FMU carries; what prevents that is the problem."""
     try:
-        text = (archive.directory / MODEL_ENTRY).read_text(encoding="utf-8")
+        text = read_json_text(archive.directory / MODEL_ENTRY)
         found.append(loads(text, MODEL_ENTRY, effects))
-    except PsaError as error:
+    except (PsaError, OSError, ValueError) as error:
         yield str(error)
 
 
