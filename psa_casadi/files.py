@@ -8,8 +8,9 @@ from pathlib import Path
 
 from psa_casadi.errors import InputError
 
-#: Files that are being written.
+#: Files that are being written, and those that were, in their order.
 _TEMPORARY: set[Path] = set()
+_WRITTEN: list[Path] = []
 
 
 @contextmanager
@@ -39,9 +40,15 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.exists():
             temporary.chmod(target.stat().st_mode & 0o777)
         temporary.replace(target)
+        _WRITTEN.append(Path(path))
     finally:
         temporary.unlink(missing_ok=True)
         _TEMPORARY.discard(temporary)
+
+
+def written() -> tuple[Path, ...]:
+    """Return the files that this process has written whole, by the names they were given."""
+    return tuple(_WRITTEN)
 
 
 def remove_temporaries() -> None:
