@@ -8,6 +8,9 @@ from pathlib import Path
 from psa_casadi.errors import InputError
 from psa_casadi.scratch import temporary_file
 
+#: Files that were written, in their order.
+_WRITTEN: list[Path] = []
+
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -33,6 +36,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             if target.exists():
                 temporary.chmod(target.stat().st_mode & 0o777)
             replace_durably(temporary, target)
+            _WRITTEN.append(Path(path))
     except BrokenPipeError:  # who read it has gone
         raise
     except OSError as error:
@@ -40,6 +44,11 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             f"{path}: cannot write ({error.strerror or error}); choose another place or free this"
             " one."
         ) from error
+
+
+def written() -> tuple[Path, ...]:
+    """Return the files that this process has written whole, by the names they were given."""
+    return tuple(_WRITTEN)
 
 
 def atomic_write(path: str | os.PathLike[str], data: str | bytes) -> None:

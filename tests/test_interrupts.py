@@ -222,6 +222,21 @@ def test_a_designed_voltage_is_kept_without_its_check(
     assert voltage.exists()
 
 
+def test_files_that_stand_are_named_however_late_the_interrupt(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut(*given: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["psa_casadi.cli.simulate"], "tell_written", cut)
+    write_record(tmp_path / "r.csv", columns(record))
+    out = tmp_path / "out.csv"
+    given = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]
+    ended = CliRunner().invoke(app, given)
+    assert ended.exit_code == 130
+    assert f"Interrupted: written before: {out}." in ended.stderr
+
+
 def interrupted(
     word: str, record: Path, folder: Path, command: str, times: int = 1
 ) -> tuple[subprocess.Popen[str], float, str]:

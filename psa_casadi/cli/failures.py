@@ -11,6 +11,7 @@ from psa_casadi.cli import INTERRUPTED
 from psa_casadi.cli.interrupts import interrupts
 from psa_casadi.cli.surroundings import refused_by_the_machine, silence
 from psa_casadi.errors import InputError, MachineError, PsaError
+from psa_casadi.files import written
 
 P = ParamSpec("P")
 
@@ -29,6 +30,7 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
 
     @functools.wraps(command)
     def run(*args: P.args, **options: P.kwargs) -> None:
+        before = len(written())
         try:
             with interrupts():
                 command(*args, **options)
@@ -38,7 +40,9 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             silence()
             raise typer.Exit(1) from error
         except KeyboardInterrupt as stop:
-            typer.echo(f"Interrupted: {stop if stop.args else NOTHING_KEPT}", err=True)
+            there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
+            told = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
+            typer.echo(f"Interrupted: {told}", err=True)
             raise typer.Exit(INTERRUPTED) from None
         except InputError as error:
             if os.environ.get(DEBUG):
