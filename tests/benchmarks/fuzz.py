@@ -72,7 +72,8 @@ def _campaign(
         raise InputError(f"--inputs is {inputs}; give how many, at least 1.")
     each = None if inputs is None else dict.fromkeys([t.name for t in targets], inputs)
     amount = Amount(seconds if each is None else float("inf"), each, first)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it, too, ends with a table
+    for which in (signal.SIGINT, signal.SIGTERM):  # both end with a table, also in the background
+        signal.signal(which, signal.default_int_handler)
     with working("attacking", quiet) as progress:
         return attack(targets, seed, amount, jobs=jobs, keep=keep, progress=progress)
 

@@ -149,7 +149,7 @@ def misbehaved(
         yield Found(CRASH, f"{what}: {signal.Signals(-ended.code).name}: {_last(ended.err)}")
     elif ended.code not in codes:
         yield Found(WRONG_EXIT, f"{what}: exit code {ended.code}: {_last(ended.err)}")
-    elif ended.code > 0 and not mute and not ended.err.strip() and not ended.out.strip():
+    elif 0 < ended.code < 128 and not mute and not ended.err.strip() and not ended.out.strip():
         yield Found(WRONG_EXIT, f"{what}: exit code {ended.code} without a word")
     if ended.left:
         yield Found(LEFT_OVER, f"{what}: {len(ended.left)} processes go on")
