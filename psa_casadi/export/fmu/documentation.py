@@ -49,12 +49,13 @@ Over a communication step each input moves at the rate that the importer gave it
 late. FMI 3.0 has no such rates. To err by 0.1 % of the range of a sine of frequency f, one that is
 held needs steps of 1/(1600 f). With the parameter input_line = 1, which can be set until the
 initialization ends, an input goes on along the line through the last two values it was given (over
-a step longer than the last one, by as much as over that); then 1/(200 f) does, and the error falls with the square of the step. What is left is that
-the signal bends: at the end of a step the line is off by the square of the step times the second
-derivative, most where the signal turns, and hysteresis remembers that it went too far. The first
-step is held, and so is the one after event mode. Values before and after a jump have no line in
-common: enter event mode at a jump, or leave the option at 0. Between 0 and 1 that share of the
-slope counts. Model exchange knows no steps and ignores the option."""
+a step longer than the last one, by as much as over that); then 1/(200 f) does, and the error falls
+with the square of the step. What is left is that the signal bends: at the end of a step the line
+is off by the square of the step times the second derivative, most where the signal turns, and
+hysteresis remembers that it went too far. The first step is held, and so is the one after event
+mode. Values before and after a jump have no line in common: enter event mode at a jump, or leave
+the option at 0. Between 0 and 1 that share of the slope counts. Model exchange knows no steps and
+ignores the option."""
 
 
 def documentation(model: Model, *, reference_run: bool = True) -> str:
