@@ -37,8 +37,7 @@ extern const psa_variable psa_variables[PSA_VARIABLES]; /* indexed by value refe
 extern const double psa_start_states[PSA_NX + 1];
 extern const double psa_start_inputs[PSA_NU + 1];
 extern const double psa_start_parameters[PSA_HELD + 1]; /* behind them the sampled states */
-extern const double psa_state_nominals[PSA_NX + 1]; /* what importers are told */
-extern const double psa_state_scales[PSA_NX + 1];   /* what the solver's tolerance refers to */
+extern const double psa_state_nominals[PSA_NX + 1];
 /* What the states' nominal values move each switch by: the size of its noise at a tolerance of 1. */
 extern const double psa_switch_scales[PSA_NZ + 1];
 

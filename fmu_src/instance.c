@@ -94,7 +94,7 @@ const char *psa_objection(const char *name, const char *token) {
 void psa_instance_start(psa_instance *instance, psa_interface interface) {
     psa_state *const state = &instance->state;
     memset(state, 0, sizeof *state);
-    psa_solver_start(&state->solver, 0.0, psa_start_states, psa_state_scales,
+    psa_solver_start(&state->solver, 0.0, psa_start_states, psa_state_nominals,
                      STEP_SHARE * DEFAULT_TOLERANCE);
     memcpy(state->input.value, psa_start_inputs, sizeof state->input.value);
     memcpy(state->given, psa_start_inputs, sizeof state->given);

@@ -5,7 +5,7 @@
 #include "instants.h"
 
 #define LARGEST_COUNT INT64_C(9007199254740992) /* 2^53 */
-/* Over the state's scale. Far beyond, rounding keeps the solver's error from its tolerance, for millions of steps. */
+/* Over the nominal value. Far beyond, rounding keeps the solver's error from its tolerance, for millions of steps. */
 #define LARGEST_STATE 1e12
 
 static int all_finite(const double *values, int count) {
@@ -23,9 +23,9 @@ static const char *solver_fault(const psa_solver *solver) {
         !isfinite(solver->since))
         return "the time";
     for (int i = 0; i < PSA_NX; ++i)
-        if (!(fabs(solver->x[i]) <= LARGEST_STATE * (psa_state_scales[i] + fabs(psa_start_states[i]))))
+        if (!(fabs(solver->x[i]) <= LARGEST_STATE * (psa_state_nominals[i] + fabs(psa_start_states[i]))))
             return "a state";
-    if (memcmp(solver->nominal, psa_state_scales, sizeof solver->nominal)) return "the scale of a state";
+    if (memcmp(solver->nominal, psa_state_nominals, sizeof solver->nominal)) return "a nominal value";
     if (!(solver->rtol >= psa_step_tolerance(0.0) && solver->rtol <= psa_step_tolerance(INFINITY)))
         return "the tolerance";
     if (solver->max_step != 0.0 || solver->steps_limit != 0 || !(solver->step >= 0.0))

@@ -30,7 +30,7 @@ typedef struct {
     double origin, since;    /* a communication point, and the time from it: far from 0 only `since` is
                                 fine enough for the steps */
     double x[PSA_NX];        /* states, SI units */
-    double nominal[PSA_NX];  /* scale of each state; the absolute tolerance is rtol * nominal */
+    double nominal[PSA_NX];  /* usual size of each state; the absolute tolerance is rtol * nominal */
     double rtol;             /* relative tolerance */
     double max_step;         /* 0: no bound */
     double step;             /* step size to try next; 0: choose one */

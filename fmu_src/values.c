@@ -83,6 +83,8 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
         !(instance->state.phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)))
         return psa_say(instance, PSA_ERROR,
                        "State '%s' can be set only before the first step.", v->name);
+    if (v->kind == PSA_OPTION && !(instance->state.phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)))
+        return psa_say(instance, PSA_ERROR, "'%s' can be set only before the first step.", v->name);
     if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT &&
         v->kind != PSA_PARAMETER && v->kind != PSA_OPTION)
         return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be set.", v->name);

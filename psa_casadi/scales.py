@@ -33,7 +33,7 @@ def reading_scale(p: Values) -> float:
 
 
 def velocity_scale(p: Values) -> float:
-    """Stroke times the lowest natural angular frequency [m/s]."""
+    """Stroke times the lowest natural angular frequency [m/s]: the scale of solvers' tolerances."""
     if "k_B" in p:
         omega = min(sqrt(p["k_P"] / p["m_P"]), sqrt(p["k_B"] / p["m_B"]))
     else:

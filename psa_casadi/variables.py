@@ -43,8 +43,7 @@ class State:
     deviation from rest at the start of a record is unknown and is estimated; all others start at
     rest. A memory that `settles` (creep) has an equilibrium; one that does not (hysteresis) rests
     at any value.
-    `nominal` is the size that the solvers' tolerances refer to, a number or a function of the
-    parameter values; `usual` is the one that importers are told, where it is another.
+    `nominal` is the size the state usually has, a number or a function of the parameter values.
     """
 
     name: str
@@ -55,11 +54,6 @@ class State:
     display_unit: str | None = None
     memory: bool = False
     settles: bool = True
-    usual: Nominal | None = None
-
-    def told(self, values: Values) -> float:
-        """Return the size that importers are told (FMI: nominal)."""
-        return nominal_value(self.nominal if self.usual is None else self.usual, values)
 
 
 @dataclass(frozen=True)

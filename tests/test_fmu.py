@@ -14,6 +14,7 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.reference import from_samples, simulate
+from psa_casadi.scales import velocity_scale
 from psa_casadi.simulation.simulate import simulate as simulated
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but
@@ -165,4 +166,5 @@ def test_nominal_values_are_usual_ones(name: str) -> None:
     moved = simulated(model, times, step, from_rest_at_zero=True)
     fastest = np.abs(moved.outputs["velocity"]).max()
     assert fastest / 3.0 < told["velocity"] < 3.0 * fastest
-    assert told["v_x"] == told["velocity"]
+    # an importer's absolute tolerance, which a mode's rates would exhaust at a smaller size
+    assert told["v_x"] == pytest.approx(velocity_scale(model.values))

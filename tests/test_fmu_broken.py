@@ -100,7 +100,7 @@ CORE = {
     ),
     "state shared by instances": (
         "instance.c",
-        "const psa_status status = psa_solver_advance(",
+        "const psa_status status =\n            psa_solver_advance(",
         "static double shared; shared += 1.0; solver->x[0] += 1e-6 * shared;"
         " const psa_status status = psa_solver_advance(",
         {"life cycle", "independent instances", "snapshots"},

@@ -43,14 +43,12 @@ def _names(name: str) -> dict[str, list[str]]:
 def _point(name: str) -> dict[str, float]:
     """Return values of states, inputs and parameters in full motion, away from every kink."""
     random = np.random.default_rng(20)
-    point, plant = {}, model_named(name).plant()
-    scales = dict(zip(plant.state_names, plant.state_nominals(), strict=True))
-    for v in variable_table(plant):
+    point = {}
+    for v in variable_table(model_named(name).plant()):
         if v.kind == "parameter":
             point[v.name] = float(v.start or 0.0)
         elif v.kind in ("state", "input"):
-            size = scales.get(v.name, v.nominal or 1.0)
-            point[v.name] = float(size) * random.uniform(0.3, 0.6)
+            point[v.name] = float(v.nominal or 1.0) * random.uniform(0.3, 0.6)
     # the voltage rises; the hysteresis force grows from where it is, without passing zero
     point["u"] = 0.5 * point["voltage"]
     point["f_H"] = math.copysign(point["f_H"], point["A"])

@@ -119,6 +119,9 @@ def test_the_line_is_part_of_the_state(fmi: int) -> None:
             other.restore(copy)
             other.drop(copy)
             assert np.array_equal(_run(other, 100, first=10, end=20), first)
+            with pytest.raises(FmuError, match="'input_line' can be set only before the first"):
+                other.set({"input_line": 0.0})
+        with fmu.open(CO_SIMULATION) as other:
             with pytest.raises(FmuError, match="'input_line' cannot be set to 2: it must") as told:
                 other.set({"input_line": 2.0})
             assert told.value.status == ERROR

@@ -70,14 +70,7 @@ def _single_mass(s: Symbols) -> Equations:
 
 _OUTPUT_STATES = (
     State("x", "m", "displacement of the output mass", stroke_scale, display_unit="um"),
-    State(
-        "v_x",
-        "m/s",
-        "velocity of the output mass",
-        velocity_scale,
-        display_unit="um/s",
-        usual=usual_velocity,
-    ),
+    State("v_x", "m/s", "velocity of the output mass", velocity_scale, display_unit="um/s"),
 )
 
 CASCADE_MECHANICS = Component(
@@ -99,14 +92,7 @@ CASCADE_MECHANICS = Component(
     ),
     states=(
         State("y", "m", "displacement of the wafers", stroke_scale, display_unit="um"),
-        State(
-            "v_y",
-            "m/s",
-            "velocity of the wafers",
-            velocity_scale,
-            display_unit="um/s",
-            usual=usual_velocity,
-        ),
+        State("v_y", "m/s", "velocity of the wafers", velocity_scale, display_unit="um/s"),
         *_OUTPUT_STATES,
     ),
     inputs=(_LOAD,),

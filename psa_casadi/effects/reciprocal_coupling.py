@@ -6,7 +6,7 @@ m_P m_B s^4 + (m_P c_B + m_B (c_P + g c_B)) s^3 + (m_P k_B + m_B (k_P + g k_B) +
 """
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.scales import stroke_scale, usual_velocity, velocity_scale
+from psa_casadi.scales import stroke_scale, velocity_scale
 from psa_casadi.variables import Parameter, State
 
 #: Gains to try, over 0.25: a fit from near 0 does not find a truth near 1, since the static gain
@@ -59,7 +59,7 @@ RECIPROCAL_COUPLING = Component(
             stroke_scale,
             display_unit="um",
         ),
-        State("v_r", "m/s", "its rate", velocity_scale, display_unit="um/s", usual=usual_velocity),
+        State("v_r", "m/s", "its rate", velocity_scale, display_unit="um/s"),
     ),
     equations=_equations,
     looks_like="the resonances and the zero between them do not fit the one-way cascade",

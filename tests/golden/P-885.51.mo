@@ -37,9 +37,9 @@ package PiezoStack "model of a device, written by psa_casadi"
     parameter Real c_B(unit="N.s/m", min=1e-06, max=1000000000.0) = 670.0 "equivalent damping of the bonding layers";
     parameter Real k_B(unit="N/m", min=1.0, max=1000000000000.0) = 50000000.0 "equivalent stiffness of the bonding layers";
     Real y(unit="m", displayUnit="um", start=0.0, fixed=true, nominal=2.1e-05) "displacement of the wafers";
-    Real v_y(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=0.181) "velocity of the wafers";
+    Real v_y(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=4.7) "velocity of the wafers";
     Real x(unit="m", displayUnit="um", start=0.0, fixed=true, nominal=2.1e-05) "displacement of the output mass";
-    Real v_x(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=0.181) "velocity of the output mass";
+    Real v_x(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=4.7) "velocity of the output mass";
   protected
     Real drive_voltage(unit="V") "open-circuit voltage of the amplifier";
     Real drive_current(unit="A") "current through the amplifier's output resistance";
@@ -149,13 +149,13 @@ package PiezoStack "model of a device, written by psa_casadi"
     parameter Real c_B(unit="N.s/m", min=1e-06, max=1000000000.0) = 670.0 "equivalent damping of the bonding layers";
     parameter Real k_B(unit="N/m", min=1.0, max=1000000000000.0) = 50000000.0 "equivalent stiffness of the bonding layers";
     Real y(unit="m", displayUnit="um", start=0.0, fixed=true, nominal=2.1e-05) "displacement of the wafers";
-    Real v_y(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=0.181) "velocity of the wafers";
+    Real v_y(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=4.7) "velocity of the wafers";
     Real x(unit="m", displayUnit="um", start=0.0, fixed=true, nominal=2.1e-05) "displacement of the output mass";
-    Real v_x(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=0.181) "velocity of the output mass";
+    Real v_x(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=4.7) "velocity of the output mass";
     // reciprocal_coupling: the bonding layers push back on the wafers: two masses with action and reaction
     final parameter Real reciprocal_gain(unit="1", min=0.0, max=1.2) = 1.0 "share of the reaction: 0 the paper's cascade, 1 Newton; more only in error";
     Real y_r(unit="m", displayUnit="um", start=0.0, fixed=true, nominal=2.1e-05) "change of y from holding the output at zero, over the gain";
-    Real v_r(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=0.181) "its rate";
+    Real v_r(unit="m/s", displayUnit="um/s", start=0.0, fixed=true, nominal=4.7) "its rate";
   protected
     Real voltage(unit="V", start=0.0, nominal=120.0) "voltage command to the amplifier";
     Real load_force(unit="N", start=0.0, nominal=876.0) "external force on the output mass, positive outward";

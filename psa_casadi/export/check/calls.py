@@ -172,10 +172,10 @@ def parameter_changes(fmu: Fmu) -> Problems:
 
 
 def _changed(fmu: Fmu) -> dict[str, float]:
-    """Return all parameters, each 3 % from its start, to the side that its bounds allow."""
+    """Return all tunable parameters, each 3 % from its start, to the side that its bounds allow."""
     with fmu.open(CO_SIMULATION) as slave:
         slave.setup()
-        names = fmu.names("parameter")
+        names = fmu.tunable()
         changed, bounds = {}, fmu.bounds
         for name, value in zip(names, slave.get(names), strict=True):
             low, high = bounds[name]

@@ -24,7 +24,7 @@ def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
     point = {"time": float(generator.uniform(0.1, 1.0))}
     bounds = fmu.bounds
     for v in fmu.description.modelVariables:
-        if v.causality == "parameter":
+        if v.variability == "tunable":
             start = float(v.start) or 0.1 * fmu.nominals[v.name]
             value = start * generator.uniform(0.95, 1.05)
             low, high = bounds[v.name]

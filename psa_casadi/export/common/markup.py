@@ -31,7 +31,7 @@ CAUSALITY = {
     "input": {"causality": "input", **_CONTINUOUS},
     "output": {"causality": "output", **_CONTINUOUS, "initial": "calculated"},
     "parameter": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
-    "option": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
+    "option": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
     "indicator": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
     "sampled": {"causality": "local", "variability": "discrete", "initial": "exact"},
 }

@@ -54,7 +54,7 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
         Variable("time", "time", 0, "s", "simulation time"),
         *(
             Variable(q.name, "state", i, q.unit, q.description, q.display_unit, q.start,
-                     q.told(values))
+                     nominal_value(q.nominal, values))
             for i, q in enumerate(s.states)
         ),
         *(

@@ -71,7 +71,8 @@ straight."""
 _INPUTS = """\
 Over a communication step each input moves at the rate that the importer gave it for the step (FMI
 2.0: fmi2SetRealInputDerivatives); without one it is held, and a smooth signal arrives half a step
-late. FMI 3.0 has no such rates. With the parameter input_line = 1 an input goes on along the line
+late. FMI 3.0 has no such rates. With the parameter input_line = 1, which can be set
+until the initialization ends, an input goes on along the line
 through the last two values it was given (over a step longer than the last one, by as much as over
 that). Steps of 1/(200 f) then err by 0.1 % of the range of a sine of frequency f, and the error
 falls with the square of the step. What is left is that

@@ -220,7 +220,6 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         _vector("psa_start_inputs", "PSA_NU", starts("input")),
         _vector("psa_start_parameters", "PSA_HELD", held),
         _vector("psa_state_nominals", "PSA_NX", nominals or [1.0]),
-        _vector("psa_state_scales", "PSA_NX", [abs(s) for s in model.state_nominals()] or [1.0]),
         _vector("psa_switch_scales", "PSA_NZ", scales),
         "",
     ]

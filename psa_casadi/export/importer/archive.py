@@ -108,6 +108,10 @@ class Archive:
         """Step size of the default experiment [s], 1 ms if there is none."""
         return float(getattr(self.description.defaultExperiment, "stepSize", None) or 1e-3)
 
+    def tunable(self) -> list[str]:
+        """Return the names of the parameters that may be set between steps."""
+        return [v.name for v in self.description.modelVariables if v.variability == "tunable"]
+
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
         """The least and the greatest value of each variable, infinite where there is no bound."""

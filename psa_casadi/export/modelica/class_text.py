@@ -75,9 +75,7 @@ def _units(it: Input | Output | Parameter | State) -> tuple[tuple[str, str | Non
 
 
 def _nominal(model: Model, it: Input | Output | State) -> str:
-    values = model.values
-    size = it.told(values) if isinstance(it, State) else nominal_value(it.nominal, values)
-    return size_text(size, it.name)
+    return size_text(nominal_value(it.nominal, model.values), it.name)
 
 
 def size_text(size: float, name: str) -> str:

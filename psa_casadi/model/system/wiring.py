@@ -155,9 +155,7 @@ def _declared(
     def own(variable: State) -> State:
         text = f"{name}: {variable.description}"
         name_there = f"{name}_{variable.name}"
-        usual = None if variable.usual is None else size(variable.usual)
-        there = replace(variable, name=name_there, description=text, usual=usual)
-        return replace(there, nominal=size(variable.nominal))
+        return replace(variable, name=name_there, description=text, nominal=size(variable.nominal))
 
     return Component(
         name=name,
