@@ -33,18 +33,12 @@ def reading_scale(p: Values) -> float:
 
 
 def velocity_scale(p: Values) -> float:
-    """Stroke times the lowest natural angular frequency [m/s]: the scale of solvers' tolerances."""
+    """Stroke times the lowest natural angular frequency [m/s]."""
     if "k_B" in p:
         omega = min(sqrt(p["k_P"] / p["m_P"]), sqrt(p["k_B"] / p["m_B"]))
     else:
         omega = sqrt(p["k"] / p["m"])
     return stroke_scale(p) * omega
-
-
-def usual_velocity(p: Values) -> float:
-    """Stroke over the time that a step takes: the lags and the lowest mode, together [m/s]."""
-    lags = p.get("tau", 0.0) + p.get("R_s", 0.0) * p.get("C_p", 0.0)
-    return stroke_scale(p) / (stroke_scale(p) / velocity_scale(p) + lags)
 
 
 def current_scale(p: Values) -> float:

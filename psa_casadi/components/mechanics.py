@@ -1,7 +1,7 @@
 """Mechanics: the paper's one-way cascade of wafers and bonding layers, and the single mass."""
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.scales import force_scale, stroke_scale, usual_velocity, velocity_scale
+from psa_casadi.scales import force_scale, stroke_scale, velocity_scale
 from psa_casadi.variables import Input, Output, Parameter, State
 
 _LOAD = Input(
@@ -12,7 +12,7 @@ _LOAD = Input(
 )
 _OUTPUTS = (
     Output("displacement", "m", "displacement of the stack's output", stroke_scale, "um"),
-    Output("velocity", "m/s", "velocity of the stack's output", usual_velocity, "um/s"),
+    Output("velocity", "m/s", "velocity of the stack's output", velocity_scale, "um/s"),
     Output(
         "blocked_force", "N", "force that would hold the output at zero displacement", force_scale
     ),

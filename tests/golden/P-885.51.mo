@@ -7,7 +7,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     output Real current(unit="A", displayUnit="mA", nominal=0.18) "current into the stack";
     output Real charge(unit="C", displayUnit="uC", nominal=0.00018) "charge on the stack's electrodes";
     output Real displacement(unit="m", displayUnit="um", nominal=2.1e-05) "displacement of the stack's output";
-    output Real velocity(unit="m/s", displayUnit="um/s", nominal=0.181) "velocity of the stack's output";
+    output Real velocity(unit="m/s", displayUnit="um/s", nominal=4.7) "velocity of the stack's output";
     output Real blocked_force(unit="N", nominal=876.0) "force that would hold the output at zero displacement";
     // drive: amplifier of gain G and output resistance R_s charging the stack (C_p)
     parameter Real G(unit="1", min=0.001, max=10000.0) = 1.0 "voltage gain of the amplifier";
@@ -119,7 +119,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     Real current(unit="A", displayUnit="mA", nominal=0.18) "current into the stack";
     Real charge(unit="C", displayUnit="uC", nominal=0.00018) "charge on the stack's electrodes";
     Real displacement(unit="m", displayUnit="um", nominal=2.1e-05) "displacement of the stack's output";
-    Real velocity(unit="m/s", displayUnit="um/s", nominal=0.181) "velocity of the stack's output";
+    Real velocity(unit="m/s", displayUnit="um/s", nominal=4.7) "velocity of the stack's output";
     Real blocked_force(unit="N", nominal=876.0) "force that would hold the output at zero displacement";
     // drive: amplifier of gain G and output resistance R_s charging the stack (C_p)
     parameter Real G(unit="1", min=0.001, max=10000.0) = 1.0 "voltage gain of the amplifier";
