@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.errors import InputError, MachineError
 from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
 from psa_casadi.export.fmu.platforms import host_platform as host
 from psa_casadi.simulation import compiler
@@ -53,7 +53,7 @@ def test_a_mac_without_developer_tools_uses_zig(
 @pytest.mark.usefixtures("no_zig")
 def test_without_any_compiler_both_ways_out_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     _machine(monkeypatch)
-    with pytest.raises(PsaError, match=r"psa-casadi\[compiler\].*apt install.*CC") as caught:
+    with pytest.raises(MachineError, match=r"psa-casadi\[compiler\].*apt install.*CC") as caught:
         compiler.compiler_command()
     assert "xcode-select" in str(caught.value)
 

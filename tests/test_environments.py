@@ -199,7 +199,7 @@ def test_files_that_cannot_be_written_are_named(tmp_path: Path) -> None:
     fits, too_long = tmp_path / ("n" * 246 + ".json"), tmp_path / ("n" * 251 + ".json")
     atomic_write(fits, "text")
     assert fits.read_text() == "text"
-    atomic_write(tmp_path / ("µ" * 120 + ".json"), f"a name such as {os.fsdecode(bytes([255]))}")
+    atomic_write(tmp_path / ("µ" * 120 + ".json"), "text")
     with pytest.raises(InputError, match="File name too long"):
         atomic_write(too_long, "text")
     model = write(tmp_path / "model.json", MODEL)
