@@ -6,7 +6,8 @@ from pathlib import Path
 
 import fmpy
 
-from psa_casadi.simulation.compiler import shared_library
+from psa_casadi.scratch import temporary_folder
+from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
 
 #: What the library does, and when: "MOMENT:DEED" in this variable; MOMENT is load, make or step.
 DEED = "PSA_TEST_DEED"
@@ -104,8 +105,12 @@ _DESCRIPTIONS = {
 
 @cache
 def library() -> bytes:
-    """Return the library, compiled once for both versions of FMI."""
-    return shared_library({"hostile.c": _SOURCE}, []).read_bytes()
+    """Return the library, compiled once for both versions of FMI, and never loaded here."""
+    with temporary_folder() as work:
+        (work / "hostile.c").write_text(_SOURCE, encoding="utf-8")
+        flags = ("-fPIC", "-fvisibility=hidden", "-shared", "hostile.c", "-o", "hostile.lib")
+        run_compiler([*compiler_command(), *OPTIMISE, *flags], work)
+        return (work / "hostile.lib").read_bytes()
 
 
 def hostile_fmu(path: Path, fmi: int, content: bytes | None = None) -> Path:
