@@ -6,7 +6,6 @@ import queue
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -19,6 +18,7 @@ from psa_casadi.export.check.memory import nearly_full
 from psa_casadi.export.check.records import CLOSED, Reader, SpoiltError
 from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.export.check.task import Task
+from psa_casadi.scratch import temporary_folder
 
 #: The row that is there only if the process ends badly outside of any check.
 OUTSIDE = "process ends"
@@ -171,9 +171,9 @@ def started(modules: Iterable[str] = ()) -> Iterator[Process]:
     own, for what an FMU writes.
     Raises PsaError if it cannot be started.
     """
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with temporary_folder() as folder:
         paths = os.pathsep.join(os.path.abspath(p) for p in sys.path)
-        temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder)
+        temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
         command = [sys.executable, "-P", "-m", "psa_casadi.export.check.child", *modules]
         try:
             process = subprocess.Popen(

@@ -28,8 +28,10 @@ class Archive:
 
     One that is unpacked already, in the folder `unpacked`, is left there.
 
-    `version` is 2 or 3, `description` fmpy's record of the XML, `references` and `nominals` map the
-    names of variables to value references and nominal values.
+    `version` is 2 or 3, `description` fmpy's record of the XML. `references`, `nominals` and
+    `bounds` map the names of variables to value references, nominal values, and the least and the
+    greatest value, infinite where there is no bound. `step_size` is that of the default experiment
+    [s], 1 ms if there is none.
 
     Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0, or must not be unpacked.
     """
@@ -86,6 +88,16 @@ class Archive:
             v.name: 1.0 if v.nominal is None else float(v.nominal)
             for v in self.description.modelVariables
         }
+        self.bounds = {
+            v.name: (
+                -math.inf if v.min is None else float(v.min),
+                math.inf if v.max is None else float(v.max),
+            )
+            for v in self.description.modelVariables
+        }
+        experiment = self.description.defaultExperiment
+        self.step_size = float(getattr(experiment, "stepSize", None) or 1e-3)
+        self._states = [str(u.variable.derivative.name) for u in self.description.derivatives]
 
     def __enter__(self) -> Self:
         return self
@@ -103,25 +115,9 @@ class Archive:
         """The GUID (FMI 2.0) or instantiation token (FMI 3.0)."""
         return str(self.description.guid)
 
-    @property
-    def step_size(self) -> float:
-        """Step size of the default experiment [s], 1 ms if there is none."""
-        return float(getattr(self.description.defaultExperiment, "stepSize", None) or 1e-3)
-
     def tunable(self) -> list[str]:
         """Return the names of the parameters that may be set between steps."""
         return [v.name for v in self.description.modelVariables if v.variability == "tunable"]
-
-    @property
-    def bounds(self) -> dict[str, tuple[float, float]]:
-        """The least and the greatest value of each variable, infinite where there is no bound."""
-        return {
-            v.name: (
-                -math.inf if v.min is None else float(v.min),
-                math.inf if v.max is None else float(v.max),
-            )
-            for v in self.description.modelVariables
-        }
 
     def names(self, causality: str) -> list[str]:
         """Return the names of the variables of one causality, in the order of the description."""
@@ -129,7 +125,7 @@ class Archive:
 
     def states(self) -> list[str]:
         """Return the names of the continuous states, in the order of the state vector."""
-        return [u.variable.derivative.name for u in self.description.derivatives]
+        return list(self._states)
 
     def sampled(self) -> list[str]:
         """Return the names of the sampled states: local variables that are discrete."""
