@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from typing import NoReturn
 
 __all__ = ["main"]
 
@@ -19,12 +20,20 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.stderr.write("Interrupted: nothing was begun.\n")
         sys.stderr.flush()
-        os._exit(INTERRUPTED)
+        _leave()
     except SystemExit as ended:
         if ended.code == INTERRUPTED:
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(INTERRUPTED)
+            _leave()
         raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done; Python tidies up
+
+
+def _leave() -> NoReturn:
+    """End at once, without temporary files and children."""
+    from psa_casadi.scratch import abandon
+
+    abandon()
+    os._exit(INTERRUPTED)
