@@ -4,6 +4,7 @@ import os
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import inf
 from pathlib import Path
@@ -101,8 +102,9 @@ def run(
         return tally
     finally:
         for worker in running:
-            os.kill(worker.pid, 9)
-            os.waitpid(worker.pid, 0)
+            with suppress(ProcessLookupError, ChildProcessError):  # it has ended
+                os.kill(worker.pid, 9)
+                os.waitpid(worker.pid, 0)
             worker.clean()
 
 

@@ -71,8 +71,8 @@ def checked_target(time: FloatArray, displacement: FloatArray, where: str = "tar
         )
     elif not (np.isfinite(time).all() and np.isfinite(displacement).all()):
         problems.add(f"{where}: has samples that are missing or not finite; fill them in.")
-    elif not (np.diff(time) > 0.0).all():
-        line = int(np.flatnonzero(np.diff(time) <= 0.0)[0]) + 2
+    elif not (np.diff(time - time[0]) > 0.0).all():  # as it is used: a far start merges instants
+        line = int(np.flatnonzero(np.diff(time - time[0]) <= 0.0)[0]) + 2
         problems.add(
             f"{where}: the time does not increase at sample {line}; sort the samples and remove"
             " repeated ones."

@@ -5,11 +5,13 @@ import io
 import os
 import zlib
 from pathlib import Path
+from typing import IO
 
 from psa_casadi.errors import InputError
 
 #: The most bytes that a record may have, in its file or unpacked in memory.
 MOST_BYTES = 2**30
+_BLOCK = 2**20
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -20,7 +22,7 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """
     try:
         with Path(path).open("rb") as stream:
-            data = stream.read(MOST_BYTES + 1)
+            data = _most(stream)
     except FileNotFoundError:
         raise InputError(
             f"{path}: there is no such file; check the name and the directory it is in."
@@ -35,6 +37,15 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     if not data.strip():
         raise InputError(f"{path}: the file is empty; export the record again.")
     return data
+
+
+def _most(stream: IO[bytes]) -> bytes:
+    """Return the content of a stream, or more than `MOST_BYTES` of it; takes no more memory."""
+    blocks, size = [], 0
+    while size <= MOST_BYTES and (block := stream.read(_BLOCK)):
+        blocks.append(block)
+        size += len(block)
+    return b"".join(blocks)
 
 
 def check_size(path: str | os.PathLike[str], size: int, what: str) -> None:
@@ -60,7 +71,7 @@ def unpacked(data: bytes, path: str | os.PathLike[str]) -> bytes:
         return data
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
-            content = stream.read(MOST_BYTES + 1)
+            content = _most(stream)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
     check_size(path, len(content), "holds")
