@@ -4,8 +4,8 @@ import gzip
 import io
 import os
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO
 
 from psa_casadi.errors import InputError
 
@@ -22,7 +22,7 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """
     try:
         with Path(path).open("rb") as stream:
-            data = _most(stream)
+            data = _most(stream.read)
     except FileNotFoundError:
         raise InputError(
             f"{path}: there is no such file; check the name and the directory it is in."
@@ -39,10 +39,10 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     return data
 
 
-def _most(stream: IO[bytes]) -> bytes:
-    """Return the content of a stream, or more than `MOST_BYTES` of it; takes no more memory."""
+def _most(read: Callable[[int], bytes]) -> bytes:
+    """Return the content that is read, or more than `MOST_BYTES` of it; takes no more memory."""
     blocks, size = [], 0
-    while size <= MOST_BYTES and (block := stream.read(_BLOCK)):
+    while size <= MOST_BYTES and (block := read(_BLOCK)):
         blocks.append(block)
         size += len(block)
     return b"".join(blocks)
@@ -71,7 +71,7 @@ def unpacked(data: bytes, path: str | os.PathLike[str]) -> bytes:
         return data
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
-            content = _most(stream)
+            content = _most(stream.read)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
     check_size(path, len(content), "holds")
