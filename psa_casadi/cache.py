@@ -14,11 +14,11 @@ import platform
 import shutil
 import stat
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from psa_casadi.files import replace_durably
-from psa_casadi.scratch import temporary_folder
+from psa_casadi.scratch import sweep, temporary_folder
 
 #: Environment variable that names another folder.
 VARIABLE = "PSA_CASADI_CACHE"
@@ -31,13 +31,16 @@ def cache_directory() -> Path:
 
     A user without a home gets a folder that goes with this process.
     """
-    override = os.environ.get(VARIABLE)
-    if override:
-        return Path(override).absolute()
     try:
-        return _base() / "psa_casadi"
+        return _wanted()
     except RuntimeError:
         return _private()
+
+
+def _wanted() -> Path:
+    """Return the cache that the user wants; raises RuntimeError for one without a home."""
+    override = os.environ.get(VARIABLE)
+    return Path(override).absolute() if override else _base() / "psa_casadi"
 
 
 def cached(
@@ -57,6 +60,14 @@ def cached(
     except OSError as error:
         _refuse(wanted, error)
     return _found_or_made(_private() / room, name, make, usable)
+
+
+def sweep_rooms() -> None:
+    """Remove what dead processes left in the folders of the cache."""
+    with suppress(OSError, RuntimeError):
+        for room in _wanted().iterdir():
+            if room.is_dir() and not room.is_symlink():
+                sweep(room)
 
 
 def writable_room(room: str) -> Path:

@@ -151,3 +151,20 @@ def test_to_abandon_removes_everything_at_once(
         abandon()
         assert not os.listdir(tmp_path)
     assert not scratch._MADE
+
+
+@posix
+def test_any_command_sweeps_what_a_killed_one_left_in_the_cache(tmp_path: Path) -> None:
+    room = tmp_path / "cache" / "models"
+    room.mkdir(parents=True)
+    dead = holder(room)
+    dead.kill()
+    dead.communicate()
+    assert os.listdir(room)
+    subprocess.run(
+        [sys.executable, "-m", "psa_casadi.cli", "--version"],
+        env={**os.environ, "PSA_CASADI_CACHE": str(tmp_path / "cache")},
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    assert os.listdir(room) == []

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from types import FrameType
 
+from psa_casadi.cache import sweep_rooms
 from psa_casadi.scratch import abandon, temporary_folder
 
 #: What the operating system refuses: what happened, and what to do.
@@ -42,6 +43,7 @@ def prepare() -> None:
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, _end)
     _take_temporary_folder()
+    sweep_rooms()
 
 
 def _open_streams() -> None:
