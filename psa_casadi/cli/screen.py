@@ -62,11 +62,11 @@ HistoryOption = Annotated[
 SweepOption = Annotated[
     float,
     typer.Option(
-        "--sweep", help="Duration of each sweep of the history [s]; delta and creep see it."
+        "--sweep", help="Duration of each sweep of the history \\[s]; delta and creep see it."
     ),
 ]
 
-RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history [s].")]
+RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history \\[s].")]
 
 StartVoltageOption = Annotated[
     float | None,
