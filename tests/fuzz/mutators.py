@@ -227,8 +227,13 @@ def _rename(holder: Any, key: Any, rng: Random) -> None:
         holder.append(holder[key])
 
 
+#: About the largest double.
+_MOST = 10**300
+
+
 def _nudged(value: Any, rng: Random) -> Any:
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or abs(value) > _MOST:  # what is beyond a double already stays so
         return str(value) if rng.random() < 0.5 else [value]
     return rng.choice(
         (-value, value * 1e30, value * 1e-30, value * (1 + 1e-12), str(value), [value])
