@@ -176,7 +176,8 @@ _VALUES: tuple[Any, ...] = (
 
 def damaged_json(tree: Any, rng: Random) -> bytes:
     """Return the JSON of a tree with nodes changed, removed, renamed or repeated; or other text."""
-    tree = json.loads(json.dumps(tree))
+    given = tree
+    tree = json.loads(json.dumps(given))
     raw = None
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         holder, key = _node(tree, rng)
@@ -197,7 +198,11 @@ def damaged_json(tree: Any, rng: Random) -> bytes:
                 holder[key] = json.loads(json.dumps(other[place] if other else None))
             case 7:
                 holder[key] = _nudged(holder[key], rng)
-    text = json.dumps(tree, indent=rng.choice((None, 2)), ensure_ascii=rng.random() < 0.5)
+    how: dict[str, Any] = {"indent": rng.choice((None, 2)), "ensure_ascii": rng.random() < 0.5}
+    try:
+        text = json.dumps(tree, **how)
+    except ValueError:  # a list was put into itself
+        text = json.dumps(given, **how)
     data = text.encode("utf-8", "surrogatepass")
     if raw is not None:
         data = data.replace(b'"RAW"', raw.encode())
