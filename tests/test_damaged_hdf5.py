@@ -1,6 +1,7 @@
 """MATLAB files of version 7.3 that are damaged, huge or lead elsewhere: a sentence or a record."""
 
 import io
+import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -10,12 +11,21 @@ import h5py
 import numpy as np
 import pytest
 
+from psa_casadi.records.read import mat_file
 from psa_casadi.records.read.mat_file import load_arrays
+from psa_casadi.records.read.mat_hdf5 import hdf5_arrays
 from tests.mat_bytes import refusal, refused
 from tests.mutations import changed
 from tests.tiers import slow
 
 T = np.arange(24) / 8.0
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Let files be read in this process, where thousands take a moment; `apart` keeps the other."""
+    if "apart" not in request.keywords:
+        monkeypatch.setattr(mat_file, "arrays_apart", hdf5_arrays)
 
 
 def hdf5(fill: Callable[[Any], object]) -> bytes:
@@ -92,3 +102,36 @@ def test_wrong_bytes_of_version_7_3_are_refused_or_read() -> None:
 
     count = sum(refused(wrong) for wrong in changed(hdf5(fill), 1000, seed=3))
     assert 200 < count < 1000
+
+
+@pytest.mark.apart
+def test_a_process_of_its_own_reads_what_this_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(file: Any) -> None:
+        file["log/t"], file["x"], file["log/inner/a b/é"] = T, 2.0 * T, T.astype(np.float32)
+
+    apart = load_arrays("f.mat", hdf5(fill))
+    monkeypatch.setattr(mat_file, "arrays_apart", hdf5_arrays)
+    same = load_arrays("f.mat", hdf5(fill))
+    assert set(apart) == set(same)
+    assert {"log.t", "x"} < set(same)
+    for name, values in same.items():
+        np.testing.assert_array_equal(apart[name], values)
+        assert apart[name].dtype == values.dtype
+
+
+@pytest.mark.apart
+def test_what_the_process_refuses_is_told() -> None:
+    assert "more than 1 GiB" in refusal(hdf5(HUGE["stated"]))
+    assert "no readable MATLAB file" in refusal(hdf5(_twice)[:300])
+
+
+@pytest.mark.apart
+@pytest.mark.skipif(os.name != "posix", reason="a script stands in for the interpreter")
+def test_a_crash_of_the_library_is_a_damaged_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crashing = tmp_path / "python"
+    crashing.write_text("#!/bin/sh\nkill -SEGV $$\n")
+    crashing.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(crashing))
+    assert "the library of HDF5 fails on it" in refusal(hdf5(_twice))

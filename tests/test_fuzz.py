@@ -36,7 +36,7 @@ from tests.fuzz.target import CRASH, FALSE_PASS, FOREIGN, HANG, LEFT_OVER, Found
 #: Inputs of each target in the quick tier, and in the full one.
 QUICK = {"records-csv": 500, "column-maps": 500, "paths": 200, "models": 200}
 FULL = {
-    "records-csv": 6000, "records-mat": 1500, "records-hdf5": 700, "records-parquet": 700,
+    "records-csv": 6000, "records-mat": 1500, "records-hdf5": 10, "records-parquet": 700,
     "column-maps": 6000, "mapped-records": 1000, "units": 4000, "models": 1500, "paths": 2000,
     "binaries": 6000, "zips": 150, "descriptions": 500, "states": 1000,
 }  # fmt: skip

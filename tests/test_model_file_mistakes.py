@@ -143,3 +143,10 @@ def test_a_model_that_could_not_be_read_again_is_not_saved(expected: str) -> Non
     with pytest.raises(InputError, match=r"cannot be saved as MODEL\.json") as caught:
         dumps(UNWRITABLE[expected](SAVED))
     assert expected in str(caught.value)
+
+
+def test_an_integer_of_thirty_digits_is_a_number() -> None:
+    """It fits a double, and no machine's integer."""
+    content = json.loads(TEXT)
+    content["starts"] = {MODEL.state_names[0]: 10**30}
+    assert loads(json.dumps(content)).own_starts() == {MODEL.state_names[0]: 1e30}

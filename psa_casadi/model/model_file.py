@@ -100,7 +100,7 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
             {n: e["value"] for n, e in given.items()},
             name=content.get("name", "psa"),
             description=content.get("description", ""),
-        ).with_starts(content.get("starts", {}))
+        ).with_starts({n: float(v) for n, v in content.get("starts", {}).items()})
     except InputError as error:
         said = first_ones(f"{source}: {problem}" for problem in error.problems)
         raise InputError(said) from error

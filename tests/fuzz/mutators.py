@@ -174,6 +174,15 @@ _VALUES: tuple[Any, ...] = (
 )  # fmt: skip
 
 
+def _text(tree: Any, given: Any, rng: Random) -> str:
+    """Return the JSON of a tree, of the given one where a list of it was put into itself."""
+    how: dict[str, Any] = {"indent": rng.choice((None, 2)), "ensure_ascii": rng.random() < 0.5}
+    try:
+        return json.dumps(tree, **how)
+    except ValueError:
+        return json.dumps(given, **how)
+
+
 def damaged_json(tree: Any, rng: Random) -> bytes:
     """Return the JSON of a tree with nodes changed, removed, renamed or repeated; or other text."""
     given = tree
@@ -198,12 +207,7 @@ def damaged_json(tree: Any, rng: Random) -> bytes:
                 holder[key] = json.loads(json.dumps(other[place] if other else None))
             case 7:
                 holder[key] = _nudged(holder[key], rng)
-    how: dict[str, Any] = {"indent": rng.choice((None, 2)), "ensure_ascii": rng.random() < 0.5}
-    try:
-        text = json.dumps(tree, **how)
-    except ValueError:  # a list was put into itself
-        text = json.dumps(given, **how)
-    data = text.encode("utf-8", "surrogatepass")
+    data = _text(tree, given, rng).encode("utf-8", "surrogatepass")
     if raw is not None:
         data = data.replace(b'"RAW"', raw.encode())
     return damaged_bytes(data, rng, _JSON_WORDS) if rng.random() < 0.2 else data

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
-from psa_casadi.records.read.mat_hdf5 import hdf5_arrays, is_hdf5
+from psa_casadi.records.read.hdf5_process import arrays_apart
+from psa_casadi.records.read.mat_hdf5 import is_hdf5
 from psa_casadi.records.read.mat_level4 import level4_arrays
 from psa_casadi.records.read.mat_level5 import Tree, byte_order, level5_arrays
 
@@ -38,7 +39,7 @@ def load_arrays(path: str, data: bytes) -> Mapping[str, Numbers]:
 
 def _tree(path: str, data: bytes) -> Mapping[str, Tree]:
     if is_hdf5(data):
-        return hdf5_arrays(path, data)
+        return arrays_apart(path, data)
     return level5_arrays(path, data) if byte_order(data) else level4_arrays(data)
 
 

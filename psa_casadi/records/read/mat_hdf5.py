@@ -1,5 +1,6 @@
 """The arrays of a MATLAB file of version 7.3, which is HDF5."""
 
+import importlib.util
 import io
 import math
 import zlib
@@ -32,16 +33,21 @@ def hdf5_arrays(path: str, data: bytes) -> dict[str, Tree]:
             other files.
         Exception: whatever h5py says of a damaged file.
     """
-    try:
-        import h5py  # noqa: PLC0415 - an optional dependency, needed for these files only
-    except ImportError:
-        raise InputError(
-            f"{path}: is a MATLAB file of version 7.3, and reading it needs h5py, which is not "
-            f"installed; run `pip install 'psa-casadi[matlab]'`, or save it with save(..., '-v7')."
-        ) from None
+    require_h5py(path)
+    import h5py  # noqa: PLC0415 - an optional dependency, needed for these files only
+
     with h5py.File(io.BytesIO(data), "r") as file:
         _check(path, list(_datasets(file, set())))
         return _tree(file)
+
+
+def require_h5py(path: str) -> None:
+    """Raise InputError where h5py is not installed, without loading it."""
+    if importlib.util.find_spec("h5py") is None:
+        raise InputError(
+            f"{path}: is a MATLAB file of version 7.3, and reading it needs h5py, which is not "
+            f"installed; run `pip install 'psa-casadi[matlab]'`, or save it with save(..., '-v7')."
+        )
 
 
 def _members(group: Any) -> Iterator[tuple[str, Any]]:
