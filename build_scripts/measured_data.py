@@ -1,4 +1,4 @@
-"""Where the measured records lie that some tests and README commands need."""
+"""Where the measured records lie that some tests and commands of the pages need."""
 
 import os
 from pathlib import Path

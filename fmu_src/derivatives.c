@@ -19,6 +19,7 @@ static double *known_place(psa_instance *instance, unsigned vr, psa_knowns *in) 
     case PSA_INPUT: return in->u + v->index;
     case PSA_PARAMETER: return in->p + v->index;
     case PSA_SAMPLED: return in->p + PSA_NP + v->index;
+    case PSA_OPTION: return &in->option;
     default:
         psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be varied.", v->name);
         return NULL;
@@ -63,7 +64,7 @@ psa_result psa_directional_derivative(psa_instance *instance, const unsigned *un
     }
     const psa_result sampled = psa_sample_now(instance);
     if (sampled != PSA_FINE) return sampled;
-    psa_input_at(&state->input, state->solver.t, u);
+    psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, in.t, in.x, in.u, in.p,
                               out.xdot, out.y, out.z))
         return psa_say(instance, PSA_DISCARD, "The model cannot be differentiated here.");
@@ -118,7 +119,7 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
     for (int i = 0; i < PSA_NZ; ++i) out.z[i] *= state->facing[i];
     const psa_result sampled = psa_sample_now(instance);
     if (sampled != PSA_FINE) return sampled;
-    psa_input_at(&state->input, state->solver.t, u);
+    psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_adjoint(state->solver.t, state->solver.x, u, state->p, out.xdot, out.y, out.z, &in.t,
                           in.x, in.u, in.p))
         return psa_say(instance, PSA_DISCARD, "The model cannot be differentiated here.");

@@ -333,7 +333,7 @@ int psa_run_exact(psa_exact *run) {
     }
     for (long sample = 0; sample + 1 < run->samples && status == 0; ++sample) {
         if (run->zero_order_hold && sample > 0) start_ports(state, run->v + sample * EX_NU);
-        status = next_sample(state, sample, &pace);
+        status = run->stop && *run->stop ? 4 : next_sample(state, sample, &pace);
         if (status == 0) status = write_sample(state, sample + 1, &pace);
     }
     run->t_failed = LANE(state->t, 0);

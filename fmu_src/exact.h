@@ -31,12 +31,14 @@ typedef struct {
     const int *which;      /* [count] parameter index, -1: initial value */
     const double *s0;      /* [nx][count] d x0 / d theta */
     double *dy;            /* [samples][count] */
+    const volatile int *stop; /* NULL, or 0 until another thread ends the run */
     /* results */
     long steps, rejected, forced; /* forced: steps of the finest level that missed the tolerance */
     double t_failed;
 } psa_exact;
 
-/* 0; 1 where a number is not finite; 2 where memory is out; 3 where too many steps were needed */
+/* 0; 1 where a number is not finite; 2 where memory is out; 3 where too many steps were needed; 4 where the run was
+   stopped */
 PSA_EXACT_API int psa_run_exact(psa_exact *run);
 
 #endif

@@ -12,11 +12,21 @@ typedef struct {
     char name[]; /* copy of the instance name */
 } component;
 
+/* A message of FMI 2.0 is a format of printf, in which #r1# stands for the name of a variable: the signs
+   that begin such things are doubled. Importers that print the message as it is can read it too, which
+   they could not if it came as an argument of "%s". */
 static void report(void *owner, psa_result severity, int detail, const char *sentence) {
     const component *const self = owner;
-    if (self->logger && (self->debug || !detail))
-        self->logger(self->environment, self->name, psa_fmi2_status(severity),
-                     psa_log_category(severity), sentence);
+    char message[2 * PSA_SENTENCE];
+    size_t length = 0;
+    if (!self->logger || (detail && !self->debug)) return;
+    for (; *sentence && length + 2 < sizeof message; ++sentence) {
+        if (*sentence == '%' || *sentence == '#') message[length++] = *sentence;
+        message[length++] = *sentence;
+    }
+    message[length] = 0;
+    self->logger(self->environment, self->name, psa_fmi2_status(severity), psa_log_category(severity),
+                 message);
 }
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }

@@ -7,9 +7,10 @@
 #include "model.h"
 
 /* Value references count through the variables: time, then states, their derivatives, inputs, outputs,
-   parameters, event indicators and sampled states, each in the order of the model's vectors. */
+   parameters, event indicators, sampled states, each in the order of the model's vectors, and last, if
+   there are inputs, the option input_line. */
 #define PSA_FIRST_STATE 1
-#define PSA_VARIABLES (1 + 2 * PSA_STATES + PSA_NU + PSA_NY + PSA_NP + PSA_NZ + PSA_NS)
+#define PSA_VARIABLES (1 + 2 * PSA_STATES + PSA_NU + PSA_NY + PSA_NP + PSA_NZ + PSA_NS + (PSA_NU > 0))
 
 typedef enum {
     PSA_TIME,
@@ -19,7 +20,8 @@ typedef enum {
     PSA_OUTPUT,
     PSA_PARAMETER,
     PSA_INDICATOR,
-    PSA_SAMPLED
+    PSA_SAMPLED,
+    PSA_OPTION
 } psa_kind;
 
 typedef struct {

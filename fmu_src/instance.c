@@ -97,6 +97,8 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     psa_solver_start(&state->solver, 0.0, psa_start_states, psa_state_nominals,
                      STEP_SHARE * DEFAULT_TOLERANCE);
     memcpy(state->input.value, psa_start_inputs, sizeof state->input.value);
+    memcpy(state->given, psa_start_inputs, sizeof state->given);
+    memcpy(state->earlier, psa_start_inputs, sizeof state->earlier);
     memcpy(state->p, psa_start_parameters, sizeof state->p);
     for (int i = 0; i < PSA_NZ; ++i) state->facing[i] = 1.0;
     state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
@@ -106,6 +108,10 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     instance->fresh = 0;
 }
 
+double psa_step_tolerance(double tolerance) {
+    return fmax(STEP_SHARE * fmin(tolerance, LOOSEST_TOLERANCE), TIGHTEST_STEP_TOLERANCE);
+}
+
 psa_result psa_setup(psa_instance *instance, int tolerance_defined, double tolerance, double start,
                      int stop_defined, double stop) {
     psa_state *const state = &instance->state;
@@ -113,13 +119,13 @@ psa_result psa_setup(psa_instance *instance, int tolerance_defined, double toler
         return psa_say(instance, PSA_ERROR, "The experiment from %g s to %g s is impossible.", start, stop);
     if (tolerance_defined && !(tolerance > 0.0))
         return psa_say(instance, PSA_ERROR, "The tolerance %g is not positive.", tolerance);
+    if (psa_beyond_counting(instance, start, state->p[PSA_PERIOD])) return PSA_ERROR;
     if (tolerance_defined) {
-        const double kept = fmin(tolerance, LOOSEST_TOLERANCE);
-        state->solver.rtol = fmax(STEP_SHARE * kept, TIGHTEST_STEP_TOLERANCE);
-        state->event_margin = EVENT_MARGIN * kept;
+        state->solver.rtol = psa_step_tolerance(tolerance);
+        state->event_margin = EVENT_MARGIN * fmin(tolerance, LOOSEST_TOLERANCE);
     }
-    state->solver.t = start;
-    state->input.origin = start;
+    psa_solver_move(&state->solver, start);
+    state->input.begin = 0.0;
     state->stop_defined = stop_defined;
     state->stop_time = stop_defined ? stop : 0.0;
     psa_schedule(instance);
@@ -138,39 +144,79 @@ static const char *reason(psa_status status) {
 
 /* Take the input along to the time the solver has reached, and forget rates that were not renewed. */
 static void carry_input(psa_state *state) {
-    psa_input_at(&state->input, state->solver.t, state->input.value);
-    state->input.origin = state->solver.t;
+    psa_input_at(&state->input, state->solver.since, state->input.value);
+    state->input.begin = state->solver.since;
+}
+
+/* Count the time from here on, so that the clock can tell short steps again; return by how much it was
+   set back. */
+static double restart_clock(psa_state *state) {
+    const double since = state->solver.since;
+    psa_solver_move(&state->solver, state->solver.t);
+    state->input.begin = 0.0;
+    return since;
 }
 
 /* After an accepted step of the solver: let the importer look at the intermediate time, set inputs from
    here on, or end the communication step earlier. */
-static void look(void *owner, double *t_end) {
+static void look(void *owner, psa_end *end) {
     psa_instance *const instance = owner;
     psa_state *const state = &instance->state;
-    const double now = state->solver.t;
-    double end = instance->goal;
+    psa_end *const goal = &instance->goal;
+    const psa_end now = {state->solver.since, state->solver.t};
+    const int more = now.since < goal->since;
+    double wanted = goal->t;
     carry_input(state);
     instance->fresh = 0;
     const psa_input input = state->input;
     state->phase = PSA_INTERMEDIATE;
-    const int early = instance->update(instance->owner, now, now < instance->goal, &end);
+    const int early = instance->update(instance->owner, now.t, more, &wanted);
     state->phase = PSA_STEP_COMPLETE;
-    if (early && !(end > now)) end = now;
-    if (now < instance->goal && memcmp(&input, &state->input, sizeof input))
+    if (more && early && !(wanted > now.t)) *goal = now;
+    else if (more && early && wanted < goal->t) {
+        goal->since = now.since + (wanted - now.t);
+        goal->t = wanted;
         state->last.kind = PSA_STEP_VARIED;
-    if (!early || !(end < instance->goal)) return;
-    if (end > now) state->last.kind = PSA_STEP_VARIED;
-    instance->goal = end;
-    *t_end = fmin(*t_end, end);
+    }
+    if (goal->since < end->since) *end = *goal;
+    if (!more || !memcmp(&input, &state->input, sizeof input)) return;
+    state->last.kind = PSA_STEP_VARIED;
+    const double back = restart_clock(state);
+    goal->since -= back;
+    end->since -= back;
+}
+
+/* How the inputs move over the coming step: by the rate that the importer gave, else along the line, but
+   by no more than over the last step, which may have been much shorter. */
+static void aim_inputs(psa_state *state, double size) {
+    for (int i = 0; i < PSA_NU; ++i) {
+        if (!state->rate_given[i]) state->input.rate[i] = 0.0;
+        if (!state->rate_given[i] && state->line > 0.0) {
+            state->input.value[i] = state->given[i];
+            if (state->stride > 0.0)
+                state->input.rate[i] =
+                    state->line * (state->given[i] - state->earlier[i]) / fmax(state->stride, size);
+        }
+        state->earlier[i] = state->input.value[i];
+    }
+}
+
+/* What the next line goes through, at the end of a step. */
+static void remember_inputs(psa_state *state, double begin) {
+    const int same_clock = state->last.kind == PSA_STEP_KNOWN;
+    state->stride = same_clock ? state->solver.since : fmax(state->solver.t - begin, 0.0);
+    for (int i = 0; i < PSA_NU; ++i)
+        if (state->rate_given[i] || state->line == 0.0) state->given[i] = state->input.value[i];
+    memset(state->rate_given, 0, sizeof state->rate_given);
 }
 
 /* Keep what the coming communication step starts from, for its sensitivities. */
-static void remember(psa_state *state, double target) {
+static void remember(psa_state *state, psa_end end) {
     psa_last_step *const last = &state->last;
     last->solver = state->solver;
     last->input = state->input;
     memcpy(last->p, state->p, sizeof last->p);
-    last->target = target;
+    last->end = end;
     last->kind = PSA_STEP_KNOWN;
 }
 
@@ -180,34 +226,34 @@ static psa_status run_solver(psa_instance *instance) {
     psa_solver *const solver = &state->solver;
     const psa_watch watch = {look, instance};
     for (;;) {
-        const double period = state->p[PSA_PERIOD];
-        const int stop = PSA_NS > 0 && !psa_reached(state->next_instant, instance->goal, period);
-        const double end = stop ? state->next_instant : instance->goal;
-        const psa_status status = psa_solver_advance(solver, &instance->work, end, &state->input,
-                                                     state->p, NULL, instance->update ? &watch : NULL);
+        const double period = state->p[PSA_PERIOD], next = state->next_instant;
+        const psa_end instant = {next - solver->origin, next};
+        const int stop = PSA_NS > 0 && !psa_reached(next, instance->goal.t, period);
+        const psa_status status =
+            psa_solver_advance(solver, &instance->work, stop ? instant : instance->goal, &state->input,
+                               state->p, NULL, instance->update ? &watch : NULL);
         carry_input(state);
         instance->fresh = 0;
         if (status != PSA_OK) return status;
-        if (!stop || psa_reached(solver->t, instance->goal, period)) return PSA_OK;
+        if (!stop || psa_reached(solver->t, instance->goal.t, period)) return PSA_OK;
         if (psa_sample_within(instance) != PSA_FINE) return PSA_NOT_FINITE;
     }
 }
 
-static psa_result advance(psa_instance *instance, double target) {
+static psa_result advance(psa_instance *instance, psa_end end) {
     psa_state *const state = &instance->state;
     psa_solver *const solver = &state->solver;
     const double begin = solver->t;
     const int sampled = PSA_NS > 0 && state->at_instant;
     const int64_t steps = solver->steps, rejected = solver->rejected;
-    for (int i = 0; i < PSA_NU; ++i)
-        if (!state->rate_given[i]) state->input.rate[i] = 0.0;
-    state->input.origin = begin;
+    restart_clock(state);
+    aim_inputs(state, end.since);
     if (psa_leave_instant(instance) != PSA_FINE) return PSA_DISCARD;
-    remember(state, target);
+    remember(state, end);
     if (sampled) state->last.kind = PSA_STEP_SAMPLED;
-    instance->goal = target;
+    instance->goal = end;
     const psa_status status = run_solver(instance);
-    memset(state->rate_given, 0, sizeof state->rate_given);
+    remember_inputs(state, begin);
     psa_arrive(instance);
     psa_whisper(instance, "Step from %.9g s to %.9g s: %ld solver steps, %ld rejected.", begin, solver->t,
             (long)(solver->steps - steps), (long)(solver->rejected - rejected));
@@ -217,7 +263,7 @@ static psa_result advance(psa_instance *instance, double target) {
     return psa_say(instance, PSA_DISCARD,
                    "The step from %.9g s to %.9g s stopped at %.9g s in state '%s': %s. Likely an input"
                    " or a parameter is far from its physical range, or the tolerance is too tight.",
-                   begin, target, solver->t,
+                   begin, end.t, solver->t,
                    PSA_STATES > 0 ? psa_variables[PSA_FIRST_STATE + solver->culprit].name : "sampled",
                    reason(status));
 }
@@ -225,7 +271,9 @@ static psa_result advance(psa_instance *instance, double target) {
 psa_result psa_do_step(psa_instance *instance, double point, double size, psa_update *update,
                        int *early) {
     const psa_state *const state = &instance->state;
-    const double now = state->solver.t, target = point + size;
+    const double now = state->solver.t;
+    /* an importer that stands elsewhere by rounding gets the end that it expects */
+    const psa_end end = {size + (point - now), point + size};
     const double slack = 1e-3 * fabs(size) + 1e-12 * (fabs(point) + fabs(now));
     if (!isfinite(point) || !isfinite(size) || size < 0.0)
         return psa_say(instance, PSA_ERROR, "A step of %g s from %g s is impossible.", size, point);
@@ -233,13 +281,19 @@ psa_result psa_do_step(psa_instance *instance, double point, double size, psa_up
         return psa_say(instance, PSA_ERROR,
                        "The communication point is %.17g s, but the instance stands at %.17g s.", point,
                        now);
-    if (state->stop_defined && target > state->stop_time + slack)
+    if (size > 0.0 && !(end.t > point))
+        return psa_say(instance, PSA_ERROR,
+                       "The step of %g s from %.17g s is too short: a double cannot tell its end from its"
+                       " begin. Count the time from a nearer start.",
+                       size, point);
+    if (psa_beyond_counting(instance, end.t, state->p[PSA_PERIOD])) return PSA_ERROR;
+    if (state->stop_defined && end.t > state->stop_time + slack)
         return psa_say(instance, PSA_ERROR, "The step to %.17g s goes beyond the stop time %.17g s.",
-                       target, state->stop_time);
-    if (!(size > 0.0 && target > now)) return PSA_FINE;
+                       end.t, state->stop_time);
+    if (!(size > 0.0 && end.since > 0.0 && end.t > now)) return PSA_FINE;
     instance->update = update;
-    const psa_result result = advance(instance, target);
+    const psa_result result = advance(instance, end);
     instance->update = NULL;
-    if (early) *early = result == PSA_FINE && state->solver.t < target;
+    if (early) *early = result == PSA_FINE && state->solver.t < end.t;
     return result;
 }

@@ -68,8 +68,8 @@ typedef struct {
     psa_solver solver;
     psa_input input;
     double p[PSA_HELD + 1];
-    double target; /* end that the importer asked for */
-    int64_t kind;  /* psa_step_kind */
+    psa_end end;  /* that the importer asked for */
+    int64_t kind; /* psa_step_kind */
 } psa_last_step;
 
 /* Everything that a snapshot must hold: a plain struct without pointers. Each member has eight bytes or
@@ -80,6 +80,12 @@ typedef struct {
     double p[PSA_HELD + 1];
     psa_last_step last;
     int64_t rate_given[PSA_NU + 1]; /* the importer gave this input's rate for the next step */
+    /* The option input_line: this share of the slope between the last two values that an input was
+       given goes on over a step (0: inputs are held). A step does not change what was given. */
+    double line;
+    double given[PSA_NU + 1];   /* last */
+    double earlier[PSA_NU + 1]; /* that the last step started with */
+    double stride;              /* length of that step; 0: there is none, or an event came after it */
     /* An event indicator is facing * switch + margin. Facing changes its sign at an event, so that the
        noise of an importer's solver about a held input makes no further ones. */
     double facing[PSA_NZ + 1];
@@ -95,6 +101,8 @@ typedef struct {
     int64_t interface; /* psa_interface */
 } psa_state;
 
+#define PSA_SENTENCE 512 /* bytes of the longest one that an instance says, with its end */
+
 /* Receives a sentence; `detail` is 1 for what only debug logging shows. */
 typedef void psa_reporter(void *owner, psa_result severity, int detail, const char *sentence);
 
@@ -108,7 +116,7 @@ typedef struct {
     double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1]; /* valid while `fresh` */
     int fresh;
     psa_update *update; /* during a communication step; may be NULL */
-    double goal;        /* end of that step */
+    psa_end goal;       /* end of that step */
     psa_reporter *report; /* may be NULL */
     void *owner;
     void *(*allocate)(size_t count, size_t size);
@@ -131,6 +139,8 @@ psa_result psa_choose_log(psa_instance *instance, int on, size_t count,
 void psa_instance_start(psa_instance *instance, psa_interface interface);
 /* 1 if the call is allowed now, else 0 and a report. `instance` may be NULL. */
 int psa_admit(psa_instance *instance, psa_call call, const char *name);
+/* Tolerance of a solver step, from that of the trajectory. */
+double psa_step_tolerance(double tolerance);
 psa_result psa_setup(psa_instance *instance, int tolerance_defined, double tolerance, double start,
                      int stop_defined, double stop);
 /* One communication step; `early` is set if `update`, which may be NULL, ended it before its time. */
@@ -141,6 +151,8 @@ const char *psa_objection(const char *name, const char *token);
 
 /* sampling.c: sampled states between their instants. In co-simulation the instant at a communication
    point belongs to the step that starts there, and outputs are read as if it had happened. */
+/* 1 and a report if a double cannot count sample periods up to a time. */
+int psa_beyond_counting(psa_instance *instance, double time, double period);
 /* The present time is where the instance starts; the period may have changed. */
 void psa_schedule(psa_instance *instance);
 /* The present time is an instant if the next one has been reached. */
@@ -200,13 +212,17 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
 
 /* One number for each variable that can be known: a direction, or a gradient. */
 typedef struct {
-    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1];
+    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1], option; /* the option: of no effect */
 } psa_knowns;
 
 /* Change of the states at the end of the last communication step along each direction: moved is
    [PSA_NX][count]. */
 psa_result psa_step_sensitivity(psa_instance *instance, int count, const psa_knowns *directions,
                                 double *moved);
+
+/* snapshot_fault.c: why bytes that look like a state cannot be one, or NULL: which part is impossible.
+   Nothing in a state without a fault crashes a call or keeps it busy. */
+const char *psa_state_fault(const psa_state *state);
 
 /* snapshot.c: the state of an instance, in memory and as bytes */
 psa_result psa_snapshot_take(psa_instance *instance, void **snapshot);

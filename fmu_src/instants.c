@@ -8,7 +8,12 @@
 /* Communication points are sums with an error of rounding; this share of a period counts as none. */
 #define ROUNDING 1e-6
 
+/* The allowance for rounding is a tenth of a period there. */
+#define MOST_PERIODS 1e13
+
 static double slack(double t, double period) { return ROUNDING * period + 1e-14 * fabs(t); }
+
+int psa_countable(double t, double period) { return fabs(t) <= MOST_PERIODS * period; }
 
 int psa_at_instant(double t, double period) {
     return fabs(t - period * nearbyint(t / period)) <= slack(t, period);

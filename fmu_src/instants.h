@@ -2,6 +2,8 @@
 #ifndef PSA_INSTANTS_H
 #define PSA_INSTANTS_H
 
+/* 1 if a double tells the instants near t apart; what follows takes for granted that it does. */
+int psa_countable(double t, double period);
 /* 1 if t is an instant, or differs from one by no more than the rounding of communication points. */
 int psa_at_instant(double t, double period);
 /* The first instant after t, other than the one that t is. */

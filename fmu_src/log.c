@@ -6,7 +6,7 @@
 
 static void say(psa_instance *instance, psa_result result, int detail, const char *format,
                 va_list arguments) {
-    char sentence[512];
+    char sentence[PSA_SENTENCE];
     if (!instance->report) return;
     vsnprintf(sentence, sizeof sentence, format, arguments);
     instance->report(instance->owner, result, detail, sentence);

@@ -3,6 +3,15 @@
 #include "instance.h"
 #include "instants.h"
 
+int psa_beyond_counting(psa_instance *instance, double time, double period) {
+    if (PSA_NS == 0 || psa_countable(time, period)) return 0;
+    psa_say(instance, PSA_ERROR,
+            "Sample periods of %g s cannot be counted up to %.9g s: a double does not tell them apart there."
+            " Count the time from a nearer start.",
+            period, time);
+    return 1;
+}
+
 void psa_schedule(psa_instance *instance) {
     psa_state *const state = &instance->state;
     const double period = state->p[PSA_PERIOD];
@@ -31,7 +40,7 @@ psa_result psa_sample_now(psa_instance *instance) {
     double u[PSA_NU + 1];
     if (PSA_NS == 0 || !state->at_instant) return PSA_FINE;
     memcpy(state->p + PSA_NP, state->before, sizeof(double) * PSA_NS);
-    psa_input_at(&state->input, state->solver.t, u);
+    psa_input_at(&state->input, state->solver.since, u);
     if (psa_take_sample(state->solver.t, state->solver.x, u, state->p))
         return psa_say(instance, PSA_DISCARD, "The sampled states cannot be evaluated at t = %.9g s.",
                        state->solver.t);
@@ -58,6 +67,7 @@ psa_result psa_sample_within(psa_instance *instance) {
 
 void psa_enter_event(psa_instance *instance) {
     instance->state.phase = PSA_EVENT;
+    instance->state.stride = 0.0; /* no line through values before and after a jump */
     if (instance->state.interface == PSA_MODEL_EXCHANGE) psa_arrive(instance);
 }
 

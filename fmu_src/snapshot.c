@@ -5,14 +5,15 @@
 
 /* psa_state without gaps: otherwise its bytes would depend on the platform. Does not compile if there are. */
 #define WORDS_OF_POINT \
-    ((12 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_HELD + 1)) /* solver, input, parameters */
+    ((14 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_HELD + 1)) /* solver, input, parameters */
 typedef char psa_state_has_no_gaps
-    [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + (PSA_NS + 1) + 7)
+    [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + (PSA_NS + 1) + 8 + 
+                                2 + 2 * (PSA_NU + 1))
          ? 1
          : -1];
 
 /* Raise it whenever psa_state or psa_solver changes its meaning. */
-#define SNAPSHOT_VERSION 4u
+#define SNAPSHOT_VERSION 5u
 
 /* In front of the bytes of a psa_state: who wrote them, and whether they arrived whole. A machine of
    another byte order or struct layout fails the comparison of version or size. */
@@ -22,6 +23,13 @@ typedef struct {
     uint64_t model; /* hash of the model's token */
     uint64_t checksum;
 } psa_stamp;
+
+/* What an importer holds. Some (fmusim) free a snapshot by itself where its address is asked for: then
+   the zero is taken for the snapshot, which is missing, and nothing is freed. */
+typedef struct {
+    uint64_t zero;
+    psa_state state;
+} psa_snapshot;
 
 /* FNV-1a, 64 bit */
 static uint64_t hash(const void *data, size_t size) {
@@ -39,27 +47,29 @@ static psa_stamp stamp_of(const void *state) {
 }
 
 static psa_result provide(psa_instance *instance, void **snapshot) {
-    if (!*snapshot) *snapshot = instance->allocate(1, sizeof(psa_state));
-    if (*snapshot) return PSA_FINE;
+    if (!*snapshot) *snapshot = instance->allocate(1, sizeof(psa_snapshot));
+    if (*snapshot) {
+        ((psa_snapshot *)*snapshot)->zero = 0;
+        return PSA_FINE;
+    }
     return psa_say(instance, PSA_ERROR, "There is no memory for a snapshot of %lu bytes.",
-                   (unsigned long)sizeof(psa_state));
+                   (unsigned long)sizeof(psa_snapshot));
 }
 
 psa_result psa_snapshot_take(psa_instance *instance, void **snapshot) {
     if (psa_lacks(instance, 1, snapshot, snapshot)) return PSA_ERROR;
     const psa_result result = provide(instance, snapshot);
-    if (result == PSA_FINE) memcpy(*snapshot, &instance->state, sizeof(psa_state));
+    if (result == PSA_FINE) ((psa_snapshot *)*snapshot)->state = instance->state;
     return result;
 }
 
 psa_result psa_snapshot_restore(psa_instance *instance, const void *snapshot) {
-    psa_state state;
+    const psa_snapshot *const found = snapshot;
     if (psa_lacks(instance, 1, snapshot, snapshot)) return PSA_ERROR;
-    memcpy(&state, snapshot, sizeof state);
-    if (state.interface != instance->state.interface)
+    if (found->state.interface != instance->state.interface)
         return psa_say(instance, PSA_ERROR,
                        "The snapshot is one of the other interface (co-simulation or model exchange).");
-    memcpy(&instance->state, snapshot, sizeof state);
+    instance->state = found->state;
     instance->fresh = 0;
     return PSA_FINE;
 }
@@ -77,28 +87,34 @@ psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, void
     if (size < psa_snapshot_size())
         return psa_say(instance, PSA_ERROR, "A snapshot needs %lu bytes; there are %lu.",
                        (unsigned long)psa_snapshot_size(), (unsigned long)size);
-    const psa_stamp stamp = stamp_of(snapshot);
+    const psa_state *const state = &((const psa_snapshot *)snapshot)->state;
+    const psa_stamp stamp = stamp_of(state);
     memcpy(bytes, &stamp, sizeof stamp);
-    memcpy((char *)bytes + sizeof stamp, snapshot, sizeof(psa_state));
+    memcpy((char *)bytes + sizeof stamp, state, sizeof *state);
     return PSA_FINE;
 }
 
 psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t size, void **snapshot) {
     psa_stamp found;
+    psa_state state;
     if (psa_lacks(instance, 1, bytes, snapshot)) return PSA_ERROR;
     if (size != psa_snapshot_size())
         return psa_say(instance, PSA_ERROR, "These %lu bytes are no snapshot of this model, which has %lu.",
                        (unsigned long)size, (unsigned long)psa_snapshot_size());
     memcpy(&found, bytes, sizeof found);
-    const char *const state = (const char *)bytes + sizeof found;
-    const psa_stamp expected = stamp_of(state);
+    memcpy(&state, (const char *)bytes + sizeof found, sizeof state);
+    const psa_stamp expected = stamp_of(&state);
     if (memcmp(found.magic, expected.magic, sizeof found.magic) || found.version != expected.version ||
         found.size != expected.size || found.model != expected.model)
         return psa_say(instance, PSA_ERROR,
                        "The snapshot was written by another model, version or kind of machine.");
     if (found.checksum != expected.checksum)
         return psa_say(instance, PSA_ERROR, "The snapshot is damaged: its checksum does not match.");
+    const char *const fault = psa_state_fault(&state);
+    if (fault)
+        return psa_say(instance, PSA_ERROR,
+                       "The snapshot was altered: %s cannot be what this model wrote.", fault);
     const psa_result result = provide(instance, snapshot);
-    if (result == PSA_FINE) memcpy(*snapshot, state, sizeof(psa_state));
+    if (result == PSA_FINE) ((psa_snapshot *)*snapshot)->state = state;
     return result;
 }

@@ -9,6 +9,7 @@
 #define NEWTON_LIMIT 8
 #define NEWTON_TOLERANCE 0.02 /* share of the step's error tolerance */
 #define SAFETY 0.9
+#define SMALLEST 1e-25 /* s; no step is shorter, nor than what the solver's clock can tell */
 #define KINK_ITERATIONS 12
 #define KINK_RESOLUTION 1e-3 /* of the step in which a kink is located */
 #define KINK_RESTART 0.05    /* first step after a kink over the one that ended there */
@@ -52,14 +53,19 @@ static const psa_method *method_of(const psa_solver *solver) {
     return solver->rtol < LOOSE ? &ESDIRK4 : &TR_BDF2;
 }
 
-void psa_input_at(const psa_input *input, double t, double *u) {
-    for (int i = 0; i < PSA_NU; ++i) u[i] = input->value[i] + input->rate[i] * (t - input->origin);
+void psa_input_at(const psa_input *input, double since, double *u) {
+    for (int i = 0; i < PSA_NU; ++i) u[i] = input->value[i] + input->rate[i] * (since - input->begin);
+}
+
+void psa_solver_move(psa_solver *solver, double t) {
+    solver->t = solver->origin = t;
+    solver->since = 0.0;
 }
 
 void psa_solver_start(psa_solver *solver, double t, const double *x, const double *nominal,
                       double rtol) {
     memset(solver, 0, sizeof *solver);
-    solver->t = t;
+    psa_solver_move(solver, t);
     solver->rtol = rtol;
     solver->contraction = 1.0;
     memcpy(solver->x, x, sizeof solver->x);
@@ -131,6 +137,14 @@ static int solve_stage(psa_solver *solver, psa_work *work, int stage, const doub
     return 1;
 }
 
+/* The time of a stage of a step of size h, and the input then. */
+static void set_stage(const psa_solver *solver, psa_work *work, int stage, double h,
+                      const psa_input *input, double *u) {
+    const double since = solver->since + method_of(solver)->c[stage] * h;
+    work->stage_t[stage] = solver->origin + since;
+    psa_input_at(input, since, u);
+}
+
 /* Try one step of size h; returns the scaled error (<= 1 accepts), or a negative number on failure. */
 static double try_step(psa_solver *solver, psa_work *work, double h, const psa_input *input,
                        const double *p) {
@@ -143,10 +157,9 @@ static double try_step(psa_solver *solver, psa_work *work, double h, const psa_i
     }
     memcpy(work->stage_x[0], solver->x, sizeof solver->x);
     memcpy(work->stage_k[0], solver->slope, sizeof solver->slope);
-    work->stage_t[0] = solver->t;
+    set_stage(solver, work, 0, h, input, u);
     for (int stage = 1; stage < method->stages; ++stage) {
-        work->stage_t[stage] = solver->t + method->c[stage] * h;
-        psa_input_at(input, work->stage_t[stage], u);
+        set_stage(solver, work, stage, h, input, u);
         for (int i = 0; i < PSA_NX; ++i) {
             double sum = 0.0;
             for (int j = 0; j < stage; ++j) sum += method->a[stage][j] * work->stage_k[j][i];
@@ -166,7 +179,7 @@ static double try_step(psa_solver *solver, psa_work *work, double h, const psa_i
 static int prepare_slope(psa_solver *solver, const psa_input *input, const double *p) {
     double u[PSA_NU + 1];
     int same = solver->slope_valid != 0;
-    psa_input_at(input, solver->t, u);
+    psa_input_at(input, solver->since, u);
     for (int i = 0; i < PSA_NU; ++i)
         if (fabs(u[i] - solver->last_input[i]) > 1e-12 * (fabs(u[i]) + fabs(solver->last_input[i])))
             same = 0;
@@ -197,7 +210,7 @@ static int step_sensitivities(const psa_solver *solver, psa_work *work, double h
     double jac[PSA_NX * PSA_NX], u[PSA_NU + 1];
     for (int stage = sens->slope_valid ? 1 : 0; stage < stages; ++stage) {
         double *const slopes = stage > 0 ? sens->stage + (long)stage * size : sens->slope;
-        psa_input_at(input, work->stage_t[stage], u);
+        set_stage(solver, work, stage, h, input, u);
         if (sens->differentiate(sens, work->stage_t[stage], work->stage_x[stage], u, p, jac, slopes))
             return 1;
         memcpy(sens->base, sens->s, bytes);
@@ -237,10 +250,10 @@ static void interpolate(const psa_solver *solver, const psa_work *work, double h
 static int switches_at(const psa_solver *solver, const psa_work *work, double h, double theta,
                        const psa_input *input, const double *p, double *z) {
     double x[PSA_NX], u[PSA_NU + 1];
-    const double t = solver->t + theta * h;
+    const double since = solver->since + theta * h;
     interpolate(solver, work, h, theta, x);
-    psa_input_at(input, t, u);
-    return psa_model_switches(t, x, u, p, z);
+    psa_input_at(input, since, u);
+    return psa_model_switches(solver->origin + since, x, u, p, z);
 }
 
 /* Share of the step just tried after which the first switch has changed its sign; 1 if none does.
@@ -273,42 +286,54 @@ static double first_kink(const psa_solver *solver, const psa_work *work, double 
     return first;
 }
 
-static psa_status accept(psa_solver *solver, psa_work *work, double t_new, double h,
+static psa_status accept(psa_solver *solver, psa_work *work, psa_end reached, double h,
                          const psa_input *input, const double *p, psa_sensitivities *sens) {
     if (sens && step_sensitivities(solver, work, h, input, p, sens)) return PSA_NOT_FINITE;
     const int last = method_of(solver)->stages - 1;
     memcpy(solver->x, work->stage_x[last], sizeof solver->x);
     memcpy(solver->slope, work->stage_k[last], sizeof solver->slope);
-    solver->t = t_new;
-    psa_input_at(input, t_new, solver->last_input);
+    solver->since = reached.since;
+    solver->t = reached.t;
+    psa_input_at(input, reached.since, solver->last_input);
     solver->steps++;
     return PSA_OK;
 }
 
 /* What one call of psa_solver_advance may still spend and reach. */
 typedef struct {
-    double t_end, smallest; /* the end and the smallest step [s] */
-    int64_t attempts;       /* left */
+    psa_end end;
+    int64_t attempts; /* left */
 } psa_bounds;
+
+/* Bounds a step from below, for the clock must move; one that is not shorter is tried before it fails. */
+static double smallest_step(const psa_solver *solver) {
+    return fmax(SMALLEST, 8.0 * 2.220446049250313e-16 * solver->since);
+}
+
+static psa_end after(const psa_solver *solver, double h) {
+    const double since = solver->since + h;
+    const psa_end reached = {since, solver->origin + since};
+    return reached;
+}
 
 /* One accepted step towards the end, after as many attempts as it takes. */
 static psa_status one_step(psa_solver *solver, psa_work *work, psa_bounds *bounds,
                            const psa_input *input, const double *p, psa_sensitivities *sens) {
-    const double exponent = method_of(solver)->exponent, smallest = bounds->smallest;
-    const double left = bounds->t_end - solver->t;
+    const double exponent = method_of(solver)->exponent, smallest = smallest_step(solver);
+    const double left = bounds->end.since - solver->since;
     double u[PSA_NU + 1];
     double aimed = 0.0; /* length of the step that ends at a kink; 0: no kink is in sight */
-    psa_input_at(input, solver->t, u);
+    psa_input_at(input, solver->since, u);
     set_weights(solver, work);
     if (psa_model_jacobian(solver->t, solver->x, u, p, work->jac)) return PSA_NOT_FINITE;
     work->lu_factor_h = 0.0;
     for (;;) {
-        double h = solver->max_step > 0.0 ? fmin(solver->step, solver->max_step) : solver->step;
+        double h = fmax(solver->step, smallest);
+        if (solver->max_step > 0.0) h = fmin(h, solver->max_step);
         const int last = h * 1.01 >= left && aimed == 0.0;
         if (aimed > 0.0) h = fmin(h, aimed);
         else if (last) h = left;
         else if (2.0 * h > left) h = 0.5 * left;
-        if (!(h > smallest) && !last) return PSA_STEP_TOO_SMALL;
         if (--bounds->attempts < 0) return PSA_TOO_MANY_STEPS;
         const double error = try_step(solver, work, h, input, p);
         const int good = error >= 0.0 && error <= 1.0;
@@ -320,7 +345,7 @@ static psa_status one_step(psa_solver *solver, psa_work *work, psa_bounds *bound
         } else if (good) {
             const double factor = fmin(5.0, fmax(0.2, SAFETY * pow(fmax(error, 1e-10), exponent)));
             const psa_status status =
-                accept(solver, work, last ? bounds->t_end : solver->t + h, h, input, p, sens);
+                accept(solver, work, last ? bounds->end : after(solver, h), h, input, p, sens);
             if (status != PSA_OK) return status;
             solver->landed = aimed > 0.0 && h >= aimed;
             if (solver->landed) solver->step = KINK_RESTART * h;
@@ -334,12 +359,11 @@ static psa_status one_step(psa_solver *solver, psa_work *work, psa_bounds *bound
     }
 }
 
-psa_status psa_solver_advance(psa_solver *solver, psa_work *work, double t_end,
+psa_status psa_solver_advance(psa_solver *solver, psa_work *work, psa_end end,
                               const psa_input *input, const double *p, psa_sensitivities *sens,
                               const psa_watch *watch) {
-    psa_bounds bounds = {t_end, 8.0 * 2.220446049250313e-16 * (fabs(t_end) + fabs(solver->t)),
-                         solver->steps_limit > 0 ? solver->steps_limit : 10000000};
-    while (solver->t < bounds.t_end) {
+    psa_bounds bounds = {end, solver->steps_limit > 0 ? solver->steps_limit : 10000000};
+    while (solver->since < bounds.end.since) {
         /* afresh for each step, because who watches may have changed the input */
         switch (prepare_slope(solver, input, p)) {
         case 1: return PSA_NOT_FINITE;
@@ -354,7 +378,7 @@ psa_status psa_solver_advance(psa_solver *solver, psa_work *work, double t_end,
         }
         const psa_status status = one_step(solver, work, &bounds, input, p, sens);
         if (status != PSA_OK) return status;
-        if (watch) watch->accepted(watch->owner, &bounds.t_end);
+        if (watch) watch->accepted(watch->owner, &bounds.end);
     }
     return PSA_OK;
 }

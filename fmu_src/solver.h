@@ -26,7 +26,9 @@ typedef enum {
 /* What the solver remembers between calls: enough to go on with the same bits. Only numbers of eight
    bytes, so that the struct has the same bytes on every platform of the same byte order. */
 typedef struct {
-    double t;                /* time of x [s] */
+    double t;                /* time of x [s]: origin + since, rounded */
+    double origin, since;    /* a communication point, and the time from it: far from 0 only `since` is
+                                fine enough for the steps */
     double x[PSA_NX];        /* states, SI units */
     double nominal[PSA_NX];  /* usual size of each state; the absolute tolerance is rtol * nominal */
     double rtol;             /* relative tolerance */
@@ -50,12 +52,17 @@ typedef struct {
     double lu_factor_h; /* h * gamma that `lu` was made for */
 } psa_work;
 
-/* Input that is linear in time: u(t) = value + rate * (t - origin). */
+/* Input that is linear in time: u = value + rate * (since - begin), on the solver's clock. */
 typedef struct {
-    double origin;
+    double begin;
     double value[PSA_NU + 1];
     double rate[PSA_NU + 1];
 } psa_input;
+
+/* Where an advance ends: on the solver's clock, and the time that it is called. */
+typedef struct {
+    double since, t;
+} psa_end;
 
 /* Sensitivities of the states with respect to `count` unknowns, carried along (may be NULL). All arrays
    belong to the caller. */
@@ -76,18 +83,20 @@ struct psa_sensitivities {
 /* Who wants to hear of each accepted step (may be NULL): it may change the input from this time on and
    bring the end of the advance nearer. */
 typedef struct {
-    void (*accepted)(void *owner, double *t_end);
+    void (*accepted)(void *owner, psa_end *end);
     void *owner;
 } psa_watch;
 
 void psa_solver_start(psa_solver *solver, double t, const double *x, const double *nominal,
                       double rtol);
+/* Set the clock: the time is t, and `since` counts from it. */
+void psa_solver_move(psa_solver *solver, double t);
 /* Forget the slope: after a change of states or parameters from outside. */
 void psa_solver_invalidate(psa_solver *solver);
-psa_status psa_solver_advance(psa_solver *solver, psa_work *work, double t_end,
+psa_status psa_solver_advance(psa_solver *solver, psa_work *work, psa_end end,
                               const psa_input *input, const double *p, psa_sensitivities *sens,
                               const psa_watch *watch);
-/* The input at time t. */
-void psa_input_at(const psa_input *input, double t, double *u);
+/* The input at a time of the solver's clock. */
+void psa_input_at(const psa_input *input, double since, double *u);
 
 #endif

@@ -22,12 +22,12 @@ static int differentiate(const psa_sensitivities *sens, double t, const double *
 /* A step that the importer ended early stops where it did the first time. */
 typedef struct {
     const psa_solver *solver;
-    double stop;
+    double stop; /* on the clock of the step */
 } psa_repetition;
 
-static void stop_there(void *owner, double *t_end) {
+static void stop_there(void *owner, psa_end *end) {
     const psa_repetition *const repetition = owner;
-    if (repetition->solver->t >= repetition->stop) *t_end = repetition->solver->t;
+    if (repetition->solver->since >= repetition->stop) end->since = repetition->solver->since;
 }
 
 static psa_result refuse(psa_instance *instance) {
@@ -50,13 +50,13 @@ psa_result psa_step_sensitivity(psa_instance *instance, int count, const psa_kno
     double stage[PSA_STAGES * PSA_NX * PSA_DIRECTIONS];
     psa_solver solver = last->solver;
     psa_sensitivities sens = {count, differentiate, directions, moved, slope, stage, base, 0};
-    psa_repetition repetition = {&solver, instance->state.solver.t};
+    psa_repetition repetition = {&solver, instance->state.solver.since};
     const psa_watch watch = {stop_there, &repetition};
     for (int i = 0; i < PSA_NX; ++i)
         for (int c = 0; c < count; ++c) moved[i * count + c] = directions[c].x[i];
     if (last->kind == PSA_NO_STEP) return PSA_FINE;
     if (last->kind != PSA_STEP_KNOWN) return refuse(instance);
-    if (psa_solver_advance(&solver, &instance->work, last->target, &last->input, last->p, &sens, &watch))
+    if (psa_solver_advance(&solver, &instance->work, last->end, &last->input, last->p, &sens, &watch))
         return psa_say(instance, PSA_DISCARD, "The last step cannot be differentiated.");
     return PSA_FINE;
 }

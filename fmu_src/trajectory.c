@@ -1,5 +1,6 @@
 #include "trajectory.h"
 
+#include <math.h>
 #include <string.h>
 
 #include "instants.h"
@@ -52,7 +53,7 @@ static int differentiate(const psa_sensitivities *sens, double t, const double *
 
 static void set_input(const psa_trajectory *run, long sample, psa_input *input) {
     const double span = run->t[sample + 1] - run->t[sample];
-    input->origin = run->t[sample];
+    input->begin = 0.0;
     for (int i = 0; i < PSA_NU; ++i) {
         const double now = run->u[sample * PSA_NU + i], next = run->u[(sample + 1) * PSA_NU + i];
         input->value[i] = now;
@@ -84,22 +85,35 @@ static int start_held(const psa_trajectory *run, psa_solver *solver, psa_held *h
     return sample_at(solver, run->u, held);
 }
 
+static int stopped(const psa_trajectory *run) { return run->stop && *run->stop; }
+
+/* After each step: one that was stopped goes no further. */
+static void end_if_stopped(void *owner, psa_end *end) {
+    if (stopped(owner)) end->since = end->t = -HUGE_VAL;
+}
+
 /* Integrate over one interval between samples; steps end at the instants inside. One at its end is taken
    with the next sample's input, which is the one after a jump where the input is held. */
 static int next_sample(const psa_trajectory *run, psa_solver *solver, psa_work *work, psa_held *held,
                        psa_sensitivities *sens, long sample) {
-    const double end = run->t[sample + 1], period = held->p[PSA_PERIOD];
+    const double begin = run->t[sample], end = run->t[sample + 1], period = held->p[PSA_PERIOD];
+    const psa_end next = {end - begin, end};
     double u[PSA_NU + 1];
     psa_input input;
+    const psa_watch watch = {end_if_stopped, (void *)run};
     set_input(run, sample, &input);
+    psa_solver_move(solver, begin);
     while (PSA_NS > 0 && !psa_reached(held->next, end, period)) {
-        int status = (int)psa_solver_advance(solver, work, held->next, &input, held->p, sens, NULL);
+        const psa_end instant = {held->next - begin, held->next};
+        int status = (int)psa_solver_advance(solver, work, instant, &input, held->p, sens, &watch);
         if (status != PSA_OK) return status;
-        psa_input_at(&input, solver->t, u);
+        if (stopped(run)) return PSA_STOPPED;
+        psa_input_at(&input, solver->since, u);
         status = sample_at(solver, u, held);
         if (status != PSA_OK) return status;
     }
-    const int status = (int)psa_solver_advance(solver, work, end, &input, held->p, sens, NULL);
+    const int status = (int)psa_solver_advance(solver, work, next, &input, held->p, sens, &watch);
+    if (status == PSA_OK && stopped(run)) return PSA_STOPPED;
     if (status != PSA_OK || PSA_NS == 0 || !psa_reached(end, held->next, period)) return status;
     return sample_at(solver, run->u + (sample + 1) * PSA_NU, held);
 }

@@ -32,11 +32,15 @@ typedef struct {
     int output;             /* output whose sensitivity is wanted */
     double *dy;             /* [samples][count] */
     double *work;           /* (PSA_STAGES + 3) * PSA_NX * count */
+    const volatile int *stop; /* NULL, or 0 until another thread ends the run */
     /* results */
     long steps, rejected, evaluations;
     double t_failed;
     int culprit;
 } psa_trajectory;
+
+/* A psa_status, or that the run was stopped. */
+enum { PSA_STOPPED = 4 };
 
 PSA_API int psa_run(psa_trajectory *trajectory);
 

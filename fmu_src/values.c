@@ -9,7 +9,7 @@ psa_result psa_refresh(psa_instance *instance) {
     if (instance->fresh) return PSA_FINE;
     const psa_result result = psa_sample_now(instance);
     if (result != PSA_FINE) return result;
-    psa_input_at(&state->input, state->solver.t, u);
+    psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
         psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y) ||
         psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z))
@@ -44,6 +44,7 @@ static double value_of(const psa_instance *instance, const psa_variable *v) {
     case PSA_OUTPUT: return instance->y[v->index];
     case PSA_INDICATOR: return instance->z[v->index];
     case PSA_SAMPLED: return sampled_value(&instance->state, v->index);
+    case PSA_OPTION: return instance->state.line;
     default: return instance->state.p[v->index];
     }
 }
@@ -82,22 +83,29 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
         !(instance->state.phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)))
         return psa_say(instance, PSA_ERROR,
                        "State '%s' can be set only before the first step.", v->name);
-    if (PSA_NS > 0 && v->kind == PSA_PARAMETER && v->index == PSA_PERIOD && value < v->low)
-        return psa_say(instance, PSA_ERROR, "The sample period '%s' cannot be set to %g, below %g.",
-                       v->name, value, v->low);
-    if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT && v->kind != PSA_PARAMETER)
+    if (v->kind == PSA_OPTION && !(instance->state.phase & (PSA_INSTANTIATED | PSA_INITIALIZATION)))
+        return psa_say(instance, PSA_ERROR, "'%s' can be set only before the first step.", v->name);
+    if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT &&
+        v->kind != PSA_PARAMETER && v->kind != PSA_OPTION)
         return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be set.", v->name);
     if (value < v->low || value > v->high)
-        return psa_say(instance, PSA_WARNING, "'%s' is set to %g, outside its interval [%g, %g].",
-                       v->name, value, v->low, v->high);
+        return psa_say(instance, PSA_ERROR, "'%s' cannot be set to %.9g: it must be at %s %.9g.", v->name,
+                       value, value < v->low ? "least" : "most", value < v->low ? v->low : v->high);
+    if (PSA_NS > 0 && v->kind == PSA_PARAMETER && v->index == PSA_PERIOD &&
+        psa_beyond_counting(instance, instance->state.solver.t, value))
+        return PSA_ERROR;
     return PSA_FINE;
 }
 
 static void set_one(psa_instance *instance, const psa_variable *v, double value) {
     psa_state *const state = &instance->state;
     if (v->kind == PSA_INPUT) {
-        state->input.value[v->index] = value;
+        state->input.value[v->index] = state->given[v->index] = value;
         if (!state->rate_given[v->index]) state->input.rate[v->index] = 0.0;
+        return;
+    }
+    if (v->kind == PSA_OPTION) {
+        state->line = value;
         return;
     }
     if (v->kind == PSA_STATE) state->solver.x[v->index] = value;
@@ -115,10 +123,10 @@ psa_result psa_set(psa_instance *instance, const unsigned *vr, size_t count, con
         const psa_result result = settable(instance, vr[i], value[i]);
         if (result > worst) worst = result;
     }
-    if (worst > PSA_WARNING) return worst;
+    if (worst != PSA_FINE) return worst;
     for (size_t i = 0; i < count; ++i) set_one(instance, &psa_variables[vr[i]], value[i]);
     instance->fresh = 0;
-    return worst;
+    return PSA_FINE;
 }
 
 static int mismatch(psa_instance *instance, const void *vector, size_t count) {
@@ -130,8 +138,9 @@ static int mismatch(psa_instance *instance, const void *vector, size_t count) {
 
 psa_result psa_set_time(psa_instance *instance, double time) {
     if (!isfinite(time)) return psa_say(instance, PSA_ERROR, "The time is not finite.");
-    instance->state.solver.t = time;
-    instance->state.input.origin = time;
+    if (psa_beyond_counting(instance, time, instance->state.p[PSA_PERIOD])) return PSA_ERROR;
+    psa_solver_move(&instance->state.solver, time);
+    instance->state.input.begin = 0.0;
     instance->fresh = 0;
     return PSA_FINE;
 }
@@ -227,7 +236,7 @@ psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size
         return PSA_ERROR;
     const psa_result result = psa_refresh(instance);
     if (result != PSA_FINE) return result;
-    psa_input_at(&state->input, state->solver.t, u);
+    psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, 1.0, instance->xdot,
                               state->input.rate, none, NULL, dy, NULL))
         return psa_say(instance, PSA_DISCARD, "The outputs cannot be differentiated here.");

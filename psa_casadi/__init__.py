@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from psa_casadi.diagnosis.result import Diagnosis
     from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
-    from psa_casadi.errors import InputError, PsaError
+    from psa_casadi.errors import InputError, MachineError, PsaError
     from psa_casadi.export.check.check import CheckReport, check_fmu
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.modelica.package import export_modelica
@@ -55,7 +55,13 @@ if TYPE_CHECKING:
     from psa_casadi.model.system.nanopositioner import nanopositioner
     from psa_casadi.model.system.system import System, connect
     from psa_casadi.model.system.tuning import controller_for, margins_of
-    from psa_casadi.records import Record, read_record, read_records, write_record
+    from psa_casadi.records import (
+        Record,
+        read_record,
+        read_records,
+        record_from,
+        write_record,
+    )
     from psa_casadi.report.page.diagnosis import write_report
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.report.plots.figure import save_figure
@@ -65,7 +71,7 @@ if TYPE_CHECKING:
     from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
     from psa_casadi.simulation.stepper import run
     from psa_casadi.simulation.timings import Timings, timed
-    from psa_casadi.variables import Input, Output, Parameter, State
+    from psa_casadi.variables import Input, Output, Parameter, Publication, State
 
 #: Where each public name lives.
 _HOMES = {
@@ -73,6 +79,7 @@ _HOMES = {
         "Record",
         "read_record",
         "read_records",
+        "record_from",
         "write_record",
     ),
     "psa_casadi.components": (
@@ -129,6 +136,7 @@ _HOMES = {
         "Input",
         "Output",
         "Parameter",
+        "Publication",
         "State",
     ),
     "psa_casadi.model.model_file": (
@@ -167,6 +175,7 @@ _HOMES = {
     ),
     "psa_casadi.errors": (
         "InputError",
+        "MachineError",
         "PsaError",
     ),
 }
@@ -176,6 +185,7 @@ __all__ = [
     "Record",
     "read_record",
     "read_records",
+    "record_from",
     "write_record",
     "BASE",
     "SIMPLIFIED",
@@ -202,6 +212,7 @@ __all__ = [
     "Input",
     "Output",
     "Parameter",
+    "Publication",
     "State",
     "load_model",
     "save_model",
@@ -237,6 +248,7 @@ __all__ = [
     "CheckReport",
     "check_fmu",
     "InputError",
+    "MachineError",
     "PsaError",
     "datasets",
     "__version__",

@@ -4,7 +4,14 @@ from collections.abc import Sequence
 
 
 class PsaError(Exception):
-    """A failure that the package foresees; every error it raises on purpose is one of these."""
+    """A failure that the package foresees; what it raises on purpose is one of these."""
+
+
+class MachineError(Exception):
+    """The machine lacks what the package needs, such as a compiler that works.
+
+    No PsaError, which a search takes for a model that cannot be had: here no model can be.
+    """
 
 
 class InputError(PsaError, ValueError):

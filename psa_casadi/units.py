@@ -118,7 +118,9 @@ UNITS: dict[str, Unit] = {unit.name: unit for unit in _table()}
 _ALIASES = str.maketrans(
     {"\u00b5": "u", "\u03bc": "u", "\u03a9": "Ohm", "\u2126": "Ohm", "°": "deg", "·": "."}
 )
-_FACTOR = re.compile(r"(?P<symbol>1|%|[A-Za-z]+)(?P<exponent>[+-]?\d+)?")
+_FACTOR = re.compile(r"(?P<symbol>1|%|[A-Za-z]+)(?P<exponent>[+-]?[0-9]{1,2})?")
+#: A unit's size in SI base units lies between this and its inverse, so that both are floats.
+_SMALLEST = Fraction(1, 10**150)
 _FORM = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<group>[^/()]+)\)|(?P<one>[^/().]+)))?")
 
 
@@ -157,6 +159,8 @@ def parse_unit(text: str, quantity: str = "") -> Unit:
                 raise InputError(_unknown_symbol(match["symbol"], text, quantity))
             power = sign * int(match["exponent"] or 1)
             ratio *= unit.ratio**power
+            if not _SMALLEST < ratio < 1 / _SMALLEST:
+                raise InputError(_not_a_unit(text))
             counts += power * unit.counts
             exponents = [e + power * own for e, own in zip(exponents, unit.exponents, strict=True)]
     kg, m, s, A, K, mol, cd, rad = exponents
@@ -165,17 +169,17 @@ def parse_unit(text: str, quantity: str = "") -> Unit:
 
 def _not_a_unit(text: str) -> str:
     return (
-        f"'{text}' is not a unit string; write symbols joined by '.', at most one '/', and a "
+        f"'{text[:60]}' is not a unit string; write symbols joined by '.', at most one '/', and a "
         f"denominator of several symbols in parentheses, such as N.s/m or N/(V.s)."
     )
 
 
 def _unknown_symbol(symbol: str, text: str, quantity: str) -> str:
-    within = "" if symbol == text.strip() else f" in '{text}'"
+    within = "" if symbol == text.strip() else f" in '{text[:60]}'"
     by_case = [unit.quantity for unit in UNITS.values() if unit.name.lower() == symbol.lower()]
     listed = units_of(quantity or by_case[0]) if quantity or by_case else tuple(UNITS)
     what = f"units of {quantity or by_case[0]}" if quantity or by_case else "units"
-    return f"the unit '{symbol}'{within} is unknown; {what} that exist: {', '.join(listed)}."
+    return f"the unit '{symbol[:60]}'{within} is unknown; {what} that exist: {', '.join(listed)}."
 
 
 @overload

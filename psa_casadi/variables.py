@@ -1,7 +1,7 @@
 """The words of every model: parameters, states, inputs and outputs, named as FMI names them."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 Values = Mapping[str, float]
 Nominal = float | Callable[[Values], float]
@@ -89,7 +89,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a model's values come from: records, package version, what was free, how sure."""
+    """Where a model's values come from: records, package version, what was free, how sure.
+
+    `interrupted` says that they are those of a search that did not come to its end.
+    """
 
     identified_from: tuple[tuple[str, str], ...] = ()
     package_version: str = ""
@@ -97,6 +100,25 @@ class Provenance:
     intervals: Mapping[str, Interval] = field(default_factory=dict)
     force_scale: str = "assumed"
     notes: tuple[str, ...] = ()
+    interrupted: bool = False
+
+
+@dataclass(frozen=True)
+class Publication:
+    """Who made a model, which version it is, and on what terms it is passed on; "" if not said.
+
+    The terms are those of the model and its values. The C code of an exported model has its own.
+    """
+
+    author: str = ""
+    version: str = ""
+    copyright: str = ""
+    license: str = ""
+
+    @property
+    def stated(self) -> dict[str, str]:
+        """What is said, by the names of the fields."""
+        return {name: text for name, text in asdict(self).items() if text}
 
 
 def nominal_value(nominal: Nominal, values: Values) -> float:

@@ -1,119 +1,167 @@
-"""Stands in for OMSimulator's Python interface (version 2), as far as the recipe uses it.
+"""Stands in for OMSimulator's Python interface (version 3), as far as the recipe uses it.
 
 Wires co-simulation FMUs and steps them side by side with fmpy, inputs held during each step.
 Unknown FMUs, variables and functions are errors, and so are connections of other than an output to
-an input of the same unit.
+an input of the same unit. Of an archive it reads the elements and the connections.
 """
 
 # ruff: noqa: N802 (the functions have the names of that interface)
 
 import shutil
+import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 
+_SSD = "{http://ssp-standard.org/SSP1/SystemStructureDescription}"
 
-class OMSimulator:
-    """The functions that a script calls, under their own names; 0 is success."""
 
-    system_wc = 2
+class CRef:
+    """The name of an element or of a variable: system, element, variable."""
 
-    def __init__(self) -> None:
-        self.parts: dict[str, _Part] = {}
-        self.wires: list[tuple[_Part, str, _Part, str]] = []
-        self.stop, self.step, self.calls = 0.0, 0.0, list[str]()
+    def __init__(self, *names: str) -> None:
+        self.names = names
 
-    def setTempDirectory(self, path: str) -> int:
-        return self._done("setTempDirectory")
 
-    def newModel(self, name: str) -> int:
-        self.model = name
-        return self._done("newModel")
+class SSP:
+    """A system that is wired by hand, or read from an archive."""
 
-    def addSystem(self, name: str, kind: int) -> int:
-        if (name.partition(".")[0], kind) != (self.model, self.system_wc):
-            raise ValueError(f"no system {name} of kind {kind}")
-        self.system = name
-        return self._done("addSystem")
+    def __init__(self, path: str | None = None) -> None:
+        self.resources: dict[str, Path] = {}
+        self.parts: dict[str, Path] = {}
+        self.wires: list[tuple[tuple[str, str], tuple[str, str]]] = []
+        self.system, self.stop = "default", 1.0
+        if path is not None:
+            self._read(Path(path))
 
-    def addSubModel(self, name: str, path: str) -> int:
-        system, _, part = name.rpartition(".")
+    def addResource(self, filename: str, new_name: str) -> None:
+        if not Path(filename).is_file():
+            raise ValueError(f"no file {filename}")
+        self.resources[new_name] = Path(filename)
+
+    def addComponent(self, cref: CRef, resource: str) -> None:
+        system, part = cref.names
         if system != self.system:
             raise ValueError(f"no system {system}")
-        self.parts[part] = _Part(Path(path))
-        return self._done("addSubModel")
+        self.parts[part] = self.resources[resource]
 
-    def addConnection(self, source: str, target: str) -> int:
-        (one, out), (other, into) = self._variable(source), self._variable(target)
-        left, right = one.variables[out], other.variables[into]
-        if (left.causality, right.causality) != ("output", "input") or left.unit != right.unit:
-            raise ValueError(f"{source} [{left.unit}] cannot drive {target} [{right.unit}]")
-        self.wires.append((one, out, other, into))
-        return self._done("addConnection")
+    def addConnection(self, source: CRef, target: CRef) -> None:
+        self.wires.append((self._port(source), self._port(target)))
 
-    def setResultFile(self, model: str, path: str) -> int:
-        return self._done("setResultFile")
+    def instantiate(self) -> "Model":
+        return Model(self)
 
-    def setStopTime(self, model: str, time: float) -> int:
-        self.stop = time
-        return self._done("setStopTime")
+    def _port(self, cref: CRef) -> tuple[str, str]:
+        system, part, variable = cref.names
+        if system != self.system or part not in self.parts:
+            raise ValueError(f"no element {system}.{part}")
+        return part, variable
 
-    def setFixedStepSize(self, system: str, step: float) -> int:
-        self.step = step
-        return self._done("setFixedStepSize")
+    def _read(self, path: Path) -> None:
+        folder = Path(tempfile.mkdtemp())
+        with zipfile.ZipFile(path) as archive:
+            archive.extractall(folder)
+        root = ET.parse(folder / "SystemStructure.ssd").getroot()
+        system = root.find(f"{_SSD}System")
+        experiment = root.find(f"{_SSD}DefaultExperiment")
+        if system is None or experiment is None:
+            raise ValueError(f"{path} has no system or no experiment")
+        self.system, self.stop = system.attrib["name"], float(experiment.attrib["stopTime"])
+        for element in system.iter(f"{_SSD}Component"):
+            self.parts[element.attrib["name"]] = folder / element.attrib["source"]
+        for wire in system.iter(f"{_SSD}Connection"):
+            ends = [(wire.get(f"{s}Element", ""), wire.attrib[f"{s}Connector"])
+                    for s in ("start", "end")]  # fmt: skip
+            self.wires.append((ends[0], ends[1]))
 
-    def instantiate(self, model: str) -> int:
+
+class Model:
+    """An instantiated system; what was called, in order, is in `calls`."""
+
+    def __init__(self, system: SSP) -> None:
+        self.system, self.stop, self.step = system.system, system.stop, 1e-3
+        self.parts = {name: _Part(path) for name, path in system.parts.items()}
+        self.outside: dict[str, float] = {}
+        self.calls: list[str] = []
+        for start, end in system.wires:
+            self._check(start, end)
+        self.wires = system.wires
         for part in self.parts.values():
             part.slave.instantiate()
-            part.slave.setupExperiment(tolerance=1e-6, startTime=0.0, stopTime=self.stop)
-        return self._done("instantiate")
 
-    def setReal(self, name: str, value: float) -> int:
-        part, variable = self._variable(name)
-        part.slave.setReal([part.variables[variable].valueReference], [value])
-        return self._done("setReal")
+    def setResultFile(self, path: str) -> None:
+        self.calls.append("setResultFile")
 
-    def getReal(self, name: str) -> tuple[float, int]:
-        part, variable = self._variable(name)
-        return part.get(variable), self._done("getReal")
+    def setStopTime(self, time: float) -> None:
+        self.stop = time
+        self.calls.append("setStopTime")
 
-    def initialize(self, model: str) -> int:
+    def setFixedStepSize(self, step: float) -> None:
+        self.step = step
+        self.calls.append("setFixedStepSize")
+
+    def setValue(self, cref: CRef, value: float) -> None:
+        system, *where, name = cref.names
+        if system != self.system:
+            raise ValueError(f"no system {system}")
+        if where:
+            self.parts[where[0]].set(name, value)
+        elif ("", name) in (start for start, _ in self.wires):
+            self.outside[name] = value
+        else:
+            raise ValueError(f"the system has no input {name}")
+        self.calls.append("setValue")
+
+    def getValue(self, cref: CRef) -> float:
+        _, part, name = cref.names
+        return self.parts[part].get(name)
+
+    def initialize(self) -> None:
         for part in self.parts.values():
+            part.slave.setupExperiment(tolerance=1e-6, startTime=0.0, stopTime=self.stop)
             part.slave.enterInitializationMode()
+        self._exchange()
+        for part in self.parts.values():
             part.slave.exitInitializationMode()
-        return self._done("initialize")
+        self.calls.append("initialize")
 
-    def simulate(self, model: str) -> int:
+    def simulate(self) -> None:
         for k in range(round(self.stop / self.step)):
-            values = [one.get(out) for one, out, _, _ in self.wires]
-            for (_, _, other, into), value in zip(self.wires, values, strict=True):
-                other.slave.setReal([other.variables[into].valueReference], [value])
+            self._exchange()
             for part in self.parts.values():
                 part.slave.doStep(k * self.step, self.step)
-        return self._done("simulate")
+        self.calls.append("simulate")
 
-    def terminate(self, model: str) -> int:
+    def terminate(self) -> None:
         for part in self.parts.values():
             part.slave.terminate()
-        return self._done("terminate")
+        self.calls.append("terminate")
 
-    def delete(self, model: str) -> int:
+    def delete(self) -> None:
         for part in self.parts.values():
             part.slave.freeInstance()
             shutil.rmtree(part.unpacked)
-        return self._done("delete")
+        self.calls.append("delete")
 
-    def _done(self, name: str) -> int:
-        self.calls.append(name)
-        return 0
+    def _exchange(self) -> None:
+        values = [
+            self.parts[part].get(name) if part else self.outside.get(name)
+            for (part, name), _ in self.wires
+        ]
+        for (_, (part, name)), value in zip(self.wires, values, strict=True):
+            if part and value is not None:
+                self.parts[part].set(name, value)
 
-    def _variable(self, name: str) -> "tuple[_Part, str]":
-        system, part, variable = name.rsplit(".", 2)
-        if system != self.system or variable not in self.parts[part].variables:
-            raise ValueError(f"no variable {name}")
-        return self.parts[part], variable
+    def _check(self, start: tuple[str, str], end: tuple[str, str]) -> None:
+        ends = [self.parts[part].variables[name] for part, name in (start, end) if part]
+        kinds = [v.causality for v in ends]
+        wanted = [k for (part, _), k in ((start, "output"), (end, "input")) if part]
+        if kinds != wanted or len({v.unit for v in ends}) > 1:
+            raise ValueError(f"{start} cannot drive {end}")
 
 
 class _Part:
@@ -128,3 +176,6 @@ class _Part:
 
     def get(self, name: str) -> float:
         return float(self.slave.getReal([self.variables[name].valueReference])[0])
+
+    def set(self, name: str, value: float) -> None:
+        self.slave.setReal([self.variables[name].valueReference], [value])

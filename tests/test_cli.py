@@ -227,6 +227,10 @@ def test_export_leaves_the_sensor_out_unless_asked(
     assert "sensor_delay" in [v.name for v in fmpy.read_model_description(str(fmu)).modelVariables]
 
 
+def test_a_short_option_asks_for_help() -> None:
+    assert "Usage: psa diagnose" in " ".join(done("diagnose", "-h").stdout.split())
+
+
 def test_effects_are_listed_and_shown() -> None:
     listed = done("effects").stdout
     for name, effect in EFFECTS.items():
@@ -236,6 +240,7 @@ def test_effects_are_listed_and_shown() -> None:
     shown = done("effects", "slow-creep").stdout
     assert "equation" in shown
     assert "Croft, Shed and Devasia" in " ".join(shown.split())
+    assert "4 further resonances" in done("effects", "modal_series_4").stdout
 
 
 def test_an_identification_tells_its_warnings(demo: Demo) -> None:

@@ -134,6 +134,10 @@ def test_mistakes_are_told_together(tmp_path: Path) -> None:
     bad.write_text("time [s],displacement [um]\n0,0\n1,x\n", encoding="utf-8")
     with pytest.raises(psa.InputError, match="'x'"):
         read_target(bad)
+    rows = "".join(f"{k},{k}\n" for k in range(20))
+    bad.write_text(f"time [s],displacement [counts]\n{rows}", encoding="utf-8")
+    with pytest.raises(psa.InputError, match="line 1: the displacement is in counts of a sensor"):
+        read_target(bad)
     with pytest.raises(psa.InputError, match="not below"):
         AmplifierLimits(5.0, 1.0)
     with pytest.raises(psa.InputError, match="both limits"):

@@ -65,7 +65,7 @@ def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray
 
 
 def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
-    with pytest.raises(InputError, match="m per volt, more than piezoelectric stacks do"):
+    with pytest.raises(InputError, match="m, more than a stack with any sensor: its unit"):
         diagnose([Record("r", TIME, VOLTAGE, 1e6 * shown)], effects=TABLE)
 
 
@@ -90,10 +90,10 @@ def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: Float
     rest = np.full(TIME.size, 1e-6)
     with pytest.raises(InputError, match="The voltage is 40 V throughout"):
         diagnose([Record("r", TIME, np.full(TIME.size, 40.0), shown)], effects=TABLE)
-    with pytest.raises(InputError, match="But for stuck readings, the displacement is one value"):
+    with pytest.raises(InputError, match="The displacement is 1e-06 m throughout: the sensor"):
         diagnose([Record("r", TIME, VOLTAGE, rest)], effects=TABLE)
     bit: FloatArray = np.where(shown > np.mean(shown), 1e-5, 0.0)
-    with pytest.raises(InputError, match="But for stuck readings, the displacement is one value"):
+    with pytest.raises(InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
         diagnose([Record("r", TIME, VOLTAGE, bit)], effects=TABLE)
 
 

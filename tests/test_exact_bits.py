@@ -6,28 +6,31 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.simulation.compiler import vector_flags
+from psa_casadi.simulation.compiler import vector_flags, zig_command
 from psa_casadi.simulation.exact import run as exact
 from psa_casadi.simulation.start import start_on
+from tests.c_host.build import tool
 from tests.exact_cases import composite, inputs, times, with_effect
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
 LANES = (1, 4)
 
 
+def _clear() -> None:
+    """Forget the libraries that are loaded."""
+    exact._compiled.cache_clear()
+    exact._library.cache_clear()
+
+
 @pytest.fixture
 def _plain_vectors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Compile without this processor's vectors, in libraries of their own."""
-
-    def clear() -> None:
-        exact._compiled.cache_clear()
-        exact._library.cache_clear()
-
-    clear()
+    _clear()
     monkeypatch.setattr(exact, "vector_flags", lambda: ())
     yield
-    clear()
+    _clear()
 
 
 def results(name: str) -> list[FloatArray]:
@@ -59,3 +62,19 @@ def test_two_runs_have_the_same_bits() -> None:
     for ours, theirs in zip(first, second, strict=True):
         np.testing.assert_array_equal(ours, theirs)
         assert np.isfinite(ours).all()
+
+
+@slow
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_every_compiler_gives_the_same_bits(
+    compiler: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """Where `ziglang` is not installed, the system's compiler takes its place."""
+    request.addfinalizer(_clear)
+    found = []
+    for command in ([tool(compiler)], zig_command()):
+        _clear()
+        monkeypatch.setenv("CC", " ".join(command))
+        found.append(results("backlash"))
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_array_equal(ours, theirs)

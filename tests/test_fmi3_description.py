@@ -38,7 +38,7 @@ def test_variables(name: str) -> None:
     for v in variables:
         if v.attrib["name"].startswith("der("):
             assert v.attrib["name"] == f"der({by_reference[int(v.attrib['derivative'])]})"
-        between = v.attrib["name"] in model_named(name).parameter_names
+        between = v.attrib["name"] in (*model_named(name).parameter_names, "input_line")
         between = between or v.attrib["name"].startswith("switch.")
         assert ("intermediateUpdate" in v.attrib) == (not between and v is not variables[0])
         assert ("initial" in v.attrib) == (v.attrib["causality"] not in ("input", "independent"))

@@ -9,6 +9,7 @@ import pytest
 
 from psa_casadi.export.check.agreement import has_reference
 from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate
 from psa_casadi.reference import from_samples, simulate
@@ -143,3 +144,11 @@ def test_tolerance_is_the_accuracy() -> None:
             errors.append(np.max(np.abs(found - truth)) / np.ptp(truth))
             assert errors[-1] < 5.0 * tolerance
     assert errors[-1] < 1e-3 * errors[0]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_nominal_values_of_parameters_are_within_their_bounds(name: str) -> None:
+    for v in variable_table(model_named(name)):
+        if v.kind == "parameter" and v.bounds and v.bounds[1] > 0.0:
+            assert v.nominal is not None
+            assert v.bounds[0] <= v.nominal <= v.bounds[1], v

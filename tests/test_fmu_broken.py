@@ -100,7 +100,7 @@ CORE = {
     ),
     "state shared by instances": (
         "instance.c",
-        "const psa_status status = psa_solver_advance(",
+        "const psa_status status =\n            psa_solver_advance(",
         "static double shared; shared += 1.0; solver->x[0] += 1e-6 * shared;"
         " const psa_status status = psa_solver_advance(",
         {"life cycle", "independent instances", "snapshots"},
@@ -137,8 +137,8 @@ CORE = {
     ),
     "a step beside the communication point": (
         "instance.c",
-        "target = point + size;",
-        "target = point + 0.999 * size;",
+        "{size + (point - now), point + size};",
+        "{0.999 * size + (point - now), point + size};",
         {"co-simulation, step 0.01 s"},
     ),
 }
@@ -238,6 +238,14 @@ def test_sources_and_model_that_are_not_those_of_the_binary(fmi: int, tmp_path: 
     report = check_fmu(rewritten(exported(STACK, fmi), path, changed))
     assert set(_failures(report)) == {"model inside"}
     assert not report.compared
+
+
+@slow
+def test_a_folder_in_place_of_a_source(tmp_path: Path) -> None:
+    path, name = tmp_path / "b.fmu", "sources/solver.c"
+    files = {f"{n}/x" if n == name else n: c for n, c in entries(STACK, 2).items()}
+    write_archive(path, files)
+    assert set(_failures(check_fmu(path))) == {ALWAYS}
 
 
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))

@@ -13,9 +13,10 @@ import lief
 import numpy as np
 import pytest
 
+from psa_casadi.cache import cache_directory
 from psa_casadi.export.fmu.platforms import PLATFORMS
 from psa_casadi.export.fmu.sources import STRICT
-from psa_casadi.simulation.compiler import cache_directory, run_compiler, zig_command
+from psa_casadi.simulation.compiler import run_compiler, zig_command
 from tests.c_host.build import (
     HEADERS,
     IDENTIFIER,

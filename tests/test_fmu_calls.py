@@ -14,7 +14,6 @@ from psa_casadi.export.importer.fmu import (
     ERROR,
     MODEL_EXCHANGE,
     OK,
-    WARNING,
     Fmu,
     FmuError,
     Instance,
@@ -28,11 +27,6 @@ STACK = "P-885.51"
 def slave() -> Iterator[Instance]:
     with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION) as instance:
         yield instance
-
-
-def _set(instance: Instance, name: str, value: float) -> int:
-    one, number = ctypes.c_size_t(1), (ctypes.c_double * 1)(value)
-    return instance.call("SetReal", instance.references([name]), one, number)
 
 
 def test_refusal_names_call_and_state(slave: Instance) -> None:
@@ -63,12 +57,6 @@ def test_failed_step_names_state_and_time_and_can_be_undone(slave: Instance) -> 
     assert 0.0 < slave.get(["displacement"])[0] < 20e-6
     slave.drop(snapshot)
     assert snapshot.value is None
-
-
-def test_parameter_out_of_bounds_is_taken_with_a_warning(slave: Instance) -> None:
-    assert _set(slave, "tau", 5.0) == WARNING
-    assert "'tau' is set to 5, outside its interval" in slave.messages[-1]
-    assert slave.get(["tau"])[0] == 5.0
 
 
 def test_values_are_set_all_or_none(slave: Instance) -> None:

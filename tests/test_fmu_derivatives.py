@@ -46,13 +46,19 @@ def _point(name: str) -> dict[str, float]:
     point = {}
     for v in variable_table(model_named(name).plant()):
         if v.kind == "parameter":
-            point[v.name] = float(v.start or 0.0)
+            point[v.name] = _inside(float(v.start or 0.0), *(v.bounds or (-math.inf, math.inf)))
         elif v.kind in ("state", "input"):
             point[v.name] = float(v.nominal or 1.0) * random.uniform(0.3, 0.6)
     # the voltage rises; the hysteresis force grows from where it is, without passing zero
     point["u"] = 0.5 * point["voltage"]
     point["f_H"] = math.copysign(point["f_H"], point["A"])
     return point
+
+
+def _inside(value: float, low: float, high: float) -> float:
+    """Return a value that differences, of up to 2 %, do not take out of its bounds."""
+    room = 0.02 * abs(value)
+    return min(max(value, low + room), high - room)
 
 
 def _scales(names: Sequence[str], name: str) -> FloatArray:

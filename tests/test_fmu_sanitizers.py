@@ -79,7 +79,7 @@ FAULTS = {
     ),
     "memory that threads share": (
         "threads", "ThreadSanitizer: data race",
-        "log.c", "    char sentence[512];", "    static char sentence[512];",
+        "log.c", "    char sentence[PSA_SENTENCE];", "    static char sentence[PSA_SENTENCE];",
     ),
     "an allocation in a step": (
         "counted", "allocations == made",

@@ -27,6 +27,8 @@ SEED = 1
 LAGS = {"drive_lag", "sensor_lag", "sensor_delay"}
 #: Share of the noise below which nothing of an effect is left beside the base.
 HARDLY = 0.1
+#: Foreign causes that take most of a minute each: the benchmark `diagnose` has them.
+LONG = {"guide_stiffness", "range_switch", "source_power"}
 #: Fresh records in every run.
 FRESH = 4
 
@@ -93,7 +95,7 @@ def test_three_causes_are_found_where_one_by_one_ends_with_two(tmp_path: Path) -
 
 
 @slow
-@pytest.mark.parametrize("effect", sorted(FOREIGN))
+@pytest.mark.parametrize("effect", sorted(set(FOREIGN) - LONG))
 def test_a_cause_that_is_not_in_the_table_is_not_named_alone(effect: str, tmp_path: Path) -> None:
     found, _ = diagnose(effect, SEED, tmp_path)
     if effect == "dry_friction" and found.causes:

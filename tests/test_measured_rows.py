@@ -1,4 +1,4 @@
-"""README's rows on the measured micromanipulator are what a diagnosis says of it."""
+"""The rows of docs/measured.md on the measured micromanipulator are what a diagnosis says of it."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.records import read_record
 
-README = Path(__file__).parent.parent / "README.md"
+PAGE = Path(__file__).parent.parent / "docs" / "measured.md"
 JUDGED = "`minor_loops.csv`, judged on `sine_1hz.csv` (`--holdout`)"
 FILES = {"`sine_1hz.csv`": ("sine_1hz",), "`minor_loops.csv`": ("minor_loops",),
          "both files": ("sine_1hz", "minor_loops"), JUDGED: ("minor_loops",)}  # fmt: skip
@@ -18,7 +18,7 @@ HELD_OUT = {JUDGED: ("sine_1hz",)}
 
 def rows() -> dict[str, list[str]]:
     """Cells of the table under `psa diagnose` on, by their first one."""
-    table = README.read_text(encoding="utf-8").split("| `psa diagnose` on |")[1].split("\n\n")[0]
+    table = PAGE.read_text(encoding="utf-8").split("| `psa diagnose` on |")[1].split("\n\n")[0]
     cells = [[c.strip() for c in line.strip("|").split("|")] for line in table.split("\n")[2:]]
     return {row[0]: row[1:] for row in cells}
 

@@ -188,7 +188,7 @@ def test_each_mistake_in_a_file_is_named() -> None:
         "its format is 'x/2', expected 'psa_casadi.model/1'": lambda c: c.update(format="x/2"),
         "'components' is missing": lambda c: c.pop("components"),
         "unknown name 'engine' in components": lambda c: c["components"].append("engine"),
-        "unknown name '[1]' in effects": lambda c: c["effects"].append([1]),
+        "unknown name [1] in effects": lambda c: c["effects"].append([1]),
         "unknown name 'slow_creep' in components": lambda c: c["components"].append("slow_creep"),
         "Two components declare 'k_L'": lambda c: c["components"].append("linear_force"),
         "'parameters' is missing": lambda c: c.pop(parameters),
@@ -199,7 +199,7 @@ def test_each_mistake_in_a_file_is_named() -> None:
             unit="ms"
         ),
         "'n' is 17 1, outside its bounds": lambda c: c[parameters]["n"].update(value=17),
-        "'n' is nan": lambda c: c[parameters]["n"].update(value=float("nan")),
+        "NaN is no number": lambda c: c[parameters]["n"].update(value=float("nan")),
         "unknown parameters ['warp']": lambda c: c[parameters].update(warp={"value": 1}),
         "interval of 'n' is [1]": lambda c: c[parameters]["n"].update(interval=[1]),
         "'identified_from' must list": lambda c: c.update(identified_from=[{"record": "a"}]),

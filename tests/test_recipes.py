@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import shutil
+import subprocess
 import sys
 import types
 from dataclasses import replace
@@ -19,9 +21,11 @@ from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi.examples.index import Example, Script, examples
+from psa_casadi.model.system.nanopositioner import nanopositioner
+from psa_casadi.simulation.history import settled_at
 from tests.modelica_runs import load
 from tests.modelica_stub import STUB
-from tests.oms_stand_in import OMSimulator
+from tests.oms_stand_in import SSP, CRef
 from tests.recipe_commands import run_command
 from tests.script_calls import calls_of
 from tests.tiers import slow
@@ -154,22 +158,45 @@ def test_the_matlab_script() -> None:
 
 @slow
 @pytest.mark.parametrize("made", ["omsimulator"], indirect=True)
-def test_the_script_for_omsimulator_pushes_the_stage(
+def test_the_scripts_for_omsimulator_push_and_move_the_stage(
     made: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """On a stand-in that wires and steps the FMUs; the end is where scipy says."""
+    """On a stand-in that wires and steps the FMUs; the ends are where scipy and the model say."""
     module = types.ModuleType("OMSimulator")
-    module.OMSimulator = OMSimulator  # type: ignore[attr-defined]
+    module.SSP, module.CRef = SSP, CRef  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "OMSimulator", module)
     text = _script("omsimulator", "push_the_stage.py").text
     exec(compile(text, "push_the_stage.py", "exec"), space := dict[str, Any]())
     assert float(capsys.readouterr().out) == pytest.approx(_pushed(100.0, 2e-3), rel=1e-3)
-    assert space["oms"].calls[-2:] == ["terminate", "delete"]
+    assert space["model"].calls[-2:] == ["terminate", "delete"]
     with pytest.raises(ValueError, match="cannot drive"):
-        exec(compile(text.replace("stack.velocity", "stack.current"), "wrong", "exec"), {})
+        exec(compile(text.replace('"velocity"', '"current"'), "wrong", "exec"), {})
+    text = _script("omsimulator", "move_the_stage.py").text
+    exec(compile(text, "move_the_stage.py", "exec"), space := dict[str, Any]())
+    model = nanopositioner("P-885.51").model()
+    times = np.linspace(0.0, space["model"].stop, 201)
+    moved = psa.run(model, times, np.full((201, 1), 5e-6), np.zeros(len(model.state_names)))
+    expected = moved.y[-1, model.output_names.index("stage_position")]
+    assert float(capsys.readouterr().out) == pytest.approx(expected, rel=2e-3)
     files = re.findall(r"\S+\.(?:fmu|ssp)\b", _script("omsimulator", "run_omsimulator.sh").text)
-    assert files == ["stack.fmu", "nanopositioner.ssp"]
+    assert files == ["held.fmu", "held.fmu", "nanopositioner.ssp"]
     assert all((made / name).is_file() for name in files)
+
+
+@slow
+@pytest.mark.skipif(shutil.which("OMSimulator") is None, reason="OMSimulator is not installed")
+@pytest.mark.parametrize("made", ["omsimulator"], indirect=True)
+def test_the_shell_commands_of_omsimulator(made: Path) -> None:
+    """A stack that is held at 60 V stays there, a closed loop rests."""
+    for line in _script("omsimulator", "run_omsimulator.sh").text.splitlines():
+        subprocess.run(shlex.split(line), cwd=made, check=True, timeout=120)
+    held = settled_at(psa.stack_model("P-885.51"), 60.0, [120.0, 0.0])
+    expected = psa.simulate(held, [0.0, 1e-3], [60.0, 60.0]).displacement[-1]
+    for name in ("held.csv", "held_cs.csv"):
+        found = np.genfromtxt(made / name, delimiter=",", names=True)["displacement"]
+        assert found == pytest.approx(expected, rel=1e-9)
+    rows = np.loadtxt(made / "nanopositioner.csv", delimiter=",", skiprows=1)
+    assert rows[-1, 0] == pytest.approx(0.01)
 
 
 def _pushed(voltage: float, end: float) -> float:

@@ -4,6 +4,7 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record, read_records
+from psa_casadi.records.read import file_bytes
 from tests.record_files import HEADER, ROWS, write
 
 
@@ -30,6 +31,11 @@ def with_row(row: int, text: str) -> list[str]:
         ("time [V],voltage [V],displacement [um]", r"'time': the unit 'V' does not measure time"),
         ("time [s],voltage [V],displacement [V]", r"not measure length; .* um, nm, pm, counts\."),
         (f"{HEADER},Voltage [mV]", r"column 4: 'voltage' stands twice .*\(first as column 2\)"),
+        (
+            f"time [s],voltage [V],displacement [um{'9' * 500}]",
+            r"line 1, column 'displacement': 'um9{58}' is not a unit string; write symbols",
+        ),
+        ("time [s],voltage [kV99],displacement [um]", r"'voltage': .*kV99' is not a unit string"),
         ("0,1,2", r"line 1: found '0,1,2', expected a header; write .*'time \[s\],voltage \[V\]"),
     ],
 )
@@ -52,6 +58,7 @@ def test_mistakes_of_the_header(tmp_path: Path, header: str, expected: str) -> N
         ("nan,1,1", "line 6, column 'time': found no value, expected a number"),
         ("0.004,inf,1", "line 6, column 'voltage': found inf, expected a finite number"),
         ("0.004,1,-inf", "line 6, column 'displacement': found -inf, expected a finite number"),
+        ("0.004,1e101,1", "line 6, column 'voltage': found 1e+101, expected a measured number"),
         ("0.003,1,1", "line 6, column 'time': time stands still (from 0.003 in line 5 to 0.003)"),
         ("0.002,1,1", "line 6, column 'time': time goes back (from 0.003 in line 5 to 0.002)"),
         ("0.004,1", "line 6: found 2 cells, expected 3 as in the header"),
@@ -64,6 +71,14 @@ def test_mistakes_of_a_row(tmp_path: Path, row: str, expected: str) -> None:
     assert expected in problems[0]
     assert problems[0].endswith(".")
     assert ";" in problems[0]
+
+
+def test_a_quote_that_never_ends_is_told_as_a_mistake(tmp_path: Path) -> None:
+    rows = with_row(4, '0.004,"' + "9" * 200_000 + ",1")
+    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
+    assert "line 6, column 'voltage': found '\"999" in problem
+    header = f'{HEADER},"{"x" * 200_000}'
+    assert read_record(write(tmp_path / "b.csv", header, *(f"{row},1" for row in ROWS))).n == 20
 
 
 def test_one_file_has_one_decimal_sign(tmp_path: Path) -> None:
@@ -130,6 +145,22 @@ def test_too_few_samples_and_no_displacement_are_refused(tmp_path: Path) -> None
     assert "column 'displacement': found no valid values in 20 rows" in problem
 
 
+def test_instants_that_are_one_in_seconds_are_refused(tmp_path: Path) -> None:
+    rows = [f"{k}e-323,{k},{k}" for k in range(1, 21)]
+    assert read_record(write(tmp_path / "a.csv", HEADER, *rows)).n == 20
+    header = HEADER.replace("[s]", "[ms]")
+    (problem,) = problems_of(write(tmp_path / "b.csv", header, *rows))
+    assert "instants are the same in seconds" in problem
+
+
+def test_lines_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "a.csv", HEADER, *ROWS, *[""] * 1000)
+    assert read_record(path).n == 20
+    monkeypatch.setattr(file_bytes, "MOST_BYTES", 10_000)
+    (problem,) = problems_of(path)
+    assert "its lines need more than" in problem
+
+
 def test_a_constant_voltage_is_refused_only_for_a_fit(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv", HEADER, *(f"{k},3.5,{k}" for k in range(20)))
     assert read_record(path).n == 20
@@ -141,14 +172,14 @@ def test_files_that_are_no_csv_are_named_with_the_reason(tmp_path: Path) -> None
     (tmp_path / "empty.csv").write_text("\n \n")
     (tmp_path / "comments.csv").write_text("# only\n# comments\n")
     (tmp_path / "binary.csv").write_bytes(b"PK\x03\x04\x00\x00\x08")
-    (tmp_path / "wide.csv").write_bytes("time [s]".encode("utf-16"))
+    (tmp_path / "wide.csv").write_bytes("time [s]".encode("utf-16")[:-1])
     reasons = {
         "absent.csv": "there is no such file; check the name",
         "": "is a directory; name the CSV files in it",
         "empty.csv": "the file is empty",
         "comments.csv": "holds no header and no data",
         "binary.csv": "is not text but a binary file",
-        "wide.csv": "is UTF-16 text, expected UTF-8",
+        "wide.csv": "begins as UTF-16 text and is none",
     }
     for name, reason in reasons.items():
         (problem,) = problems_of(tmp_path / name)

@@ -14,6 +14,7 @@ from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wi
 from psa_casadi.export.ssp.layout import OUTSIDE, Port
 from psa_casadi.export.ssp.parameters import shared_parameters
 from psa_casadi.export.ssp.read_archive import SspArchive
+from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.model.system.system import System
 from tests.fmu_models import assert_valid, model_named
@@ -47,7 +48,7 @@ def test_every_file_follows_its_schema_and_names_what_the_fmus_have(name: str) -
                 assert known[connector.name].causality == connector.kind
         for part, values in archive.parameters.items():
             assert {n: known_start(archive, part, n) for n in values} == values
-            assert set(values) == set(archive.fmus[part].names("parameter"))
+            assert {*values, "input_line"} == {*archive.fmus[part].names("parameter"), "input_line"}
 
 
 def known_start(archive: SspArchive, part: str, name: str) -> float:
@@ -158,3 +159,34 @@ def test_a_system_that_cannot_be_wired_is_refused_before_anything_is_compiled(
     with pytest.raises(InputError, match="load_force"):
         export_ssp(wrong, tmp_path / "wrong.ssp")
     assert not (tmp_path / "wrong.ssp").exists()
+
+
+@pytest.mark.parametrize("name", ["pushed_stage", "closed_loop"])
+def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
+    """As its importer reads it: this annotation, by these prefixes, and no canvas.
+
+    OMSimulator 3.0.0.post114 ended with "Unable to add System" without the one, and with "wrong
+    xml schema detected" at the other.
+    """
+    text = texts(archive_of(name))["SystemStructure.ssd"]
+    assert "SystemGeometry" not in text
+    found = re.search(
+        r'<ssd:Annotations>\s*<ssc:Annotation type="org.openmodelica">\s*<oms:Annotations>\s*'
+        r'<oms:SimulationInformation>\s*<oms:FixedStepMaster description="oms-ma"'
+        r' stepSize="(0\.\d+)" relativeTolerance="(0\.\d+)" />',
+        text,
+    )
+    assert found is not None
+    root = etree.fromstring(text.encode())
+    assert root.nsmap["oms"].endswith("/OMSimulator/master/schema/oms.xsd")
+    assert [c.tag.partition("}")[2] for c in root[0]][-2:] == ["Connections", "Annotations"]
+    wiring = wiring_of(pushed_stage() if name == "pushed_stage" else closed_loop())
+    step = float(found[1])
+    assert 0.0 < step <= 0.05 * stable_step(wiring, rates=False)
+    assert step <= 1e-3 * float(root.find("{*}DefaultExperiment").get("stopTime"))
+    assert f"{step:.0e}"[0] in "125"
+    results = re.search(
+        r'<oms:SimulationInformation resultFile="(\w+)\.csv" loggingInterval="', text
+    )
+    assert results is not None
+    assert results[1] == wiring.name

@@ -96,7 +96,7 @@ def test_a_kick_of_the_load_is_not_suspect() -> None:
 @pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
 def test_the_measured_records_have_no_suspects(measured_data: object, file: str) -> None:
     found = suspects(read_record(f"{measured_data}/micromanipulator/{file}.csv"))
-    assert found.counts == {"outlier": 0, "drop-out": 0, "stuck": 0}
+    assert found.counts == {"outlier": 0, "drop-out": 0, "stuck": 0, "saturated": 0}
     assert found.quantum is None
     assert found.sentences(file) == ()
 
@@ -132,7 +132,7 @@ def test_drop_outs_are_found(value: float, length: int) -> None:
     found = suspects(replace(base, displacement=y))
     assert len(starts) >= 4
     np.testing.assert_array_equal(found.mask, lost)
-    assert found.counts == {"outlier": 0, "drop-out": lost.sum(), "stuck": 0}
+    assert found.counts == {"outlier": 0, "drop-out": lost.sum(), "stuck": 0, "saturated": 0}
     (sentence,) = found.sentences("a.csv")
     assert sentence.startswith(f"a.csv: {lost.sum()} samples belong to drop-outs")
 

@@ -1,5 +1,5 @@
 """`python -m psa_casadi.cli` is the command `psa`."""
 
-from psa_casadi.cli.app import main
+from psa_casadi.cli import main
 
 main()

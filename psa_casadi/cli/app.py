@@ -1,5 +1,6 @@
 """The table of subcommands."""
 
+import sys
 from typing import Annotated
 
 import typer
@@ -20,6 +21,7 @@ from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
+from psa_casadi.cli.surroundings import prepare
 from psa_casadi.version import __version__
 
 app = typer.Typer(
@@ -28,7 +30,7 @@ app = typer.Typer(
     epilog="Start with: psa demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 export = typer.Typer(help="Write a model in a format that other tools read.", no_args_is_help=True)
 design = typer.Typer(
@@ -93,4 +95,8 @@ app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(
 
 def main() -> None:
     """Run the command line."""
-    app(prog_name="psa")
+    prepare()
+    try:
+        guarded(app)(prog_name="psa")
+    except typer.Exit as end:  # of what fails outside the commands, such as writing the help
+        sys.exit(end.exit_code)

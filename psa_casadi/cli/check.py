@@ -21,9 +21,24 @@ def check(
         typer.Option(help="MODEL.json to compare with; by default the one that the FMU carries."),
     ] = None,
     effects: EffectsOption = None,
+    timeout: Annotated[
+        float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
+    ] = 300.0,
+    memory: Annotated[
+        int,
+        typer.Option(
+            help="Memory that the FMU's code may take [MiB]; limited on Linux only.", min=64
+        ),
+    ] = 4096,
     quiet: Quiet = False,
 ) -> None:
-    """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails."""
+    """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
+
+    This RUNS THE CODE of the FMU, as every simulation with it does. A process
+    of its own, with limits of time and memory, keeps its faults from the table.
+    It is no sandbox: the code can read and write your files and use the
+    network. Check an FMU that you do not trust in a container.
+    """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.check.check import check_fmu
     from psa_casadi.model.model_file import load_model
@@ -37,7 +52,7 @@ def check(
     chosen = None if model is None else given.attempt(lambda: load_model(model, given.effects))
     given.check()
     with working("checking", quiet):
-        report = check_fmu(fmu, chosen, effects=given.effects)
+        report = check_fmu(fmu, chosen, effects=given.effects, timeout=timeout, memory=memory << 20)
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)
     if not report.passed:

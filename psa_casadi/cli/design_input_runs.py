@@ -1,12 +1,14 @@
 """What `psa design input` does once its input is checked: design, write, show."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psa_casadi.cli.interrupts import kept
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.inversion import invert as inverted
@@ -57,7 +59,8 @@ def track(task: Task, path: Target, minimax: bool) -> None:
         rows: _Rows = [("designed, full simulator", found.error)]
         if task.check_fmu:
             progress("exported FMU")
-            rows.append(("designed, exported FMU", _on_fmu(task, path, found.voltage)))
+            with _keeping(task, found.response):
+                rows.append(("designed, exported FMU", _on_fmu(task, path, found.voltage)))
     if found.by_program:
         rows.append(("designed, the program itself", error_of(path, found.predicted)))
     rows += [
@@ -97,7 +100,9 @@ def invert(task: Task, path: Target) -> None:
         rows: _Rows = [("inversion, full simulator", found.error)]
         if task.check_fmu:
             progress("exported FMU")
-            rows.append(("inversion, exported FMU", _on_fmu(task, path, found.response.voltage)))
+            with _keeping(task, found.response):
+                error = _on_fmu(task, path, found.response.voltage)
+            rows.append(("inversion, exported FMU", error))
     summary = [_follows(found.error), *binding(found.response, task.limits)]
     summary.append(f"{len(found.trials)} trials on the simulator.")
     tables = (error_table(rows), limits_table(found.response, task.limits))
@@ -134,7 +139,8 @@ def move(task: Task, ends: tuple[float, float]) -> None:
         if task.check_fmu:
             progress("exported FMU")
             response = found.response
-            shown = _played(task, response.time, response.voltage)
+            with _keeping(task, response):
+                shown = _played(task, response.time, response.voltage)
             worst = np.max(np.abs(shown - response.displacement)) / abs(end - begin)
             summary.append(
                 f"The exported FMU differs from the simulator by {number(100.0 * worst, 2)} % of"
@@ -160,6 +166,26 @@ def _follows(error: TrackingError) -> str:
     )
 
 
+@contextmanager
+def _keeping(task: Task, response: Response) -> Iterator[None]:
+    """Write the voltage where an interrupt ends what comes after its design, and say that."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _write(task, response)
+        told = kept("the voltage was designed before", [task.output], [task.report])
+        raise KeyboardInterrupt(told) from None
+
+
+def _write(task: Task, response: Response) -> None:
+    columns = {
+        "time [s]": response.time,
+        "voltage [V]": response.voltage,
+        "displacement [um]": 1e6 * response.displacement,
+    }
+    write_record(task.output, columns)
+
+
 def _on_fmu(task: Task, path: Target, voltage: np.ndarray) -> TrackingError:
     return error_of(path, _played(task, path.time, voltage))
 
@@ -175,17 +201,13 @@ def _finish(
     pictures: "Sequence[Picture]", response: Response, *badges: str,
 ) -> None:  # fmt: skip
     """Write CSV and page, show sentences and tables."""
-    columns = {
-        "time [s]": response.time,
-        "voltage [V]": response.voltage,
-        "displacement [um]": 1e6 * response.displacement,
-    }
-    write_record(task.output, columns)
-    if task.report is not None:
-        write_design_page(
-            task.report, title=title, summary=summary, tables=tables, figures=pictures,
-            badges=badges,
-        )  # fmt: skip
+    with _keeping(task, response):
+        _write(task, response)
+        if task.report is not None:
+            write_design_page(
+                task.report, title=title, summary=summary, tables=tables, figures=pictures,
+                badges=badges,
+            )  # fmt: skip
     for sentence in summary:
         show(sentence, task.quiet)
     for titled in tables:

@@ -23,7 +23,7 @@ from psa_casadi.cli.screen import (
 
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.diagnosis.result import Alternative, Diagnosis
+    from psa_casadi.diagnosis.result import Diagnosis
 
 
 def diagnose(
@@ -92,8 +92,10 @@ def diagnose(
     }
     with timed() as spent:
         with stage("loading"):
+            from psa_casadi.cli import diagnosis_files as files
             from psa_casadi.cli.inputs import Given
             from psa_casadi.diagnosis.diagnose import diagnose as run
+            from psa_casadi.diagnosis.result import DiagnosisInterrupted
             from psa_casadi.model.own_effects import known_effects
             from psa_casadi.report.words.text import story
             from psa_casadi.report.words.timings import timings_table
@@ -107,27 +109,25 @@ def diagnose(
             given.check()
         count = len(records)
         with working("diagnosing", quiet) as progress:
-            d = run(
-                found[:count],
-                holdout=found[count:],
-                model=start,
-                stiffness=stiffness,
-                effects=tuple(known_effects(given.effects).values()),
-                progress=progress,
-            )
-            with stage("next experiment"):
-                d = _with_next(d, following or _beside(json or report), progress)
-            progress("writing")
-            with stage("writing"):
-                _write(d, {**outputs, "--patch": None}, origin.value)
-            with stage("unnamed correction"):
-                unpatched = _write_patch(d, patch, progress)
+            try:
+                d = run(
+                    found[:count],
+                    holdout=found[count:],
+                    model=start,
+                    stiffness=stiffness,
+                    effects=tuple(known_effects(given.effects).values()),
+                    progress=progress,
+                )
+            except DiagnosisInterrupted as stop:
+                raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
+            place = following or _beside(json or report)
+            d, unpatched = _finish(d, place, outputs, origin.value, progress)
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
-    written = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
-    tell_written(*written, d.next_experiment.voltage_csv, quiet=quiet)
-    for line in _models(d, output):
+    told_of = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
+    tell_written(*told_of, d.next_experiment.voltage_csv, quiet=quiet)
+    for line in files.models(d, output):
         show(line, quiet)
     if unpatched:
         show(unpatched, quiet)
@@ -135,6 +135,30 @@ def diagnose(
         show("", quiet)
         show_table(timings_table(spent.stages), quiet)
         show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", quiet)
+
+
+def _finish(
+    d: "Diagnosis",
+    following: Path | None,
+    outputs: Mapping[str, Path | None],
+    origin: str,
+    progress: Callable[[str], None],
+) -> "tuple[Diagnosis, str]":
+    """Design what follows and write all files; return the diagnosis and why a patch is missing."""
+    from psa_casadi.cli import diagnosis_files as files
+    from psa_casadi.simulation.timings import stage
+
+    written: list[Path] = []
+    try:
+        with stage("next experiment"):
+            d = _with_next(d, following, progress)
+        progress("writing")
+        with stage("writing"):
+            files.write(d, {**outputs, "--patch": None}, origin, written)
+        with stage("unnamed correction"):
+            return d, _write_patch(d, outputs["--patch"], progress)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(files.keep(d, outputs, origin, written)) from None
 
 
 def _keep_apart(given: "Given", output: Path | None, model: Path | None) -> None:
@@ -190,42 +214,3 @@ def _write_patch(d: "Diagnosis", path: Path | None, progress: Callable[[str], No
     except PsaError as error:
         return f"{path} was not written: {error}"
     return ""
-
-
-def _alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative, Path]]":
-    """Return the models with another cause, each with its file beside the extended model's."""
-    if output is None:
-        return []
-    return [
-        (a, output.with_name(f"{output.stem}_{a.instead}_for_{a.cause}.json"))
-        for a in d.alternatives
-    ]
-
-
-def _models(d: "Diagnosis", output: Path | None) -> list[str]:
-    """Say what the model's file holds if nothing was added, and which files are beside it."""
-    lines = [
-        f"written: {path}, with {a.instead} instead of {a.cause}"
-        for a, path in _alternatives(d, output)
-    ]
-    if output is not None and not d.causes:
-        lines.append(f"nothing was added: {output} holds the base model")
-    return lines
-
-
-def _write(d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str) -> None:
-    """Write what was asked for, each file whole or not at all."""
-    import psa_casadi as psa
-    from psa_casadi.files import atomic_write
-
-    writers: dict[str, Callable[[Path], None]] = {
-        "--output": lambda path: psa.save_model(d.model, path),
-        "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: psa.write_report(d, path, origin=origin),
-        "--figure": lambda path: psa.save_figure(d, path, origin=origin),
-    }
-    for option, path in outputs.items():
-        if path is not None:
-            writers[option](path)
-    for a, path in _alternatives(d, outputs["--output"]):
-        psa.save_model(a.model, path)

@@ -2,11 +2,14 @@
 
 import difflib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from psa_casadi.cli.screen import show, show_table, tell_written, width
+
+if TYPE_CHECKING:
+    from psa_casadi.component import Component
 
 
 def effects(
@@ -22,10 +25,12 @@ def effects(
     Example: psa effects slow_creep --figure creep.png
     """
     from psa_casadi.effects import EFFECTS
+    from psa_casadi.effects.modal_series import MODAL_SERIES
     from psa_casadi.report.words.tables import effects_table
     from psa_casadi.report.words.text import effect_page
 
-    wanted = _known(name, list(EFFECTS), figure)
+    known = {**EFFECTS, **{e.name: e for e in MODAL_SERIES.values()}}
+    wanted = _known(name, list(known), figure)
     if wanted is None:
         if quiet:
             show("\n".join(EFFECTS))
@@ -33,8 +38,8 @@ def effects(
             show_table(effects_table(EFFECTS.values()))
         return
     if figure is not None:
-        _draw(wanted, figure)
-    show(wanted if quiet else effect_page(EFFECTS[wanted], width()))
+        _draw(known[wanted], figure)
+    show(wanted if quiet else effect_page(known[wanted], width()))
     tell_written(figure, quiet=quiet)
 
 
@@ -61,9 +66,8 @@ def _known(name: str | None, names: list[str], figure: Path | None) -> str | Non
     return wanted
 
 
-def _draw(name: str, path: Path) -> None:
+def _draw(effect: "Component", path: Path) -> None:
     from psa_casadi.diagnosis.residual.signature import signature
-    from psa_casadi.effects import EFFECTS
     from psa_casadi.report.plots.signature_figure import save_signature
 
-    save_signature(EFFECTS[name], signature(EFFECTS[name]), path)
+    save_signature(effect, signature(effect), path)

@@ -2,13 +2,17 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from psa_casadi.cli.screen import (
+    AuthorOption,
+    CopyrightOption,
     EffectsOption,
     HistoryOption,
+    LicenseOption,
+    ModelVersionOption,
     PartOption,
     Quiet,
     RestOption,
@@ -19,6 +23,9 @@ from psa_casadi.cli.screen import (
     tell_written,
     working,
 )
+
+if TYPE_CHECKING:
+    from psa_casadi.model.compose import Model
 
 
 class FmiVersion(StrEnum):
@@ -47,6 +54,10 @@ def fmu(
     history: HistoryOption = None,
     sweep: SweepOption = 1.0,
     rest: RestOption = 0.0,
+    author: AuthorOption = None,
+    version: ModelVersionOption = None,
+    copyright_: CopyrightOption = None,
+    license_: LicenseOption = None,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -54,6 +65,7 @@ def fmu(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.fmu.platforms import chosen_platforms
+    from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
     given = Given(effects)
     given.outputs({"--output": output}, [model])
@@ -61,6 +73,9 @@ def fmu(
     targets = given.attempt(lambda: chosen_platforms(wanted))
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
+    chosen = given.published(
+        chosen, author=author, version=version, copyright=copyright_, license=license_
+    )
     given.check()
     if chosen is None or targets is None:
         return
@@ -81,4 +96,21 @@ def fmu(
     if left_out:
         show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
+    show(f"start: {start_words(kept)}", quiet)
+    if not has_zig():
+        show(
+            "The binary is by this machine's compiler, for systems like this one; after"
+            f" `{INSTALL_ZIG}` it loads on older ones too.",
+            quiet,
+        )
     tell_written(output, quiet=quiet)
+
+
+def start_words(model: "Model") -> str:
+    """Say where an exported model starts."""
+    voltage = next((i.start for i in model.structure.inputs if i.name == "voltage"), None)
+    held = "" if voltage is None else f" at {voltage:.4g} V"
+    if model.own_starts():
+        return f"the start values of the model{held}, as its page lists them"
+    settled = "; --start-voltage starts it settled" if voltage is not None else ""
+    return f"relaxed{held}{settled}"

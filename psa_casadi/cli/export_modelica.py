@@ -6,8 +6,12 @@ from typing import Annotated
 import typer
 
 from psa_casadi.cli.screen import (
+    AuthorOption,
+    CopyrightOption,
     EffectsOption,
     HistoryOption,
+    LicenseOption,
+    ModelVersionOption,
     PartOption,
     Quiet,
     RestOption,
@@ -32,6 +36,10 @@ def modelica(
     history: HistoryOption = None,
     sweep: SweepOption = 1.0,
     rest: RestOption = 0.0,
+    author: AuthorOption = None,
+    version: ModelVersionOption = None,
+    copyright_: CopyrightOption = None,
+    license_: LicenseOption = None,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -43,6 +51,9 @@ def modelica(
     given.outputs({"--output": output}, [model])
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
+    chosen = given.published(
+        chosen, author=author, version=version, copyright=copyright_, license=license_
+    )
     given.check()
     if chosen is None:
         return

@@ -6,7 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from psa_casadi.cli.screen import (
+    AuthorOption,
+    CopyrightOption,
     EffectsOption,
+    LicenseOption,
+    ModelVersionOption,
     Quiet,
     show,
     tell_written,
@@ -40,6 +44,10 @@ def ssp(
     platforms: Annotated[
         str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
     ] = "host",
+    author: AuthorOption = None,
+    version: ModelVersionOption = None,
+    copyright_: CopyrightOption = None,
+    license_: LicenseOption = None,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -56,15 +64,18 @@ def ssp(
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     given.attempt(lambda: chosen_platforms(wanted))
     chosen = given.model_or_stack(model, stack or (DEFAULT_STACK if model is None else None))
+    chosen = given.published(
+        chosen, author=author, version=version, copyright=copyright_, license=license_
+    )
     system = None
     if chosen is not None:
         system = given.attempt(lambda: nanopositioner(chosen, compensated=not no_compensator))
     given.check()
-    if system is None:
+    if chosen is None or system is None:
         return
     with working("compiling", quiet) as progress:
         progress(", ".join(system.parts))
-        export_ssp(system, output, platforms=wanted)
+        export_ssp(system, output, platforms=wanted, publication=chosen.publication)
     wiring = wiring_of(system)
     if picture is not None:
         save_wiring(wiring, layout_of(wiring), picture)

@@ -7,27 +7,43 @@ from typing import ParamSpec
 
 import typer
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.cli import INTERRUPTED
+from psa_casadi.cli.interrupts import interrupts
+from psa_casadi.cli.surroundings import refused_by_the_machine, silence
+from psa_casadi.errors import InputError, MachineError, PsaError
+from psa_casadi.files import written
 
 P = ParamSpec("P")
 
 #: Set in the environment, this variable lets a failure end with its traceback.
 DEBUG = "PSA_CASADI_DEBUG"
+#: What is told of an interrupt before there was any result.
+NOTHING_KEPT = "there was no result yet, so nothing was kept."
 
 
 def guarded(command: Callable[P, None]) -> Callable[P, None]:
     """Return the command with its errors told in sentences, without a traceback.
 
     Exit code 2: what the user gave cannot be used; every mistake is listed. Exit code 1: a failure
-    that is not the user's.
+    that is not the user's. 130: interrupted; what was kept is told.
     """
 
     @functools.wraps(command)
     def run(*args: P.args, **options: P.kwargs) -> None:
+        before = len(written())
         try:
-            command(*args, **options)
+            with interrupts():
+                command(*args, **options)
         except (typer.Exit, typer.Abort):
             raise
+        except BrokenPipeError as error:
+            silence()
+            raise typer.Exit(1) from error
+        except KeyboardInterrupt as stop:
+            there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
+            told = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
+            typer.echo(f"Interrupted: {told}", err=True)
+            raise typer.Exit(INTERRUPTED) from None
         except InputError as error:
             if os.environ.get(DEBUG):
                 raise
@@ -53,8 +69,12 @@ def _tell_problems(problems: tuple[str, ...]) -> None:
 
 
 def _tell_failure(error: Exception) -> None:
-    if isinstance(error, PsaError):
+    if isinstance(error, (PsaError, MachineError)):
         typer.echo(f"Failed: {error}", err=True)
+        return
+    refused = refused_by_the_machine(error)
+    if refused is not None:
+        typer.echo(f"Failed: {refused}", err=True)
         return
     typer.echo(
         f"Failed: an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi,"

@@ -1,8 +1,9 @@
 """`psa identify`: the parameters of a stack, with intervals."""
 
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +18,10 @@ from psa_casadi.cli.screen import (
     width,
     working,
 )
+
+if TYPE_CHECKING:
+    from psa_casadi.identification.certainty.profile import Profile
+    from psa_casadi.identification.identify import Identification
 
 
 class Method(StrEnum):
@@ -55,12 +60,9 @@ def identify(
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.identification.certainty.profile import profile as profile_of
     from psa_casadi.identification.certainty.profile import profile_sentences
     from psa_casadi.identification.identify import identify as run
     from psa_casadi.identification.paper.method import identify_by_paper as by_paper
-    from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.report.words.text import identification_text
 
     given = Given(effects)
@@ -78,16 +80,11 @@ def identify(
             found = by_paper(measured, stiffness=stiffness, progress=progress)
         else:
             found = run(measured, model=start, stiffness=stiffness, progress=progress)
-        save_model(found.model, output)
-        wanted = [n for n in profile or () if n in found.determinacy.names]
-        profiles = [profile_of(found.fit, found.experiments, n, progress=progress) for n in wanted]
-        if report is not None:
-            progress("writing the report")
-            write_fit_report(found, report, origin=origin.value, profiles=profiles)
+        profiles = _finish(found, output, report, profile or (), origin.value, progress)
     show(identification_text(found, origin=origin.value, width=width()), quiet)
     for found_profile in profiles:
         show("\n" + "\n".join(profile_sentences(found_profile)), quiet)
-    left_out = [n for n in profile or () if n not in wanted]
+    left_out = [n for n in profile or () if n not in found.determinacy.names]
     if left_out:
         show(
             f"\nNo profile of {', '.join(left_out)}: not searched in this fit; the parameters"
@@ -95,3 +92,36 @@ def identify(
             quiet,
         )
     tell_written(output, report, quiet=quiet)
+
+
+def _finish(
+    found: "Identification",
+    output: Path,
+    report: Path | None,
+    wanted: Sequence[str],
+    origin: str,
+    progress: Callable[[str], None],
+) -> "list[Profile]":
+    """Write the files and return the profiles; at an interrupt the model is kept, which it says."""
+    from psa_casadi.cli.interrupts import kept
+    from psa_casadi.identification.certainty.profile import profile
+    from psa_casadi.model.model_file import save_model
+    from psa_casadi.report.page.fit_page import write_fit_report
+
+    try:
+        save_model(found.model, output)
+        names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
+        profiles = [profile(found.fit, found.experiments, n, progress=progress) for n in names]
+        if report is not None and not found.interrupted:
+            progress("writing the report")
+            write_fit_report(found, report, origin=origin, profiles=profiles)
+        ended = found.interrupted
+    except KeyboardInterrupt:
+        save_model(found.model, output)
+        ended = True
+    if not ended:
+        return profiles
+    cut = found.fit.interrupted
+    what = "the search was cut off" if cut else "the fit was finished before"
+    mark = " (marked as interrupted)" if cut else ""
+    raise KeyboardInterrupt(kept(what, [output], [report], mark))

@@ -2,11 +2,13 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from psa_casadi.errors import InputError
+from psa_casadi.files import why_not_written
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.own_effects import own_effects
@@ -155,6 +157,19 @@ class Given:
             return model
         return self.attempt(lambda: settled_at(model, voltage, turns, **durations))
 
+    def published(self, model: Model | None, **said: str | None) -> Model | None:
+        """Return a model that states what the options say, else what it stated before.
+
+        `said` are fields of `Publication`; a text may not be empty or have line breaks.
+        """
+        for name, text in said.items():
+            if text is not None and (not text.strip() or not text.isprintable()):
+                self.add(f"--{name} is {text!r}; give a text of one line, or leave it out.")
+        if model is None:
+            return None
+        given = {name: text for name, text in said.items() if text is not None}
+        return replace(model, publication=replace(model.publication, **given))
+
     def stiffness(self, value: float | None) -> None:
         """Demand a positive stiffness, if one is given."""
         if value is not None and not 0.0 < value < float("inf"):
@@ -181,12 +196,11 @@ class Given:
             self._writable(path)
 
     def _writable(self, path: Path) -> None:
-        folder = path.resolve().parent
-        if path.is_dir():
-            self.add(f"{path}: cannot write, this is a directory; name a file in it.")
-        elif not folder.is_dir():
+        reason = why_not_written(path)
+        if reason:
+            self.add(reason)
+        elif not os.access(path.resolve().parent, os.W_OK):
             self.add(
-                f"{path}: cannot write, the directory {folder} does not exist; create it first."
+                f"{path}: cannot write, {path.resolve().parent} may not be written to; choose"
+                " another place."
             )
-        elif not os.access(folder, os.W_OK):
-            self.add(f"{path}: cannot write, {folder} may not be written to; choose another place.")

@@ -62,11 +62,11 @@ HistoryOption = Annotated[
 SweepOption = Annotated[
     float,
     typer.Option(
-        "--sweep", help="Duration of each sweep of the history [s]; delta and creep see it."
+        "--sweep", help="Duration of each sweep of the history \\[s]; delta and creep see it."
     ),
 ]
 
-RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history [s].")]
+RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history \\[s].")]
 
 StartVoltageOption = Annotated[
     float | None,
@@ -74,6 +74,29 @@ StartVoltageOption = Annotated[
         "--start-voltage",
         help="Voltage [V] that holds the stack when it starts, settled, with the memory that"
         " --history leaves; by default it starts relaxed at 0 V.",
+    ),
+]
+
+
+AuthorOption = Annotated[
+    str | None, typer.Option("--author", help="Author to state; by default the model file's.")
+]
+
+ModelVersionOption = Annotated[
+    str | None,
+    typer.Option("--version", help="Version of the model to state; by default the model file's."),
+]
+
+CopyrightOption = Annotated[
+    str | None,
+    typer.Option("--copyright", help="Copyright of the model; by default the model file's."),
+]
+
+LicenseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--license",
+        help="Licence of the model; by default the model file's. The C code stays BSD 3-Clause.",
     ),
 ]
 

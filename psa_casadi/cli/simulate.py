@@ -20,6 +20,7 @@ from psa_casadi.cli.screen import (
 
 if TYPE_CHECKING:
     from psa_casadi.model.compose import Model
+    from psa_casadi.records import Record
     from psa_casadi.simulation.simulate import Trajectory
     from psa_casadi.units import FloatArray
 
@@ -33,6 +34,14 @@ def simulate(
     stack: StackOption = None,
     columns: ColumnsOption = None,
     effects: EffectsOption = None,
+    start_voltage: Annotated[
+        float | None,
+        typer.Option(
+            "--start-voltage",
+            help="Voltage [V] that holds the stack when it starts, as in `psa export fmu`; by"
+            " default the first one of the record.",
+        ),
+    ] = None,
     history: HistoryOption = None,
     sweep: SweepOption = 1.0,
     rest: RestOption = 0.0,
@@ -40,7 +49,9 @@ def simulate(
 ) -> None:
     """Simulate a model on a measured or planned voltage; write every output with its unit.
 
-    Hysteresis and creep begin where --history leaves them, else relaxed. Example:
+    It starts settled at the first voltage, hysteresis and creep where --history leaves them, else
+    relaxed. With --start-voltage, or a model file that has start values, it starts where an FMU
+    exported with the same options does. Example:
     psa simulate --stack P-885.51 --input voltage.csv --history 120,0,120 -o out.csv
     """
     from psa_casadi.cli.inputs import Given
@@ -52,23 +63,46 @@ def simulate(
     given.outputs({"--output": output}, [model, record])
     chosen = given.model_or_stack(model, stack)
     voltage = given.voltage(record, columns=columns)
+    if start_voltage is not None:
+        chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     turns = given.numbers(history, "--history", "voltages in V")
     given.check()
     if chosen is None or voltage is None:
         return
+    as_exported = start_voltage is not None or (history is None and chosen.starts_itself)
     with working("simulating", quiet):
         first = float(voltage.voltage[0])
         memory = (
             None
-            if history is None
+            if history is None or as_exported
             else memory_after(chosen, turns, at=first, sweep=sweep, rest=rest)
         )
-        found = simulate_record(chosen, voltage, memory)
+        found = simulate_record(chosen, voltage, memory, as_exported=as_exported)
         written = output_columns(chosen, found)
         write_record(output, written)
+    show(f"start: {start_sentence(chosen, voltage, history, as_exported)}", quiet)
     show(f"{voltage.n} samples over {voltage.duration:.6g} s in {found.steps} steps", quiet)
     show(f"columns: {', '.join(written)}", quiet)
     tell_written(output, quiet=quiet)
+
+
+def start_sentence(model: "Model", record: "Record", history: str | None, as_exported: bool) -> str:
+    """Say where a simulation on a record begins, and how an exported FMU begins there too."""
+    from psa_casadi.simulation.start import initial_slope
+
+    first = float(record.voltage[0])
+    if not as_exported:
+        memory = "relaxed" if history is None else f"where the history {history} V leaves them"
+        rate = initial_slope(record.time, record.voltage)
+        moving = f", moving at {rate:.4g} V/s" if rate else ""
+        option = "" if history is None else f" --history {history}"
+        return (
+            f"settled at {first:.4g} V{moving}, hysteresis and creep {memory}; an FMU of it begins"
+            f" at rest there with --start-voltage {first:.4g}{option}"
+        )
+    held = next(i.start for i in model.structure.inputs if i.name == "voltage")
+    step = "" if held == first else f"; the record begins with a step from there to {first:.4g} V"
+    return f"the start values of the model, at {held:.4g} V, as an exported FMU has them{step}"
 
 
 def output_columns(model: "Model", found: "Trajectory") -> "dict[str, FloatArray]":

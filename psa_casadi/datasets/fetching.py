@@ -5,10 +5,10 @@ import hashlib
 import os
 from pathlib import Path
 
+from psa_casadi.cache import writable_room
 from psa_casadi.datasets.published import DATASETS, Dataset, DatasetFile, Extract, Original
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.files import atomic_write
-from psa_casadi.simulation.compiler import cache_directory
 
 #: Names the folder with the records of a machine that downloads nothing.
 DATA_VARIABLE = "PSA_CASADI_DATA"
@@ -90,7 +90,7 @@ def _path(dataset: Dataset, file: DatasetFile) -> Path:
     data = os.environ.get(DATA_VARIABLE)
     if data:
         return _from_folder(Path(data) / dataset.name, dataset, file)
-    kept = cache_directory() / "datasets" / dataset.name / file.name
+    kept = writable_room("datasets") / dataset.name / file.name
     if kept.is_file() and _sha256(kept.read_bytes()) == file.sha256:
         return kept
     content = convert(_download(file.original, kept.parent).read_bytes(), file.extract)

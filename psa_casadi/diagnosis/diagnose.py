@@ -6,19 +6,23 @@ from dataclasses import replace
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.driven import driven
 from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.diagnosis.thresholds import using
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.identify import unfinished
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
-from psa_casadi.identification.start.ordinary import chosen_start, refuse_stuck
+from psa_casadi.identification.start.doubts import refuse_few, refuse_still, refuse_stuck
+from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
-from psa_casadi.records.quality.suspects import cleaned
+from psa_casadi.records.quality.suspects import cleaned, masked, suspects
+from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, in_one_order
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
@@ -26,15 +30,22 @@ from psa_casadi.simulation.timings import stage
 
 #: So many further stuck readings are worth a second search.
 MORE = 3
+#: Steps of a sensor over a record's range below which it is coarse, and what is said then.
+COARSE = 32
+COARSE_NOTE = (
+    "{}: the sensor resolves {:.0f} steps over the whole range. They are what the model's error is"
+    " made of: nothing that is smaller can be told from them."
+)
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
 
+@interruptible_work()
 @one_thread_of_algebra()
 def diagnose(
-    records: Sequence[Record],
+    records: Records,
     *,
-    holdout: Sequence[Record] = (),
+    holdout: Records = (),
     model: Model | None = None,
     stiffness: float | None = None,
     effects: Sequence[Component] | None = None,
@@ -43,41 +54,65 @@ def diagnose(
 ) -> Diagnosis:
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
+    `records` are those of one device: a record, the path of a file, a data frame or a mapping of
+    arrays (see `record_from`), or several of these.
     Held-out data are the records `holdout`, else a quarter of every record in blocks (see
     `divided`); they choose nothing but whether an extension may stay. `model` is where the base fit
     starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search; `method` can
-    leave parts of the method out (for its ablation). Raises InputError.
+    leave parts of the method out (for its ablation). Raises InputError, and DiagnosisInterrupted
+    with the best model so far at a keyboard interrupt once there is one.
     """
     method = method or Method()
+    given, kept = records_given(records), records_given(holdout)
     with using(method.thresholds):
-        return _diagnose(records, holdout, model, stiffness, effects, method, progress)
+        with stage("preparing"):
+            table = list(effects if effects is not None else known_effects().values())
+            ordered, apart = in_one_order(given), in_one_order(kept)
+            clean, said = _cleaned(ordered)
+            experiments = divided(clean, [cleaned(r) for r in apart])
+            start, scale_given = chosen_start(clean, model, stiffness)
+            refuse_stuck([e.record for e in experiments])
+            known = {e.name for e in table}
+            searched = (*table, *(c for c in start.effects if c.more_of in known))
+            start = start.without(c.name for c in searched if c.gain is not None)
+            there = {c.name for c in start.components}
+            table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
+        so_far: list[Fit] = []
+        task = Task(experiments, tuple(table), method, progress, so_far.append)
+        try:
+            found = _diagnose(start, task, scale_given)
+            return replace(found, notes=(*found.notes, *said))
+        except KeyboardInterrupt:
+            if not so_far:
+                raise
+            raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
-def _diagnose(
-    records: Sequence[Record],
-    holdout: Sequence[Record],
-    model: Model | None,
-    stiffness: float | None,
-    effects: Sequence[Component] | None,
-    method: Method,
-    progress: Progress,
-) -> Diagnosis:
-    with stage("preparing"):
-        table = list(effects if effects is not None else known_effects().values())
-        records, holdout = in_one_order(records), in_one_order(holdout)
-        experiments = divided([cleaned(r) for r in records], [cleaned(r) for r in holdout])
-        start, scale_given = chosen_start(records, model, stiffness)
-        refuse_stuck([e.record for e in experiments])
-        searched = (*table, *(c for c in start.effects if c.more_of in {e.name for e in table}))
-        start = start.without(c.name for c in searched if c.gain is not None)
-        there = {c.name for c in start.components}
-        table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-    base = fit_base(start, experiments, progress=progress)
+def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
+    """Return the records without suspect samples, and where a sensor was saturated or coarse.
+
+    Raises InputError where hardly a sample is left.
+    """
+    refuse_still(records)
+    found = [suspects(r) for r in records]
+    clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
+    said = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
+    refuse_few(records, clean, said)
+    for r, own in zip(records, found, strict=True):
+        if own.quantum is not None and r.range_m < COARSE * own.quantum:
+            said.append(COARSE_NOTE.format(r.name, r.range_m / own.quantum))
+    return clean, said
+
+
+def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
+    """Diagnose from where the base fit starts; the task's `keep` gets the best fit so far."""
+    experiments, table, progress = task.experiments, task.table, task.progress
+    base = _base(start, task)
     experiments, stuck = without_stuck_readings(experiments, base)
     if stuck:
         refuse_stuck([e.record for e in experiments])
-        base = fit_base(start, experiments, progress=progress)
-    task = Task(experiments, tuple(table), method, progress)
+        task = replace(task, experiments=experiments)
+        base = _base(start, task)
     seen = driven(base, start, experiments, progress)
     if not seen.follows:
         steps = unsearched(base, task)
@@ -88,15 +123,26 @@ def _diagnose(
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
         experiments, stuck = fewer, stuck + more
         task = replace(task, experiments=experiments)
-        steps = _search(fit_base(start, experiments, progress=progress), task)
+        steps = _search(_base(start, task), task)
     progress("judging")
     found = conclude(steps, experiments, table, scale_given)
     notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []))
     return replace(found, notes=(*found.notes, *notes))
 
 
+def _base(start: Model, task: Task) -> Fit:
+    """Fit the base model and keep it. Raises KeyboardInterrupt after a fit that was interrupted."""
+    base = fit_base(start, task.experiments, progress=task.progress)
+    task.keep(base)
+    if base.interrupted:
+        raise KeyboardInterrupt
+    return base
+
+
 def _search(base: Fit, task: Task) -> list[Step]:
-    return steps_of(best_first(base, task), task)
+    steps = steps_of(best_first(base, task), task)
+    task.keep(steps[-1].fit)
+    return steps
 
 
 def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:

@@ -14,7 +14,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
-from psa_casadi.identification.start.ordinary import doubtful_unit, static_slope
+from psa_casadi.identification.start.doubts import correlation, doubtful_time, doubtful_unit
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 
@@ -55,9 +55,9 @@ def driven(
     if shows_ringing(experiments) and explained(base, experiments) < thresholds().follows:
         base = from_resonances(base, experiments, progress) or base
     share = explained(base, experiments)
-    unit = doubtful_unit([e.record for e in experiments])
-    notes = (unit,) if unit else ()
-    if share >= thresholds().follows and correlation(experiments) > thresholds().falling:
+    records = [e.record for e in experiments]
+    notes = tuple(s for s in (doubtful_unit(records), doubtful_time(records)) if s)
+    if share >= thresholds().follows and correlation(records) > thresholds().falling:
         return Driven(follows=True, notes=notes)
     progress("the displacement with its sign flipped")
     other = _flipped(model, experiments)
@@ -101,14 +101,6 @@ def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
         left += float(np.sum(about(time, (given - y)[valid]) ** 2))
         total += float(np.sum(about(time, given[valid]) ** 2))
     return 1.0 - left / total if total > 0 else 0.0
-
-
-def correlation(experiments: Sequence[Experiment]) -> float:
-    """Correlation of displacement and voltage over all records, -1 to 1."""
-    records = [e.record for e in experiments]
-    spread = [float(np.nanvar(measured(r))) * r.n for r in records]
-    drive = [float(np.var(r.voltage)) * r.n for r in records]
-    return static_slope(records) * float(np.sqrt(sum(drive) / max(sum(spread), 1e-300)))
 
 
 def _about_mean(_: FloatArray, signal: FloatArray) -> FloatArray:

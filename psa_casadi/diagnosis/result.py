@@ -14,8 +14,10 @@ from psa_casadi.diagnosis.held_out.errors import Errors, Gain
 from psa_casadi.diagnosis.noise.floor import NoiseFloor
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
+from psa_casadi.shown import Reported, frame
 
 FloatArray = npt.NDArray[np.float64]
 Verdict = Literal[
@@ -127,8 +129,8 @@ class Alternative:
         return {n: getattr(self, n) for n in names}
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Reported):
     """A diagnosis: verdict, causes, the base and the extended model, errors, and what remains.
 
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` are the
@@ -165,6 +167,22 @@ class Diagnosis:
     patch: Patch | None = None
     alternatives: tuple[Alternative, ...] = ()
 
+    def to_frame(self) -> Any:
+        """Return the samples as a pandas DataFrame: measured, base and extended, in metres."""
+        rows = list(zip(self.experiments, self.base, self.extended, strict=True))
+        columns = {
+            "record": np.repeat(
+                [e.record.name for e, _, _ in rows], [e.record.n for e, _, _ in rows]
+            ),
+            "time": np.concatenate([e.record.time for e, _, _ in rows]),
+            "voltage": np.concatenate([e.record.voltage for e, _, _ in rows]),
+            "measured": np.concatenate([measured(e.record) for e, _, _ in rows]),
+            "base": np.concatenate([base for _, base, _ in rows]),
+            "extended": np.concatenate([extended for _, _, extended in rows]),
+            "held_out": np.concatenate([e.held_out for e, _, _ in rows]),
+        }
+        return frame(columns)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of DIAGNOSIS.json."""
         return {
@@ -199,6 +217,19 @@ class Diagnosis:
     def to_json(self) -> str:
         """Return the text of DIAGNOSIS.json."""
         return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+class DiagnosisInterrupted(KeyboardInterrupt):
+    """A keyboard interrupt ended a diagnosis; `model` is the best so far, marked as interrupted.
+
+    Its effects, if it has any, were not judged. `str(error)` says what the model is.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        effects = ", ".join(c.name for c in model.effects)
+        what = f"the base model with {effects}, not judged" if effects else "the base model"
+        super().__init__(f"the best fit so far is {what}; its values are not final")
 
 
 def _misfit(m: Misfit) -> dict[str, Any]:

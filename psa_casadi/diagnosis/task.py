@@ -39,12 +39,16 @@ class Method:
 
 @dataclass(frozen=True)
 class Task:
-    """The records, the table of effects to search, the method, and who is told of the progress."""
+    """The records, the table of effects to search, the method, and who is told of the progress.
+
+    `keep` gets the best fit so far where a keyboard interrupt ends the search.
+    """
 
     experiments: tuple[Experiment, ...]
     table: tuple[Component, ...]
     method: Method = field(default_factory=Method)
     progress: Callable[[str], None] = lambda _: None
+    keep: Callable[[Fit], None] = lambda _: None
 
     @property
     def fast(self) -> bool:

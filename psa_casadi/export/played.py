@@ -1,14 +1,12 @@
 """A voltage played on a model's exported FMU by a co-simulation master of its own."""
 
-import tempfile
-from pathlib import Path
-
 import numpy as np
 
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate
 from psa_casadi.model.compose import Model
+from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.start import start_state
 
 
@@ -23,8 +21,8 @@ def played_on_fmu(
     u = [i.start for i in model.structure.inputs]
     u[model.input_names.index("voltage")] = float(voltage[0])
     start = dict(zip(model.state_names, start_state(model, u).x.tolist(), strict=True))
-    with tempfile.TemporaryDirectory() as folder:
-        path = export_fmu(model, Path(folder) / "stack.fmu", name="stack")
+    with temporary_folder() as folder:
+        path = export_fmu(model, folder / "stack.fmu", name="stack")
         with Fmu(path) as fmu:
             inputs = Signals(("voltage",), time, voltage[:, None])
             found = co_simulate(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,13 +13,23 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
 from psa_casadi.identification.search.refitting import Progress, record_rms, refit
+from psa_casadi.identification.start.doubts import (
+    doubtful_sign,
+    doubtful_time,
+    doubtful_unit,
+    refuse_few,
+    refuse_still,
+)
 from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
+from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.variables import Provenance
 from psa_casadi.version import __version__
@@ -28,20 +39,24 @@ _MISSED = 1.5
 #: Rounds of fitting with every record's own residual as its noise level.
 _LEVEL_ROUNDS = 2
 
+INTERRUPTED = (
+    "The search was interrupted; this is the best fit so far, and its values are not final."
+)
 FORCE_NOTE = (
     "Force scale assumed: voltage and displacement determine the displacement only. Forces, masses"
     " and stiffnesses are right in proportion, not in size; give a stiffness to fix them."
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Reported):
     """An identified model with the fit behind it, what the data determine, and warnings.
 
     `starts` tells what became of every start of the search; `sentences` what was done to the
     records (samples masked, averaged), which is no warning. `combinations` holds what is known of
     parameters that trade off; `advice` the further records that would determine what is open.
-    `read_off` names parameters that were found without a fit (the paper's method).
+    `read_off` names parameters that were found without a fit (the paper's method). `interrupted`
+    says that a keyboard interrupt ended the search, or the advice after it.
     """
 
     model: Model
@@ -54,11 +69,27 @@ class Identification:
     combinations: tuple[Combination, ...] = ()
     advice: tuple[Advice, ...] = ()
     read_off: tuple[str, ...] = ()
+    interrupted: bool = False
+
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas DataFrame: value, 95 % interval, unit, meaning."""
+        parameters = self.model.structure.parameters
+        intervals = [self.model.provenance.intervals.get(p.name) for p in parameters]
+        columns = {
+            "parameter": [p.name for p in parameters],
+            "value": [self.model.values[p.name] for p in parameters],
+            "low": [float("nan") if i is None else i.low for i in intervals],
+            "high": [float("nan") if i is None else i.high for i in intervals],
+            "unit": [p.unit for p in parameters],
+            "meaning": [p.description for p in parameters],
+        }
+        return frame(columns)
 
 
+@interruptible_work()
 @one_thread_of_algebra()
 def identify(
-    records: Sequence[Record],
+    records: Records,
     *,
     model: Model | None = None,
     stiffness: float | None = None,
@@ -66,14 +97,19 @@ def identify(
 ) -> Identification:
     """Fit the base model, or `model`, to all samples of all records.
 
+    `records` are those of one device: a record, the path of a file, a data frame or a mapping of
+    arrays (see `record_from`), or several of these.
     Maximum likelihood over all records together: every record has its own noise level (its
     residual's), initial state and offset. `stiffness` is the free stack's stiffness [N/m] from a
     data sheet; without it forces keep the scale of an assumed stiffness, and the model says so. A
     keyboard interrupt ends the search with the best fit so far, which `warnings` then says. Raises
     InputError, SimulationError.
     """
-    ready = [prepared(r) for r in records]
+    given_records = records_given(records)
+    refuse_still(given_records)
+    ready = [prepared(r) for r in given_records]
     fitted = [r for r, _ in ready]
+    refuse_few(given_records, fitted, [s for _, said in ready for s in said])
     experiments = tuple(whole(r) for r in fitted)
     start, given = chosen_start(fitted, model, stiffness)
     linear = None
@@ -88,29 +124,42 @@ def identify(
         progress=progress,
     )
     best = _with_own_levels(found.best, experiments, progress)
+    if best.interrupted:
+        current_work().wrap_up()
     determined = determinacy(
         best, experiments, not_unique=found.not_unique, assumed=assumed_ratio(best, experiments)
     )
     open_ones = free_combinations(best.model, determined, force_scale_given=given)
-    advised: tuple[Advice, ...] = ()
+    advised: tuple[Advice, ...] | None = None
     if not best.interrupted:
-        progress("what further records would tell")
-        advised = advice(best, experiments, determined, force_scale_given=given)
+        try:
+            progress("what further records would tell")
+            advised = advice(best, experiments, determined, force_scale_given=given)
+        except KeyboardInterrupt:
+            current_work().wrap_up()
     return Identification(
-        model=with_provenance(best.model, determined, records, given),
+        model=with_provenance(
+            best.model, determined, given_records, given, interrupted=best.interrupted
+        ),
         fit=best,
         determinacy=determined,
         experiments=experiments,
-        warnings=_warnings(best, determined, found, experiments),
+        warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
         sentences=tuple(s for _, said in ready for s in said),
         combinations=open_ones,
-        advice=advised,
+        advice=advised or (),
+        interrupted=advised is None,
     )
 
 
 def with_provenance(
-    model: Model, found: Determinacy, records: Sequence[Record], stiffness_given: bool
+    model: Model,
+    found: Determinacy,
+    records: Sequence[Record],
+    stiffness_given: bool,
+    *,
+    interrupted: bool = False,
 ) -> Model:
     """Return a fitted model that says from which records it comes and how sure its values are."""
     c_p = model.values.get("C_p", 0.0)
@@ -122,12 +171,27 @@ def with_provenance(
         free=found.names,
         intervals={**told, **found.intervals},
         force_scale="given" if stiffness_given else "assumed",
+        interrupted=interrupted,
         notes=(
+            *((INTERRUPTED,) if interrupted else ()),
             *(() if stiffness_given else (FORCE_NOTE,)),
             *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
     return replace(model, provenance=provenance)
+
+
+def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
+    """Return the model of the best fit so far, marked as that of a search that was interrupted."""
+    provenance = Provenance(
+        identified_from=tuple((r.name, r.sha256) for r in records),
+        package_version=__version__,
+        free=best.unknowns.names,
+        force_scale="given" if stiffness_given else "assumed",
+        notes=(INTERRUPTED, *(() if stiffness_given else (FORCE_NOTE,))),
+        interrupted=True,
+    )
+    return replace(best.model, provenance=provenance)
 
 
 def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
@@ -141,7 +205,10 @@ def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Pro
         if best.interrupted or change < 0.02:
             break
         progress("base fit with every record's own noise level")
-        best = refit(best, experiments, best.unknowns.names, sigma=levels)
+        try:
+            best = refit(best, experiments, best.unknowns.names, sigma=levels)
+        except KeyboardInterrupt:
+            return replace(best, interrupted=True, converged=False)
     return best
 
 
@@ -150,9 +217,7 @@ def _warnings(
 ) -> tuple[str, ...]:
     sentences = []
     if best.interrupted:
-        sentences.append(
-            "The search was interrupted; this is the best fit so far, and its values are not final."
-        )
+        sentences.append(INTERRUPTED)
     elif not best.converged:
         sentences.append("The fit was cut off before it converged; its values are not final.")
     sentences += _disagreement(searched)
@@ -166,6 +231,11 @@ def _warnings(
         verb = "is" if len(alone) == 1 else "are"
         sentences.append(f"{names} {verb} not determined by these records.")
     return (*sentences, *_missed(best, experiments))
+
+
+def _doubts(records: Sequence[Record]) -> list[str]:
+    """Say what of the records is unlike a stack's: unit, time, sign."""
+    return [s for doubt in (doubtful_unit, doubtful_time, doubtful_sign) if (s := doubt(records))]
 
 
 def _disagreement(searched: Search) -> list[str]:

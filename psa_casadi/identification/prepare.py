@@ -3,7 +3,7 @@
 import numpy as np
 
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.start.ordinary import static_slope
+from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.quality.fast_noise import fast_noise
 from psa_casadi.records.quality.suspects import masked, suspects

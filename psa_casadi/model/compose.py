@@ -9,20 +9,33 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.errors import InputError
 from psa_casadi.model.structure import Structure, structure_of
-from psa_casadi.variables import Input, Parameter, Provenance, State, nominal_value
+from psa_casadi.variables import (
+    Input,
+    Parameter,
+    Provenance,
+    Publication,
+    State,
+    nominal_value,
+)
 
 __all__ = ["Model", "Structure", "compose"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Model:
-    """A composed model with parameter values (SI units) and where they come from."""
+    """A composed model with parameter values (SI units), their origin, and who publishes it."""
 
     structure: Structure
     values: Mapping[str, float]
     name: str = "psa"
     description: str = ""
     provenance: Provenance = field(default_factory=Provenance)
+    publication: Publication = field(default_factory=Publication)
+
+    def __repr__(self) -> str:
+        """Return name and composition in one line."""
+        parts = ", ".join(c.name for c in self.components)
+        return f"<Model '{self.name}': {parts}; {len(self.values)} parameters>"
 
     @property
     def components(self) -> tuple[Component, ...]:
@@ -102,6 +115,11 @@ class Model:
         every = _starting(self.structure)
         return {v.name: v.start for v in every if v.start != declared.get(v.name, v.start)}
 
+    @property
+    def starts_itself(self) -> bool:
+        """Whether it has starts of its own for states or the voltage: a state to begin in."""
+        return not {"voltage", *self.state_names}.isdisjoint(self.own_starts())
+
     def with_declared_starts(self) -> "Model":
         """Return the model with the start values that its components declare."""
         return (
@@ -113,7 +131,7 @@ class Model:
     def with_starts(self, starts: Mapping[str, float]) -> "Model":
         """Return the model with other start values of states and inputs (SI units).
 
-        They are what an exported model starts from; `simulate` begins where its samples put it.
+        They are what a simulation, an exported FMU and a Modelica package start from.
         Raises InputError for a name that is neither, or a value that is not finite.
         """
         if not starts:

@@ -1,9 +1,7 @@
 """MODEL.json: a model by the names of its components, with every value, interval and origin."""
 
-import json
 import os
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Iterable
 from typing import Any
 
 from psa_casadi.component import Component
@@ -14,11 +12,10 @@ from psa_casadi.effects.patches import PATCHES
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.model_file_checks import FORMAT, check_content, first_ones, name_of
 from psa_casadi.model.own_effects import declaration_hash, known_effects
-from psa_casadi.variables import Interval, Provenance
-
-FORMAT = "psa_casadi.model/1"
-
+from psa_casadi.strict_json import json_text, parse_json, read_json_text, shown
+from psa_casadi.variables import Interval, Provenance, Publication
 
 #: What a diagnosis may add beside the effects of the table.
 _BESIDE = {c.name: c for c in (*MODAL_SERIES.values(), *PATCHES.values())}
@@ -28,7 +25,8 @@ def dumps(model: Model) -> str:
     """Return the text of MODEL.json; reading it back gives the same model exactly.
 
     An effect that is not of this package is named with its module and the hash of what it declares.
-    Raises InputError for a model with a component that is in no table and of no module.
+    Raises InputError for a model with a component that is in no table and of no module, and for
+    numbers and texts that no file can carry.
     """
     foreign = foreign_components(model)
     if foreign:
@@ -48,21 +46,29 @@ def dumps(model: Model) -> str:
             "interval": [interval.low, interval.high] if interval else None,
             "free": p.name in origin.free,
         }
-    starts = model.own_starts()
+    starts, stated = model.own_starts(), model.publication.stated
     content = {
         "format": FORMAT,
         "name": model.name,
         "description": model.description,
+        **({"publication": stated} if stated else {}),
         "components": [c.name for c in model.components if c.gain is None],
         "effects": [_reference(c) for c in model.effects],
         "parameters": parameters,
         **({"starts": starts} if starts else {}),
+        **({"interrupted": True} if origin.interrupted else {}),
         "force_scale": origin.force_scale,
         "notes": list(origin.notes),
         "identified_from": [{"record": n, "sha256": h} for n, h in origin.identified_from],
         "package_version": origin.package_version,
     }
-    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    try:
+        return json_text(content)
+    except ValueError as error:
+        raise InputError(
+            f"The model {shown(model.name)} cannot be saved as MODEL.json ({error}); give it finite"
+            " values and intervals, and plain text as name, description and notes."
+        ) from error
 
 
 def foreign_components(model: Model) -> tuple[str, ...]:
@@ -82,19 +88,11 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
 
     Raises InputError that names every unknown name, missing or bad value.
     """
-    try:
-        content = json.loads(text)
-    except ValueError as error:
-        raise InputError(
-            f"{source} is not JSON ({error}); give a file that `psa identify` or `psa diagnose`"
-            " wrote."
-        ) from error
+    content = parse_json(text, source, "give a file that `psa identify` or `psa diagnose` wrote.")
     table = {**known_effects(effects), **_BESIDE}
-    problems = _problems(content, source, table)
-    if problems:
-        raise InputError(problems)
-    components = [COMPONENTS[n] for n in content["components"]]
-    components += [table[_name_of(n)] for n in content["effects"]]
+    check_content(content, source, table)
+    components = [COMPONENTS[name_of(n)] for n in content["components"]]
+    components += [table[name_of(n)] for n in content["effects"]]
     given = content["parameters"]
     try:
         model = compose(
@@ -102,10 +100,13 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
             {n: e["value"] for n, e in given.items()},
             name=content.get("name", "psa"),
             description=content.get("description", ""),
-        ).with_starts(content.get("starts", {}))
+        ).with_starts({n: float(v) for n, v in content.get("starts", {}).items()})
     except InputError as error:
-        raise InputError([f"{source}: {problem}" for problem in error.problems]) from error
-    return model.with_values({}, provenance=_provenance(content, given))
+        said = first_ones(f"{source}: {problem}" for problem in error.problems)
+        raise InputError(said) from error
+    ordered = {p.name: given[p.name] for p in model.structure.parameters}
+    published = Publication(**content.get("publication", {}))
+    return model.with_values({}, provenance=_provenance(content, ordered), publication=published)
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
@@ -116,8 +117,8 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
 def load_model(path: str | os.PathLike[str], effects: Iterable[Component] = ()) -> Model:
     """Read MODEL.json; `effects` are own ones that it may have. Raises InputError."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_json_text(path)
+    except (OSError, ValueError) as error:
         raise InputError(
             f"The model file {path} cannot be read ({error}); give a file that `psa identify`"
             " wrote."
@@ -132,128 +133,10 @@ def _provenance(content: dict[str, Any], given: dict[str, Any]) -> Provenance:
         ),
         package_version=content.get("package_version", ""),
         free=tuple(n for n, e in given.items() if e.get("free")),
-        intervals={n: Interval(*e["interval"]) for n, e in given.items() if e.get("interval")},
+        intervals={
+            n: Interval(*map(float, e["interval"])) for n, e in given.items() if e.get("interval")
+        },
         force_scale=content.get("force_scale", "assumed"),
         notes=tuple(content.get("notes", ())),
+        interrupted=content.get("interrupted", False),
     )
-
-
-def _name_of(effect: Any) -> Any:
-    return effect.get("name") if isinstance(effect, dict) else effect
-
-
-def _problems(content: Any, source: str, effects: Mapping[str, Component]) -> list[str]:
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, dict) else type(content).__name__
-        return [
-            f"{source} is not a model file: its format is '{found}', expected '{FORMAT}';"
-            " give a file that `psa identify` or `psa diagnose` wrote."
-        ]
-    problems: list[str] = []
-    known: list[Component] = []
-    for key, table in (("components", COMPONENTS), ("effects", effects)):
-        names = content.get(key)
-        if not isinstance(names, list):
-            problems.append(f"{source}: '{key}' is missing; it must list names.")
-            continue
-        for reference in names:
-            name = _name_of(reference)
-            if isinstance(name, str) and name in table:
-                known.append(table[name])
-                problems += _changed(reference, table[name], source)
-            else:
-                problems.append(_unknown(reference, key, table, source))
-    given = content.get("parameters")
-    problems += _parameter_problems(given, known, source)
-    return problems + _origin_problems(content, given, source)
-
-
-def _unknown(reference: Any, key: str, table: Mapping[str, Component], source: str) -> str:
-    if isinstance(reference, dict) and isinstance(reference.get("module"), str):
-        module = reference["module"]
-        return (
-            f"{source}: has the effect '{reference.get('name')}' of the module {module}, which was"
-            f" not named; give --effects {module} (in Python:"
-            f" effects=psa.own_effects({module!r}).values())."
-        )
-    return f"{source}: unknown name '{reference}' in {key}; the known ones are {sorted(table)}."
-
-
-def _changed(reference: Any, component: Component, source: str) -> list[str]:
-    """Say where an own effect is not declared as it was when the file was written."""
-    if not isinstance(reference, dict) or reference.get("sha256") == declaration_hash(component):
-        return []
-    return [
-        f"{source}: the effect '{component.name}' of {component.home or 'this package'} is declared"
-        " in another way than when the file was written; restore that, or identify again."
-    ]
-
-
-def _origin_problems(content: dict[str, Any], given: Any, source: str) -> list[str]:
-    problems = [
-        f"{source}: '{key}' is {content[key]!r}; give a text."
-        for key in ("name", "description", "force_scale", "package_version")
-        if not isinstance(content.get(key, ""), str)
-    ]
-    notes = content.get("notes", [])
-    if not isinstance(notes, list) or not all(isinstance(n, str) for n in notes):
-        problems.append(f"{source}: 'notes' is {notes!r}; give a list of texts.")
-    records = content.get("identified_from", [])
-    if not isinstance(records, list) or not all(
-        isinstance(r, dict)
-        and isinstance(r.get("record"), str)
-        and isinstance(r.get("sha256"), str)
-        for r in records
-    ):
-        problems.append(f"{source}: 'identified_from' must list a record and its sha256 each.")
-    starts = content.get("starts", {})
-    if not isinstance(starts, dict) or not all(
-        isinstance(v, int | float) and not isinstance(v, bool) for v in starts.values()
-    ):
-        problems.append(f"{source}: 'starts' is {starts!r}; it must map names to numbers.")
-    entries = given if isinstance(given, dict) else {}
-    intervals = {
-        n: e["interval"] for n, e in entries.items() if isinstance(e, dict) and "interval" in e
-    }
-    return problems + [
-        f"{source}: the interval of '{name}' is {interval!r}; give [low, high] or null."
-        for name, interval in intervals.items()
-        if not (interval is None or _is_interval(interval))
-    ]
-
-
-def _is_interval(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == 2
-        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-    )
-
-
-def _parameter_problems(given: Any, known: list[Component], source: str) -> list[str]:
-    if not isinstance(given, dict):
-        return [f"{source}: 'parameters' is missing; it must map names to value and unit."]
-    problems = []
-    declared = {p.name: p for c in known for p in c.parameters}
-    for name, parameter in declared.items():
-        entry = given.get(name)
-        if not isinstance(entry, dict) or "value" not in entry:
-            problems.append(
-                f"{source}: parameter '{name}' [{parameter.unit}] has no value; add it."
-            )
-        elif not isinstance(entry["value"], int | float) or isinstance(entry["value"], bool):
-            problems.append(
-                f"{source}: the value of '{name}' is {entry['value']!r}; give a number in"
-                f" {parameter.unit}."
-            )
-        elif entry.get("unit", parameter.unit) != parameter.unit:
-            problems.append(
-                f"{source}: '{name}' is given in '{entry['unit']}'; convert it to"
-                f" '{parameter.unit}'."
-            )
-    unknown = [n for n in given if n not in declared]
-    if unknown and not problems:
-        problems.append(
-            f"{source}: unknown parameters {unknown}; remove them or add their component."
-        )
-    return problems

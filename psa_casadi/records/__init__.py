@@ -11,12 +11,19 @@ from psa_casadi.records.excitation import (
     time_grid,
     triangle,
 )
-from psa_casadi.records.read.reading import read_record, read_records
+from psa_casadi.records.read.reading import (
+    Records,
+    read_record,
+    read_records,
+    record_from,
+    records_given,
+)
 from psa_casadi.records.read.write_csv import write_record
 from psa_casadi.records.record import Record
 
 __all__ = [
     "Record",
+    "Records",
     "Waveform",
     "concatenate",
     "decaying_triangle",
@@ -24,6 +31,8 @@ __all__ = [
     "multisine",
     "read_record",
     "read_records",
+    "record_from",
+    "records_given",
     "sine",
     "steps",
     "time_grid",

@@ -13,7 +13,7 @@ from psa_casadi.units import FloatArray
 _OPTIONAL = ("displacement", "load_force", "current", "temperature")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Record:
     """Samples of one experiment in SI units; the arrays have shape (n,) and cannot be changed.
 
@@ -55,6 +55,18 @@ class Record:
             raise InputError(problems)
         if not self.sha256:
             object.__setattr__(self, "sha256", self._hash())
+
+    def __repr__(self) -> str:
+        """Return name, size and range in one line."""
+        low, high = float(self.voltage.min()), float(self.voltage.max())
+        span = ""
+        if self.mask.any():
+            size, counts = self.range_m, self.displacement_unit == "counts"
+            span = f", range {size:.4g} counts" if counts else f", range {1e6 * size:.4g} um"
+        return (
+            f"<Record '{self.name}': {self.n} samples in {self.duration:.4g} s, {low:.4g} to"
+            f" {high:.4g} V{span}>"
+        )
 
     @property
     def n(self) -> int:

@@ -1,15 +1,19 @@
-"""The C compiler, and a cache of compiled models.
+"""The C compiler, and the compiled models that are kept.
 
-The compiler is `$CC` or `cc` where there is one, else the one in the `ziglang` wheel.
+The compiler is `$CC` or `cc` where there is one, else the one in the `ziglang` wheel, which the
+extra `compiler` installs.
 """
 
+import ctypes
+import errno
 import hashlib
+import importlib.util
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -18,10 +22,15 @@ from pathlib import Path
 
 import numpy.lib.introspect
 
-from psa_casadi.errors import PsaError
+from psa_casadi.cache import VARIABLE, cached, writable_room
+from psa_casadi.errors import MachineError
+from psa_casadi.scratch import run_child
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
+#: The command that installs a C compiler where the system has none.
+INSTALL_ZIG = "pip install 'psa-casadi[compiler]'"
+_CURE = f"set CC to a working C99 compiler, or unset it and run {INSTALL_ZIG}."
 
 
 def sources_directory() -> Path:
@@ -30,37 +39,53 @@ def sources_directory() -> Path:
     for candidate in (here / "fmu_src", here.parent / "fmu_src"):
         if candidate.is_dir():
             return candidate
-    raise PsaError(
+    raise MachineError(
         "The C sources (fmu_src) are missing from this installation; reinstall psa_casadi."
     )
 
 
-def cache_directory() -> Path:
-    """Return the user's cache folder for compiled models (`PSA_CASADI_CACHE` overrides it)."""
-    override = os.environ.get("PSA_CASADI_CACHE")
-    if override:
-        return Path(override)
-    if platform.system() == "Windows":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    elif platform.system() == "Darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return base / "psa_casadi"
-
-
 def compiler_command() -> list[str]:
-    """Return the command that compiles C on this machine."""
-    wanted = os.environ.get("CC")
-    if wanted:
-        return wanted.split()
-    found = None if platform.system() == "Windows" else shutil.which("cc")
-    return [found] if found else zig_command()
+    """Return the command that compiles C on this machine.
+
+    Raises MachineError where `$CC` is no command.
+    """
+    wanted = os.environ.get("CC", "").strip()
+    if not wanted:
+        found = None if platform.system() == "Windows" else shutil.which("cc")
+        return [found] if found and not _only_asks_for_tools(found) else zig_command()
+    if shutil.which(wanted):  # a path with spaces
+        return [wanted]
+    try:
+        return shlex.split(wanted, posix=platform.system() != "Windows")
+    except ValueError as error:
+        raise MachineError(f"CC is {wanted!r}, which is no command ({error}); {_CURE}") from error
+
+
+@cache
+def _only_asks_for_tools(command: str) -> bool:
+    """A Mac without developer tools has a `cc` that compiles nothing, but asks to install them."""
+    if platform.system() != "Darwin" or command != "/usr/bin/cc":
+        return False
+    return subprocess.run(["xcode-select", "-p"], capture_output=True, check=False).returncode != 0
 
 
 def zig_command() -> list[str]:
-    """Return the command of the C compiler in the `ziglang` wheel."""
+    """Return the command of the C compiler in the `ziglang` wheel.
+
+    Raises MachineError where the wheel is not installed.
+    """
+    if not has_zig():
+        raise MachineError(
+            "There is no C compiler to be found, which turns a model into a fast program: run "
+            f"`{INSTALL_ZIG}`, or install the system's compiler (on Debian and Ubuntu `apt install "
+            "gcc libc6-dev`, on macOS `xcode-select --install`), or name one in CC."
+        )
     return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def has_zig() -> bool:
+    """Whether the `ziglang` wheel is installed."""
+    return importlib.util.find_spec("ziglang") is not None
 
 
 @cache
@@ -76,18 +101,39 @@ def vector_flags() -> tuple[str, ...]:
 
 
 def run_compiler(command: Sequence[str], directory: Path) -> None:
-    """Run a compiler command in a directory; raise PsaError with its messages if it fails."""
-    environment = dict(os.environ)
-    environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(cache_directory() / "zig"))
-    environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(cache_directory() / "zig"))
-    done = subprocess.run(
-        command, cwd=directory, env=environment, capture_output=True, text=True, check=False
-    )
+    """Run a compiler command in a directory; raise MachineError with its messages if it fails.
+
+    What it makes for itself lies in the directory too, so that it goes with it. Raises OSError
+    where the disk is full.
+    """
+    own = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(directory))
+    environment = {**os.environ, **own, "LC_ALL": "C"}  # its messages in English
+    if "ziglang" in command:
+        environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(writable_room("zig")))
+        environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(directory))
+    try:
+        done = run_child(command, directory=directory, environment=environment)
+    except OSError as error:
+        if error.errno not in (errno.ENOENT, errno.EACCES, errno.ENOEXEC):
+            raise
+        raise MachineError(
+            f"The C compiler {command[0]} cannot be started ({error.strerror}); {_CURE}"
+        ) from error
+    full = os.strerror(errno.ENOSPC)
+    if done.returncode and full in done.stderr:
+        raise OSError(errno.ENOSPC, full, str(directory))
     if done.returncode:
-        raise PsaError(
-            f"The C compiler failed ({' '.join(command[:3])} ...):\n{done.stderr[-4000:]}\n"
-            "Set CC to a working C99 compiler, or reinstall the ziglang wheel."
+        raise MachineError(
+            f"The C compiler failed ({' '.join(command[:3])} ...){_how(done.returncode)}:\n"
+            f"{done.stderr[-4000:]}\n{_CURE[0].upper()}{_CURE[1:]}"
         )
+
+
+def _how(code: int) -> str:
+    """Say what stopped a compiler that was killed."""
+    if code >= 0:
+        return ""
+    return f", killed by signal {-code}; too little memory is the likely cause"
 
 
 def shared_library(
@@ -116,36 +162,59 @@ def generated_library(
     for path in sorted(folder.glob("*.[ch]")):
         digest.update(path.name.encode() + path.read_bytes())
     suffix = {"Windows": ".dll", "Darwin": ".dylib"}.get(platform.system(), ".so")
-    target = cache_directory() / "models" / (digest.hexdigest()[:32] + suffix)
-    with _turn_of(target):
-        if not target.exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            _compile(target, generate(), [str(folder / s) for s in sources], flags)
-    return target
+    name = digest.hexdigest()[:32] + suffix
+    files = [str(folder / s) for s in sources]
+    with _turn_of(name):
+        try:
+            return cached(
+                "models", name, lambda work: _compile(work, suffix, generate(), files, flags), _load
+            )
+        except OSError as error:
+            if error.errno != errno.ENOEXEC:
+                raise
+            raise MachineError(
+                f"{error.filename}: a compiled model cannot be loaded ({error.strerror}). A folder"
+                f" from which no program may run (noexec), or a CC for another machine, is the"
+                f" likely cause; set {VARIABLE} to a folder of another disk, or unset CC."
+            ) from error
 
 
-_TURNS: defaultdict[Path, threading.Lock] = defaultdict(threading.Lock)
+_TURNS: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 _TURNS_LOCK = threading.Lock()
 
 
-def _turn_of(target: Path) -> threading.Lock:
+def _turn_of(name: str) -> threading.Lock:
     """Return the lock of a library: of threads that want the same one, the first makes it."""
     with _TURNS_LOCK:
-        return _TURNS[target]
+        return _TURNS[name]
+
+
+def _load(path: Path) -> None:
+    """Load a library; raise OSError where the system refuses it."""
+    try:
+        ctypes.CDLL(str(path))
+    except OSError as error:
+        raise OSError(errno.ENOEXEC, str(error), str(path.parent)) from error
 
 
 def _compile(
-    target: Path, generated: Mapping[str, str], sources: Sequence[str], flags: Sequence[str]
-) -> None:
-    with tempfile.TemporaryDirectory(dir=target.parent) as work:
-        for name, text in generated.items():
-            (Path(work) / name).write_text(text)
-        files = [n for n in generated if n.endswith(".c")] + list(sources)
-        output = "model" + target.suffix
-        position = () if platform.system() == "Windows" else ("-fPIC",)
-        run_compiler(
-            [*compiler_command(), *OPTIMISE, *flags, *position, "-fvisibility=hidden", "-shared",
-             "-I.", f"-I{sources_directory()}", *files, "-lm", "-o", output],
-            Path(work),
-        )  # fmt: skip
-        os.replace(Path(work) / output, target)
+    work: Path,
+    suffix: str,
+    generated: Mapping[str, str],
+    sources: Sequence[str],
+    flags: Sequence[str],
+) -> Path:
+    """Compile a library in a folder and return its path there."""
+    for name, text in generated.items():
+        (work / name).write_text(text, encoding="utf-8")
+    files = [n for n in generated if n.endswith(".c")] + list(sources)
+    output = "model" + suffix
+    position = () if platform.system() == "Windows" else ("-fPIC",)
+    command = [
+        *compiler_command(), *OPTIMISE, *flags, *position, "-fvisibility=hidden", "-shared",
+        "-I.", f"-I{sources_directory()}", *files, "-lm", "-o", output,
+    ]  # fmt: skip
+    run_compiler(command, work)
+    if not (work / output).is_file():
+        raise MachineError(f"The C compiler {command[0]} wrote no library; {_CURE}")
+    return work / output

@@ -53,7 +53,8 @@ def memory_after(
         steps += [rest / _SAMPLES] * _SAMPLES
     if not parts:
         return dict.fromkeys(names, 0.0)
-    played = simulate(model, np.append(0.0, np.cumsum(steps)), np.concatenate([[0.0], *parts]))
+    times, played_voltage = np.append(0.0, np.cumsum(steps)), np.concatenate([[0.0], *parts])
+    played = simulate(model, times, played_voltage, as_exported=False)
     ended = {n: float(played.states[n][-1]) for n in names}
     stays = {s.name: ended[s.name] for s in model.structure.states if s.memory and not s.settles}
     settled = start_state(model, _held(model, at), memory=stays).x

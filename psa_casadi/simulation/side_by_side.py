@@ -10,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from typing import TypeVar
 
+from psa_casadi.interruption import interruptible_work
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -18,10 +20,15 @@ def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[
     """Return the results for all items in their order; the first exception ends it.
 
     What has begun is finished first, what has not is left out. Context variables are the caller's.
+    A keyboard interrupt ends the simulations of what has begun, too.
     """
     given = list(items)
     if len(given) < 2:
         return [work(item) for item in given]
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+    with interruptible_work() as own, ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         contexts = [copy_context() for _ in given]
-        return list(pool.map(lambda own, item: own.run(work, item), contexts, given))
+        try:
+            return list(pool.map(lambda context, item: context.run(work, item), contexts, given))
+        except KeyboardInterrupt:
+            own.stop()
+            raise

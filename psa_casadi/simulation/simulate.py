@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +10,7 @@ import numpy.typing as npt
 from psa_casadi.errors import Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
+from psa_casadi.shown import Shown, frame
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import Steps
 from psa_casadi.simulation.ways import accurate
@@ -16,8 +18,8 @@ from psa_casadi.simulation.ways import accurate
 FloatArray = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Shown):
     """A simulated experiment in SI units; arrays of shape (n,), one per state and output.
 
     `way` tells how it was integrated, by exact steps of the linear part or by the stepper.
@@ -36,6 +38,10 @@ class Trajectory:
         name = "measured_displacement"
         return self.outputs[name if name in self.outputs else "displacement"]
 
+    def to_frame(self) -> Any:
+        """Return time, voltage, states and outputs as a pandas DataFrame, in SI units."""
+        return frame({"time": self.time, "voltage": self.voltage, **self.states, **self.outputs})
+
 
 def simulate(
     model: Model,
@@ -45,6 +51,7 @@ def simulate(
     load_force: npt.ArrayLike | None = None,
     temperature: npt.ArrayLike | None = None,
     memory: Mapping[str, float] | None = None,
+    as_exported: bool | None = None,
     from_rest_at_zero: bool = False,
     rtol: float = 1e-6,
     hold: str = "linear",
@@ -53,10 +60,13 @@ def simulate(
 
     `load_force` [N] and `temperature` [K] are samples of further inputs, each constant at its start
     value where not given. Between samples the voltage is linear (`hold="linear"`) or constant
-    (`hold="zero"`). The model
-    starts in the state that the first voltage and its rate imply, with `memory` deviations
-    (see `start_state`), or with every state at 0 if `from_rest_at_zero`. Sampled states start at
-    their declared values. The displacement errs by at most `rtol` of its range.
+    (`hold="zero"`). The displacement errs by at most `rtol` of its range.
+
+    The model starts in the state that the first voltage and its rate imply, with `memory`
+    deviations (see `start_state`). With `as_exported` it starts at its start values instead, as an
+    FMU or a Modelica package of it does; a model that has start values of its own (`settled_at`,
+    MODEL.json) does so unless a memory is given or `as_exported` is False. With `from_rest_at_zero`
+    every state starts at 0. Sampled states always start at their start values.
 
     Raises SimulationError, and InputError for samples that do not fit the times or the model.
     """
@@ -67,8 +77,13 @@ def simulate(
             given[name] = np.asarray(samples, dtype=float)
     _check(model, t, given)
     u = input_samples(model, len(t), given)
-    x0 = np.zeros(len(model.state_names))
-    if not from_rest_at_zero:
+    if as_exported is None:
+        as_exported = memory is None and model.starts_itself
+    if from_rest_at_zero:
+        x0 = np.zeros(len(model.state_names))
+    elif as_exported:
+        x0 = np.array([s.start for s in model.structure.states])
+    else:
         x0 = start_on(model, t, u, memory).x
     return _trajectory(model, t, v, *accurate(model, t, u, x0, rtol=rtol, hold=hold))
 
@@ -105,14 +120,27 @@ def _check(model: Model, t: FloatArray, given: Mapping[str, FloatArray]) -> None
 
 
 def simulate_record(
-    model: Model, record: Record, memory: Mapping[str, float] | None = None, rtol: float = 1e-6
+    model: Model,
+    record: Record,
+    memory: Mapping[str, float] | None = None,
+    rtol: float = 1e-6,
+    *,
+    as_exported: bool | None = None,
 ) -> Trajectory:
     """Simulate a model on the voltage, and the load and temperature if there are any, of a record.
 
-    Columns that are no input of the model have no influence.
+    Columns that are no input of the model have no influence. It starts as `simulate` has it.
     """
     extra = {n: getattr(record, n) for n in ("load_force", "temperature") if n in model.input_names}
-    return simulate(model, record.time, record.voltage, memory=memory, rtol=rtol, **extra)
+    return simulate(
+        model,
+        record.time,
+        record.voltage,
+        memory=memory,
+        as_exported=as_exported,
+        rtol=rtol,
+        **extra,
+    )
 
 
 def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps, way: str) -> Trajectory:

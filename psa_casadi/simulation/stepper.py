@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import Problems, PsaError
+from psa_casadi.errors import InputError, Problems, PsaError
+from psa_casadi.interruption import flag_address
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import fingerprint, generate_c
 from psa_casadi.simulation.compiler import generated_library
@@ -25,7 +26,11 @@ FloatArray = npt.NDArray[np.float64]
 #: The files of `fmu_src` that integrate a model.
 SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")
 _STAGES = 6
+#: As in instants.c: further from 0 a double does not tell the sample instants apart.
+_MOST_PERIODS = 1e13
 _POINTER = ctypes.c_void_p
+#: Status of a run that an interrupt has ended.
+_STOPPED = 4
 _REASONS = {
     1: "the step size became too small",
     2: "the model returned a value that is not finite",
@@ -48,7 +53,8 @@ class _Run(ctypes.Structure):
         ("steps_most", ctypes.c_long),
         ("x", _POINTER), ("z", _POINTER), ("y", _POINTER),
         ("count", ctypes.c_int), ("which", _POINTER), ("s0", _POINTER), ("output", ctypes.c_int),
-        ("dy", _POINTER), ("work", _POINTER), ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
+        ("dy", _POINTER), ("work", _POINTER), ("stop", _POINTER),
+        ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
         ("evaluations", ctypes.c_long), ("t_failed", ctypes.c_double), ("culprit", ctypes.c_int),
     ]  # fmt: skip
 
@@ -114,6 +120,7 @@ def run(
     arrays = _arrays(model, values or model.values, (t, u, x0), unknowns, s0)
     arrays["z0"] = _doubles(_sampled_starts(model) if z0 is None else z0)
     _check(model, arrays, hold)
+    _check_instants(model, arrays)
     nx = len(model.state_names)
     arrays["x0"] = arrays["x0"] if nx else np.zeros(1)  # C has one unused state
     count = len(unknowns)
@@ -126,10 +133,13 @@ def run(
         steps_limit=steps_limit,
         steps_most=steps_most,
         count=count,
+        stop=flag_address(),
         output=model.output_names.index(output) if count else 0,
         **{name: array.ctypes.data for name, array in arrays.items()},
     )
     status = _library(model.structure).psa_run(ctypes.byref(request))
+    if status == _STOPPED:
+        raise KeyboardInterrupt
     if status:
         state = (*model.state_names, *model.sampled_names, "none")[request.culprit]
         raise SimulationError(
@@ -212,3 +222,16 @@ def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> N
     if hold not in ("linear", "zero"):
         problems.add(f"The hold '{hold}' does not exist; use 'linear' or 'zero'.")
     problems.raise_if_any()
+
+
+def _check_instants(model: Model, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    period = model.structure.period
+    if not period:
+        return
+    seconds = float(arrays["p"][model.parameter_names.index(period)])
+    furthest = float(np.abs(arrays["t"]).max())
+    if furthest > _MOST_PERIODS * seconds:
+        raise InputError(
+            f"Sample periods of {seconds:g} s ('{period}') cannot be counted up to {furthest:g} s:"
+            " a double does not tell them apart there. Count the time from a nearer start."
+        )

@@ -1,6 +1,7 @@
 """`python -m tests.benchmarks`: the tables behind the project's figures, measured again."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -63,4 +64,8 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 app.command(epilog="Example: python -m tests.benchmarks identify --quick")(guarded(bench))
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["fuzz"]:  # it has options of its own
+        from tests.benchmarks.fuzz import app as fuzz_app
+
+        fuzz_app(sys.argv[2:], prog_name="python -m tests.benchmarks fuzz")
     app(prog_name="python -m tests.benchmarks")

@@ -101,5 +101,10 @@ BENCHES: dict[str, Bench] = {
             "design",
             "designed inputs: causes told apart, paths followed, hysteresis compensated",
         ),
+        _later(
+            "fuzz",
+            "fuzz",
+            "damaged files, hostile FMUs, kills, odd surroundings: none may fail (fuzz --help)",
+        ),
     )
 }

@@ -30,6 +30,7 @@ from psa_casadi.design.mechanism.loop import (
     mechanical_poles,
 )
 from psa_casadi.design.mechanism.polynomials import log_square, product, total
+from psa_casadi.interruption import raise_if_stopped
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -190,6 +191,7 @@ class _Problem:
             lbg=[0.0] * sum(self.free),
             ubg=[0.0] * self.free[0] + [np.inf] * self.free[1],
         )
+        raise_if_stopped()  # which the solver takes for a failure
         h = np.clip(np.array(found["x"]).ravel()[:3], low, high)
         cost = float(found["f"])
         ended = bool(self.solver.stats()["success"]) and isfinite(cost)

@@ -11,6 +11,7 @@ from psa_casadi.component import Expression
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.collocation import Chain, Interval, chain
 from psa_casadi.errors import PsaError
+from psa_casadi.interruption import raise_if_stopped
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -111,6 +112,7 @@ class Program:
             x0=np.concatenate(guess), p=path.T.ravel(), lbx=low, ubx=high,
             lbg=self._low, ubg=self._high,
         )  # fmt: skip
+        raise_if_stopped()  # which the solver takes for a failure
         stats = self._solver.stats()
         off = np.maximum(np.array(found["g"]).ravel() - self._high, 0.0)
         if not stats["success"] and not np.max(off) < _FEASIBLE:

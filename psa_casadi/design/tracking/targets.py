@@ -9,7 +9,7 @@ import numpy.typing as npt
 from psa_casadi.errors import Problems
 from psa_casadi.records.read.columns import parse_header
 from psa_casadi.records.read.csv_table import load_text, parse_numbers
-from psa_casadi.units import to_si
+from psa_casadi.units import parse_unit, to_si
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -48,6 +48,12 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     problems.raise_if_any()
     numbers = parse_numbers(text, fields, problems)
     problems.raise_if_any()
+    if parse_unit(fields["displacement"].unit).counts:
+        problems.add(
+            f"{text.where_header}: the displacement is in counts of a sensor, which is no length;"
+            " give the path in um."
+        )
+        problems.raise_if_any()
     names = list(fields)
     time, displacement = (
         to_si(numbers.values[:, names.index(n)], fields[n].unit) for n in required
@@ -65,8 +71,8 @@ def checked_target(time: FloatArray, displacement: FloatArray, where: str = "tar
         )
     elif not (np.isfinite(time).all() and np.isfinite(displacement).all()):
         problems.add(f"{where}: has samples that are missing or not finite; fill them in.")
-    elif not (np.diff(time) > 0.0).all():
-        line = int(np.flatnonzero(np.diff(time) <= 0.0)[0]) + 2
+    elif not (np.diff(time - time[0]) > 0.0).all():  # as it is used: a far start merges instants
+        line = int(np.flatnonzero(np.diff(time - time[0]) <= 0.0)[0]) + 2
         problems.add(
             f"{where}: the time does not increase at sample {line}; sort the samples and remove"
             " repeated ones."

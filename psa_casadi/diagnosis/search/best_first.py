@@ -49,8 +49,12 @@ _FINALISTS = 3
 def best_first(base: Fit, task: Task) -> Searched:
     """Return what a search from a base fit finds. Raises SimulationError where that one fails."""
     search = _Search(base, task)
-    search.run()
-    return search.result()
+    try:
+        search.run()
+        return search.result()
+    except KeyboardInterrupt:
+        task.keep(search.known.so_far().fit)
+        raise
 
 
 class _Search:

@@ -180,6 +180,10 @@ class Known:
                 return top
             self.finish([top])
 
+    def so_far(self) -> Hypothesis:
+        """Return the best of what was fitted to its end, whether worth having or not."""
+        return next(h for h in self.ranked() if h.final)
+
     def finish(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Fit hypotheses to their end."""
         if hypotheses:

@@ -1,17 +1,18 @@
-"""Trajectories of an FMU against an independent computation of the same model."""
+"""What an FMU must give: an independent computation of the same model, and its equations."""
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.export.check.rows import BREAKDOWNS
+from psa_casadi.export.check.truth import Run, Truth
 from psa_casadi.export.fmu.model_description import time_scale
-from psa_casadi.export.importer.fmu import Fmu
-from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
 from psa_casadi.simulation.stepper import run
@@ -29,16 +30,6 @@ _SLOW_STEPS = (1e-2, 1e-3, 1e-4)
 _MOST_STEPS = 6000
 _FAST_STEP, _FAST_COUNT = 1e-6, 3000
 _SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """The largest difference of one run over the range, its limit, and which output has it."""
-
-    name: str
-    figure: float
-    limit: float
-    remark: str
 
 
 def signals_of(model: Model, segment: float) -> Signals:
@@ -109,8 +100,35 @@ def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
     return found.T[np.isin(grid, times)]
 
 
-def agreements(fmu: Fmu, model: Model) -> Iterator[Agreement]:
-    """Compare both interfaces with the independent computation, communication steps 1 us to 10 ms.
+def truth_of(model: Model, version: int) -> Truth:
+    """Return what an FMU of a version of FMI is compared with; runs that fail are a problem."""
+    s = model.structure
+    switches = ca.Function("z", s.arguments, [ca.vertcat(*s.switches.values())])
+    names = model.output_names or model.state_names
+    truth = Truth(
+        model.state_names, model.input_names, model.parameter_names, model.output_names,
+        tuple(s.switches), s.f, switches, _starts(model), bool(model.sampled_names), names,
+        "reference" if has_reference(model) else "simulator", np.ones(len(names)), (),
+    )  # fmt: skip
+    try:
+        return _with_runs(truth, model, held=version == 3)
+    except BREAKDOWNS as error:
+        return replace(truth, problem=str(error))
+
+
+def _starts(model: Model) -> dict[str, float]:
+    """Return the start values of states and inputs, and the outputs that follow from them."""
+    s = model.structure
+    groups = [np.array([v.start for v in group]) for group in (s.states, s.inputs)]
+    held = [np.array([v.start for v in s.sampled])] if s.sampled else []
+    y = np.array(s.f(0.0, *groups, model.parameter_vector(), *held)[1]).ravel()
+    names = (model.state_names, model.input_names, model.output_names)
+    values = (*groups, y)
+    return {n: float(v) for k, own in enumerate(names) for n, v in zip(own, values[k], strict=True)}
+
+
+def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:
+    """Add runs of both interfaces, with communication steps of 1 us to 10 ms.
 
     A slow run has knots every 10 ms, or every multiple of 10 ms that lets the model settle; a fast
     run of 3 ms has knots every half millisecond. Inputs are linear between knots; in co-simulation
@@ -122,44 +140,23 @@ def agreements(fmu: Fmu, model: Model) -> Iterator[Agreement]:
     grids = {step: _grid(step, slow.times[-1]) for step in _SLOW_STEPS}
     times = np.unique(np.concatenate([*grids.values(), slow.times]))
     linear = expected_outputs(model, times, slow)
-    names, grid = model.output_names or model.state_names, grids[1e-3]
-    compare = _Comparison(model, names, _scale(model, names, linear))
-    settled = bool(model.sampled_names)
-    found = integrate(fmu, grid, slow, names, tolerance=_TOLERANCE)
-    yield compare("model exchange", found, linear[np.searchsorted(times, grid)])
-    if fmu.version == 3:
-        slow, fast = (replace(s, held=True) for s in (slow, fast))
-    expected = expected_outputs(model, times, slow) if slow.held else linear
-    for step, grid in grids.items():
-        found = co_simulate(fmu, grid, slow, names, tolerance=_TOLERANCE, settled=settled)
-        truth = expected[np.searchsorted(times, grid)]
-        yield compare(f"co-simulation, step {step:g} s", found, truth)
+    scale = _scale(model, truth.compared, linear)
     grid = grids[1e-3]
-    truth = expected[np.searchsorted(times, grid)]
-    found = co_simulate(fmu, grid, slow, names, settled=settled)
-    yield compare("co-simulation, default tolerance", found, truth, DEFAULT_LIMIT)
+    at = linear[np.searchsorted(times, grid)]
+    runs = [Run("model exchange", grid, slow, at, LIMIT, _TOLERANCE, integrated=True)]
+    if held:
+        slow, fast = (replace(signals, held=True) for signals in (slow, fast))
+    expected = expected_outputs(model, times, slow) if held else linear
+    for step, grid in grids.items():
+        at = expected[np.searchsorted(times, grid)]
+        runs.append(Run(f"co-simulation, step {step:g} s", grid, slow, at, LIMIT, _TOLERANCE))
+    grid = grids[1e-3]
+    at = expected[np.searchsorted(times, grid)]
+    runs.append(Run("co-simulation, default tolerance", grid, slow, at, DEFAULT_LIMIT))
     grid = _grid(_FAST_STEP, _FAST_STEP * _FAST_COUNT)
-    truth = expected_outputs(model, grid, fast)
-    found = co_simulate(fmu, grid, fast, names, tolerance=_TOLERANCE, settled=settled)
-    yield compare(f"co-simulation, step {_FAST_STEP:g} s", found, truth)
-
-
-@dataclass(frozen=True)
-class _Comparison:
-    """Says how far outputs (n, ny) are from the truth, in shares of a scale (ny,)."""
-
-    model: Model
-    names: tuple[str, ...]
-    scale: FloatArray
-
-    def __call__(
-        self, name: str, found: FloatArray, truth: FloatArray, limit: float = LIMIT
-    ) -> Agreement:
-        error = np.max(np.abs(found - truth), axis=0) / self.scale
-        worst = int(np.argmax(error))
-        by = "reference" if has_reference(self.model) else "simulator"
-        remark = f"largest in {self.names[worst]}, against the {by}"
-        return Agreement(name, float(error[worst]), limit, remark)
+    at = expected_outputs(model, grid, fast)
+    runs.append(Run(f"co-simulation, step {_FAST_STEP:g} s", grid, fast, at, LIMIT, _TOLERANCE))
+    return replace(truth, scale=scale, runs=tuple(runs))
 
 
 def _grid(step: float, end: float) -> FloatArray:

@@ -172,11 +172,15 @@ def parameter_changes(fmu: Fmu) -> Problems:
 
 
 def _changed(fmu: Fmu) -> dict[str, float]:
-    """Return all parameters, each 3 % from its start."""
+    """Return all tunable parameters, each 3 % from its start, to the side that its bounds allow."""
     with fmu.open(CO_SIMULATION) as slave:
         slave.setup()
-        names = fmu.names("parameter")
-        return {n: 1.03 * v for n, v in zip(names, slave.get(names), strict=True)}
+        names = fmu.tunable()
+        changed, bounds = {}, fmu.bounds
+        for name, value in zip(names, slave.get(names), strict=True):
+            low, high = bounds[name]
+            changed[name] = next(c for c in (1.03 * value, 0.97 * value, value) if low <= c <= high)
+        return changed
 
 
 def _run_changed(fmu: Fmu, starts: dict[str, float], when: int) -> FloatArray:
@@ -234,7 +238,8 @@ def snapshots(fmu: Fmu) -> Problems:
 
 def _damaged(data: bytes) -> Iterator[tuple[bytes, str]]:
     """Yield serialised states with something wrong, and what."""
-    for place, what in ((0, "foreign"), (len(data) // 2, "damaged")):
+    damaged = ((len(data) * share // 16, "damaged") for share in range(4, 16))
+    for place, what in ((0, "foreign"), *damaged):
         yield data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :], what
     yield data[:-1], "truncated"
     yield data[:8], "truncated"

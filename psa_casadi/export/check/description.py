@@ -2,14 +2,25 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import fields, replace
 from typing import Any
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.common.publication import (
+    LICENSE_ENTRY,
+    SOURCES_NOTICE,
+    code_license,
+    copyright_line,
+    terms_of_code,
+)
 from psa_casadi.export.importer.archive import FUNCTIONS, Archive
 from psa_casadi.export.importer.binary_file import read_binary
 from psa_casadi.export.importer.calls import MODEL_EXCHANGE
 from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.compiler import INSTALL_ZIG
 from psa_casadi.units import parse_unit
+from psa_casadi.variables import Publication
 
 #: The newest version of the GNU C library that a binary may need.
 _NEWEST_LIBC = (2, 17)
@@ -100,7 +111,38 @@ def new_libraries(archive: Archive) -> Iterator[str]:
         for need in sorted(n for n in needs if n.startswith("GLIBC_")):
             version = need.removeprefix("GLIBC_").split(".")
             if not all(p.isdigit() for p in version) or tuple(map(int, version)) > _NEWEST_LIBC:
-                yield f"{place} needs {need}"
+                yield (
+                    f"{place} needs {need}, which older systems lack; for one that loads on them"
+                    f" run `{INSTALL_ZIG}` and export it again"
+                )
+
+
+def missing_notices(archive: Archive) -> Iterator[str]:
+    """An FMU with C code of this package states its licence and holds the notice of that code."""
+    for name in ("license", "copyright"):
+        if not getattr(archive.description, name):
+            yield f"the description states no {name}"
+    if not str(archive.description.generationTool).startswith("psa_casadi"):
+        return
+    places = [LICENSE_ENTRY]
+    places += [f"sources/{SOURCES_NOTICE}"] if (archive.directory / "sources").is_dir() else []
+    for place in places:
+        path = archive.directory / place
+        if not path.is_file():
+            yield f"{place} is missing"
+        elif code_license() not in path.read_text(encoding="utf-8", errors="replace"):
+            yield f"{place} lacks the notice '{copyright_line()}' with its terms"
+
+
+def published_as(archive: Archive, model: Model) -> Model:
+    """Return the model with author, version and terms as the FMU states them.
+
+    They are given at the export, and say nothing of what the model computes.
+    """
+    said = {f.name: getattr(archive.description, f.name) or "" for f in fields(Publication)}
+    unstated = terms_of_code()
+    own = {name: text for name, text in said.items() if text != unstated.get(name)}
+    return replace(model, publication=Publication(**own))
 
 
 def _functions(archive: Archive) -> frozenset[str]:

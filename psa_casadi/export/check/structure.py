@@ -5,23 +5,34 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE, Instance
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.instance3 import Instance3
-from psa_casadi.model.compose import Model
 
 FloatArray = npt.NDArray[np.float64]
+IndexArray = npt.NDArray[np.int64]
 _POINTS = 3
+#: Columns and rows of the derivatives of a step that are compared.
+_MOST = 24
+#: Difference that rounding may make, as a share of the nominal value.
+_ROUNDING = 1e-12
 
 
 def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
-    """Return values of time, states, inputs and parameters; no gain is 0, all keep their bounds."""
+    """Return values of time, states, inputs and parameters; no gain is 0, all keep their bounds.
+
+    Parameters stay so far inside that they can be moved by 1 % and differentiated.
+    """
     point = {"time": float(generator.uniform(0.1, 1.0))}
+    bounds = fmu.bounds
     for v in fmu.description.modelVariables:
-        if v.causality == "parameter":
+        if v.variability == "tunable":
             start = float(v.start) or 0.1 * fmu.nominals[v.name]
             value = start * generator.uniform(0.95, 1.05)
-            point[v.name] = min(max(value, float(v.min or -np.inf)), float(v.max or np.inf))
+            low, high = bounds[v.name]
+            margin = min(0.02 * max(abs(value), fmu.nominals[v.name]), 0.25 * (high - low))
+            point[v.name] = min(max(value, low + margin), high - margin)
     for name in (*fmu.states(), *fmu.names("input")):
         point[name] = float(fmu.nominals[name] * generator.uniform(-1.0, 1.0))
     return point
@@ -103,9 +114,10 @@ def directional_error(fmu: Fmu) -> float:
 def adjoint_error(fmu: Fmu) -> float:
     """Return the largest difference of adjoint from directional derivatives, FMI 3.0 only.
 
-    Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step;
-    each row in nominal units of the knowns, relative to its largest entry. Sampled states are held;
-    a step into which an instant falls is not differentiated.
+    Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step,
+    there of at most `_MOST` columns and rows, for each of which the step is made again. Each row is
+    in nominal units of the knowns, relative to its largest entry. Sampled states are held; a step
+    into which an instant falls is not differentiated.
     """
     generator = np.random.default_rng(4)
     unknowns = [*fmu.names("output"), *(u.variable.name for u in fmu.description.derivatives)]
@@ -120,24 +132,54 @@ def adjoint_error(fmu: Fmu) -> float:
         instance.set({n: point[n] for n in fmu.names("input")})
         instance.step(0.0, fmu.step_size)
         through = [] if fmu.sampled() else fmu.states()
-        return max(worst, _transposed(instance, [*unknowns, *through], knowns, size))
+        return max(worst, _transposed(instance, [*unknowns, *through], knowns, size, _MOST))
 
 
 def _transposed(
-    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray
+    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray, most: int = 10**6
 ) -> float:
-    """Return the largest difference of the matrix by rows from the one by columns."""
-    columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))]
-    rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))]
-    forward, backward = np.array(columns).T * size, np.array(rows) * size
-    largest = np.max(np.abs(forward), axis=1, initial=1e-300)
-    return float(np.max(np.abs(forward - backward) / largest[:, None]))
+    """Return the largest difference of the matrix by rows from the one by columns, `most` of each.
+
+    Those that are left out lie evenly among the others.
+    """
+    across, down = (_some(len(names), most) for names in (knowns, unknowns))
+    columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))[across]]
+    rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))[down]]
+    forward, backward = np.array(columns).T[down] * size[across], np.array(rows) * size
+    largest = np.max(np.abs(backward), axis=1, initial=1e-300)
+    return float(np.max(np.abs(forward - backward[:, across]) / largest[:, None]))
 
 
-def equation_error(fmu: Fmu, model: Model) -> float:
+def _some(count: int, most: int) -> IndexArray:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+
+
+def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
+    """An instance that nothing was set in starts where a simulation of the model does.
+
+    That is at the start values of its states and inputs, with the outputs that follow from them.
+    """
+    for interface, kind in ((CO_SIMULATION, "co-simulation"), (MODEL_EXCHANGE, "model exchange")):
+        with fmu.start(interface) as instance:
+            found = instance.get(list(truth.starts))
+        others = [
+            (name, there, value)
+            for (name, value), there in zip(truth.starts.items(), found, strict=True)
+            if abs(there - value) > _ROUNDING * (abs(value) + fmu.nominals[name])
+        ]
+        if others:
+            name, there, value = next((o for o in others if o[0] == "voltage"), others[-1])
+            yield (
+                f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}, and"
+                f" {len(others) - 1} more values differ; compare with the model that was exported,"
+                " with its --start-voltage and --history"
+            )
+
+
+def equation_error(fmu: Fmu, truth: Truth) -> float:
     """Return the largest relative difference of derivatives and outputs from the model's."""
     generator = np.random.default_rng(3)
-    unknowns = [*(f"der({n})" for n in model.state_names), *model.output_names]
+    unknowns = [*(f"der({n})" for n in truth.state_names), *truth.output_names]
     worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
     with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
         for _ in range(_POINTS):
@@ -145,9 +187,9 @@ def equation_error(fmu: Fmu, model: Model) -> float:
             found = evaluate(instance, point, unknowns)
             vectors = [
                 np.array([point[n] for n in names])
-                for names in (model.state_names, model.input_names, model.parameter_names)
+                for names in (truth.state_names, truth.input_names, truth.parameter_names)
             ]
-            xdot, y = model.structure.f(point["time"], *vectors, *held_values(instance))
+            xdot, y = truth.f(point["time"], *vectors, *held_values(instance))
             expected = np.concatenate([np.array(xdot).ravel(), np.array(y).ravel()])
             size = np.abs(expected) + np.abs(found) + 1e-300
             worst = max(worst, float(np.max(np.abs(found - expected) / size)))

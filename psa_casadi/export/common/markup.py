@@ -8,6 +8,7 @@ from xml.etree import ElementTree as ET
 import casadi as ca
 import numpy as np
 
+from psa_casadi.characters import check_text
 from psa_casadi.export.common.variable_table import Variable
 from psa_casadi.model.compose import Model
 from psa_casadi.units import Unit, parse_unit
@@ -30,6 +31,7 @@ CAUSALITY = {
     "input": {"causality": "input", **_CONTINUOUS},
     "output": {"causality": "output", **_CONTINUOUS, "initial": "calculated"},
     "parameter": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
+    "option": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
     "indicator": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
     "sampled": {"causality": "local", "variability": "discrete", "initial": "exact"},
 }
@@ -95,9 +97,14 @@ def number(value: float) -> str:
 
 
 def xml_text(root: ET.Element) -> str:
-    """Return an indented XML document that ends with a line end."""
+    """Return an indented XML document that ends with a line end.
+
+    Raises InputError for a character that XML cannot carry, which a parser would stop at.
+    """
     ET.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+    text = ET.tostring(root, encoding="unicode")
+    check_text(text, f"{root.tag.rpartition('}')[2]}, an XML file,")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'
 
 
 def log_categories(root: ET.Element) -> None:

@@ -13,10 +13,11 @@ class Variable:
     """One variable as FMI describes it, in SI units.
 
     `kind` is time, state, derivative, input, output, parameter, indicator (zero where a derivative
-    has a kink) or sampled (a state that changes at sample instants only); `index` is its place in
-    the vector of its kind; the value reference is the place in the table. Only a state, an input, a
-    parameter and a sampled state have a `start`; a derivative has no nominal; an indicator, of
-    which only the sign counts, has neither unit nor nominal.
+    has a kink), sampled (a state that changes at sample instants only) or option (how the FMU takes
+    its inputs, no part of the model); `index` is its place in the vector of its kind; the value
+    reference is the place in the table. Only a state, an input, a parameter, an option and a
+    sampled state have a `start`; a derivative has no nominal; an indicator, of which only the sign
+    counts, has neither unit nor nominal.
     """
 
     name: str
@@ -30,8 +31,18 @@ class Variable:
     bounds: tuple[float, float] | None = None
 
 
+#: How an importer without derivatives of inputs (FMI 3.0) gets along with coarse steps.
+INPUT_LINE = Variable(
+    "input_line", "option", 0, "1",
+    "co-simulation: 1 continues inputs along the line through their last two values, 0 holds them",
+    None, 0.0, 1.0, (0.0, 1.0),
+)  # fmt: skip
+
+
 def variable_table(model: Model) -> tuple[Variable, ...]:
     """Return time, states, derivatives, inputs, outputs, parameters, indicators, sampled states.
+
+    Last, where there are inputs, comes the option `input_line` of co-simulation.
 
     This is the layout of `fmi_data.h`. The indicator of a switch is named `switch.<name>`, as FMI's
     structured names have parentheses for der() only.
@@ -63,7 +74,7 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
         ),
         *(
             Variable(q.name, "parameter", i, q.unit, q.description, q.display_unit, values[q.name],
-                     q.typical(values), q.bounds)
+                     abs(values[q.name]) or q.typical(values), q.bounds)
             for i, q in enumerate(s.parameters)
         ),
         *(
@@ -76,6 +87,7 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
                      nominal_value(q.nominal, values))
             for i, q in enumerate(s.sampled)
         ),
+        *([INPUT_LINE] if s.inputs else []),
     ]  # fmt: skip
     _refuse(model, table)
     return tuple(table)
@@ -102,6 +114,12 @@ def _refuse(model: Model, table: list[Variable]) -> None:
     problems = [
         f"Two variables of '{model.name}' are named '{name}', which FMI does not allow; rename one."
         for name in sorted({n for n in names if names.count(n) > 1})
+    ]
+    problems += [
+        f"A variable of '{model.name}' is named {name!r}; quotes, backslashes and control"
+        " characters cannot stand in the sources of an FMU: rename it."
+        for name in names
+        if re.search(r'["\\\x00-\x1f\ud800-\udfff]', name)
     ]
     if not (model.structure.states or model.structure.sampled):
         problems.append(f"The model '{model.name}' has no state; add a component that has one.")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
+from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
+from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.model_description import model_description
@@ -45,7 +47,7 @@ def export_fmu(
     same bytes. The file is written whole or not at all.
 
     Raises InputError for an impossible name, an unknown platform or version, or a model without
-    states, and PsaError if a compiler fails.
+    states, and MachineError if a compiler fails.
     """
     identifier = name or model.name
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
@@ -77,11 +79,12 @@ def _companions(model: Model, fmi: int) -> dict[str, bytes]:
     A model that cannot be simulated with its own values is exported without a reference run.
     """
     try:
-        entries = reference_entries(model)
+        entries, step = reference_entries(model), held_step(model)
     except SimulationError:
-        entries = {}
-    page = documentation(model, reference_run=bool(entries))
+        entries, step = {}, None
+    page = documentation(model, reference_run=bool(entries), step=step)
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
+    entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])
     entries |= {"model.png": drawing} if fmi == 2 else terminal_entries(model)
     if not foreign_components(model):

@@ -19,6 +19,7 @@ from psa_casadi.export.common.markup import (
     value_attributes,
     xml_text,
 )
+from psa_casadi.export.common.publication import published
 from psa_casadi.export.common.variable_table import Variable, variable_table
 from psa_casadi.export.fmu.dependencies import dependencies, without_sampled
 from psa_casadi.model.compose import Model, Structure
@@ -36,6 +37,7 @@ def model_description(model: Model, identifier: str, token: str, sources: Sequen
             "modelName": model.name,
             "guid": token,
             "description": describe(model),
+            **published(model),
             "generationTool": generation_tool(),
             "variableNamingConvention": "structured",
             "numberOfEventIndicators": str(len(model.structure.switches)),

@@ -17,6 +17,7 @@ from psa_casadi.export.common.markup import (
     value_attributes,
     xml_text,
 )
+from psa_casadi.export.common.publication import published
 from psa_casadi.export.common.variable_table import Variable, variable_table
 from psa_casadi.export.fmu.dependencies import Key, dependencies, without_sampled
 from psa_casadi.model.compose import Model, Structure
@@ -54,6 +55,7 @@ def model_description3(model: Model, identifier: str, token: str, sources: Seque
             "modelName": model.name,
             "instantiationToken": token,
             "description": describe(model),
+            **published(model),
             "generationTool": generation_tool(),
             "variableNamingConvention": "structured",
         },

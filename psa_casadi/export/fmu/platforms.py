@@ -2,19 +2,20 @@
 
 import hashlib
 import platform
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from psa_casadi.cache import cached
 from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.sources import compiled_files
-from psa_casadi.files import atomic_path
+from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import (
+    INSTALL_ZIG,
     OPTIMISE,
-    cache_directory,
     compiler_command,
+    has_zig,
     run_compiler,
     zig_command,
 )
@@ -68,7 +69,8 @@ def host_platform() -> Platform:
 def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     """Return the platforms named: names of `PLATFORMS`, "host" or "all"; each once, in order.
 
-    Raises InputError for a name that is not known.
+    Raises InputError for a name that is not known, and for platforms that are not this machine's
+    where the `ziglang` compiler is not installed.
     """
     unknown = [n for n in names if n not in (*PLATFORMS, "host", "all")]
     if unknown or not names:
@@ -81,6 +83,12 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     for name in names:
         found = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
         chosen.update({p.name: p for p in found})
+    foreign = ", ".join(n for n in chosen if n != host_platform().name)
+    if foreign and not has_zig():
+        raise InputError(
+            f"The machine's own compiler makes no binary for {foreign}; run `{INSTALL_ZIG}`, or"
+            " export for the host alone."
+        )
     return tuple(chosen.values())
 
 
@@ -88,9 +96,10 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     """Compile sources to a shared library that exports only FMI functions; return its bytes.
 
     What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
-    version, so that the same model is compiled once. A machine's own compiler may change unseen.
+    version, so that the same model is compiled once. Without it, this machine's binary is made by
+    its own compiler, which may change unseen, and for its own C library.
 
-    Raises PsaError with the compiler's messages if it fails.
+    Raises MachineError with the compiler's messages if it fails.
     """
     output = identifier + target.suffix
     own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
@@ -99,26 +108,22 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
         *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
         "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
     ]  # fmt: skip
-    if target.target is None:
-        return _compiled(texts, [*compiler_command(), *arguments], output)
+    if target.target is None or not has_zig():
+        with temporary_folder() as work:
+            return _compiled(work, texts, [*compiler_command(), *arguments], output).read_bytes()
     arguments = ["-target", target.target, *arguments]
     content = (version("ziglang"), arguments, sorted(texts.items()))
     digest = hashlib.sha256(repr(content).encode("utf-8")).hexdigest()[:32]
-    kept = cache_directory() / "binaries" / (digest + target.suffix)
-    try:
-        return kept.read_bytes()
-    except FileNotFoundError:
-        made = _compiled(texts, [*zig_command(), *arguments], output)
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(kept) as temporary:
-        temporary.write_bytes(made)
-    return made
+    command = [*zig_command(), *arguments]
+    kept = cached(
+        "binaries", digest + target.suffix, lambda work: _compiled(work, texts, command, output)
+    )
+    return kept.read_bytes()
 
 
-def _compiled(texts: Mapping[str, str], command: Sequence[str], output: str) -> bytes:
-    """Run a compiler in a folder of the sources; return the bytes of the file it wrote."""
-    with tempfile.TemporaryDirectory() as directory:
-        for name, text in texts.items():
-            (Path(directory) / name).write_text(text, encoding="utf-8", newline="\n")
-        run_compiler(command, Path(directory))
-        return (Path(directory) / output).read_bytes()
+def _compiled(work: Path, texts: Mapping[str, str], command: Sequence[str], output: str) -> Path:
+    """Run a compiler in a folder, with the sources; return the path of the file it wrote."""
+    for name, text in texts.items():
+        (work / name).write_text(text, encoding="utf-8", newline="\n")
+    run_compiler(command, work)
+    return work / output

@@ -2,11 +2,10 @@
 
 The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives alike.
 
-Source: FMI Layered Standard References (FMI-LS-REF) 1.0.0-alpha.1 and the Experiments Format of
+Source: FMI Layered Standard References (FMI-LS-REF) 1.0.0-beta.1 and the Experiments Format of
 the Modelica Association that it refers to.
 """
 
-import hashlib
 import math
 from collections.abc import Sequence
 from xml.etree import ElementTree as ET
@@ -56,7 +55,7 @@ def reference_entries(model: Model) -> dict[str, bytes]:
 
     Raises SimulationError if the model cannot be simulated with its own values.
     """
-    times, inputs = _inputs(model)
+    times, inputs = reference_inputs(model)
     start = np.array([s.start for s in model.structure.states])
     outputs = _rounded(run(model, times, inputs, start, rtol=_OWN_TOLERANCE).y)
     texts = {
@@ -69,7 +68,7 @@ def reference_entries(model: Model) -> dict[str, bytes]:
         name=model.name, segment=_segment(model), stop=times[-1], step=times[1], inputs=INPUTS,
         outputs=OUTPUTS, parameters=PARAMETERS, own=_OWN_TOLERANCE, digits=_DIGITS,
     )  # fmt: skip
-    texts["fmi-ls-manifest.xml"] = _manifest({**texts, f"../../{NOTES}": notes})
+    texts["fmi-ls-manifest.xml"] = _manifest()
     entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
     return {**entries, NOTES: notes.encode("utf-8")}
 
@@ -79,7 +78,7 @@ def _segment(model: Model) -> float:
     return 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
 
 
-def _inputs(model: Model) -> tuple[FloatArray, FloatArray]:
+def reference_inputs(model: Model) -> tuple[FloatArray, FloatArray]:
     """Return times (n,) and inputs (n, nu): from start to start + nominal, each shape shifted.
 
     A temperature moves by a tenth of its nominal.
@@ -145,15 +144,14 @@ _RELATED = {
 }
 
 
-def _manifest(texts: dict[str, str]) -> str:
-    """Return fmi-ls-manifest.xml, which lists the files with their SHA3-256 checksums."""
+def _manifest() -> str:
+    """Return fmi-ls-manifest.xml, which lists the files: their kind, role and meaning."""
     ET.register_namespace("fmi-ls", _NAMESPACE)
     said = "Layered Standard providing information on related files included in an FMU."
-    name = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-alpha.1", "description": said}
+    name = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-beta.1", "description": said}
     attributes = {f"{{{_NAMESPACE}}}fmi-ls-{key}": value for key, value in name.items()}
     root = ET.Element("fmiReferences", attributes)
     for source, (kind, role, meaning) in _RELATED.items():
-        digest = hashlib.sha3_256(texts[source].encode("utf-8")).hexdigest()
         attributes = {"type": kind, "source": source, "role": role, "description": meaning}
-        ET.SubElement(root, "Related", {**attributes, "checksum": digest})
+        ET.SubElement(root, "Related", attributes)
     return xml_text(root)

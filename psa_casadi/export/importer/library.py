@@ -23,12 +23,12 @@ class Library(Archive):
     Raises InputError if the file is no FMU, or has no binary for this machine, or a damaged one.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        super().__init__(path, unpacked)
         try:
             self.library = self._load()
         except InputError:
-            self._folder.cleanup()
+            self._held.close()
             raise
         for name in FUNCTIONS[self.version]:
             if hasattr(self.library, self.prefix + name):

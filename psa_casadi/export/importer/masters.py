@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.integrate import solve_ivp
 
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
@@ -153,6 +152,8 @@ def _solved(
     tolerance: float, atol: FloatArray, wanted: FloatArray,
 ) -> list[tuple[float, FloatArray]]:  # fmt: skip
     """Return times and states at the wanted times of a span, and at its end."""
+    from scipy.integrate import solve_ivp  # noqa: PLC0415 - half a second that few need
+
     solution = solve_ivp(
         rates, span, x, method="LSODA", rtol=tolerance, atol=atol,
         t_eval=np.union1d(wanted, [span[1]]),

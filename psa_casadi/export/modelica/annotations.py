@@ -50,5 +50,6 @@ def equations_table(model: Model) -> str:
 
 
 def about(model: Model) -> list[str]:
-    """Return what the model is and which program wrote the file."""
-    return [describe(model), f"Written by {generation_tool()}."]
+    """Return what the model is, who publishes it on what terms, and which program wrote it."""
+    said = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
+    return [describe(model), said, f"Written by {generation_tool()}."]

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from psa_casadi.characters import check_text
 from psa_casadi.component import BALANCES
 from psa_casadi.errors import Problems
 from psa_casadi.export.common.icon import drawing_of
@@ -38,15 +39,15 @@ def export_modelica(
     the signals for them) and `Examples`. Sensor and environment stay out unless `include_sensor`.
     The same model gives the same text. The file is written whole or not at all.
 
-    Raises InputError for an impossible name, values that are not finite, and an operation that
-    Modelica does not have.
+    Raises InputError for an impossible name, values that are not finite, a text with a character
+    that no document can carry, and an operation that Modelica does not have.
     """
     atomic_write(path, modelica_text(model, name=name, include_sensor=include_sensor))
     return Path(path)
 
 
 def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: bool = False) -> str:
-    """Return the text that `export_modelica` writes."""
+    """Return the text that `export_modelica` writes; raises what it raises."""
     check_identifier(name, "a Modelica package")
     exported = model if include_sensor else model.plant()
     _refuse(exported)
@@ -54,9 +55,13 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
     for part in _parts(exported):
         lines += ["", *(f"  {line}" if line else line for line in "\n".join(part).split("\n"))]
     uses = ', uses(Modelica(version="4.0.0"))' if has_ports(exported) else ""
+    number = model.publication.version
+    version = f", version={string(number)}" if number else ""
     sampled = [_SAMPLING] if exported.sampled_names else []
     text = documentation([*about(exported), _USE + _starts(exported), *sampled])
-    return "\n".join([*lines, "", f"  annotation({text}{uses});", f"end {name};", ""])
+    whole = "\n".join([*lines, "", f"  annotation({text}{version}{uses});", f"end {name};", ""])
+    check_text(whole, f"The Modelica package {name}")
+    return whole
 
 
 def class_names(model: Model) -> tuple[str, ...]:

@@ -4,17 +4,20 @@ Source: SSP 1.0, section 4.1 (packaging).
 """
 
 import os
-import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.export.ssp.layout import OUTSIDE, Layout, Port, Wire, arrange
 from psa_casadi.export.ssp.parameters import parameter_files
+from psa_casadi.export.ssp.steps import master_step
 from psa_casadi.export.ssp.structure import WiredParts, structure_description
 from psa_casadi.export.ssp.wiring_picture import save_wiring, wiring_svg
 from psa_casadi.files import atomic_path
 from psa_casadi.model.system.system import System
+from psa_casadi.scratch import temporary_folder
+from psa_casadi.variables import Publication
 
 __all__ = ["export_ssp", "layout_of", "save_wiring", "wiring_of"]
 
@@ -30,32 +33,46 @@ def export_ssp(
     *,
     platforms: Sequence[str] = ("host",),
     stop_time: float = STOP_TIME,
+    publication: Publication | None = None,
 ) -> Path:
     """Write a system as an SSP archive (SSP 1.0, FMUs of FMI 2.0) and return its path.
 
     The archive holds `SystemStructure.ssd` with units, connectors, wires and their drawing; in
     `resources` the FMU of each part and the parameter sets; the picture of the wiring as SVG. The
-    same system gives the same bytes. `platforms` are those of `export_fmu`.
+    same system gives the same bytes. `platforms` are those of `export_fmu`. `publication` says who
+    made the system and on what terms it is passed on; a part that says nothing of it says the same.
 
     Raises what `connect` and `export_fmu` raise.
     """
     system.model()
-    wiring = wiring_of(system)
+    wiring = _published(wiring_of(system), publication)
     layout = layout_of(wiring)
     entries, bindings = parameter_files(wiring.parts, wiring.name)
-    description = structure_description(wiring, layout, bindings, stop_time)
+    description = structure_description(
+        wiring, layout, bindings, stop_time, master_step(wiring, stop_time)
+    )
     entries["SystemStructure.ssd"] = description.encode("utf-8")
     entries[PICTURE_ENTRY] = wiring_svg(wiring, layout).encode("utf-8")
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         for name, model in wiring.parts.items():
             fmu = export_fmu(
-                model, Path(folder) / f"{name}.fmu", name=name, include_sensor=True,
+                model, folder / f"{name}.fmu", name=name, include_sensor=True,
                 platforms=platforms,
             )  # fmt: skip
             entries[f"resources/{name}.fmu"] = fmu.read_bytes()
     with atomic_path(path) as temporary:
         write_archive(temporary, entries)
     return Path(path)
+
+
+def _published(wiring: WiredParts, publication: Publication | None) -> WiredParts:
+    if publication is None:
+        return wiring
+    parts = {
+        name: part if part.publication.stated else replace(part, publication=publication)
+        for name, part in wiring.parts.items()
+    }
+    return replace(wiring, parts=parts, publication=publication)
 
 
 def layout_of(wiring: WiredParts) -> Layout:

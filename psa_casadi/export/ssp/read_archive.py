@@ -1,7 +1,5 @@
 """An SSP archive read back: its FMUs loaded, its wires, the values of its parameter sets."""
 
-import tempfile
-import zipfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
@@ -10,7 +8,9 @@ from fmpy.ssp.ssd import read_ssd
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.unpack import unpack
 from psa_casadi.export.ssp.layout import OUTSIDE, Port, Wire
+from psa_casadi.scratch import temporary_folder
 
 
 class SspArchive:
@@ -24,12 +24,9 @@ class SspArchive:
 
     def __init__(self, path: Path) -> None:
         self._held = ExitStack()
-        folder = Path(
-            self._held.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
-        )
+        folder = self._held.enter_context(temporary_folder())
         try:
-            with zipfile.ZipFile(path) as archive:
-                archive.extractall(folder)
+            unpack(path, folder)
             system: Any = read_ssd(str(path)).system
         except Exception as error:  # fmpy raises it for any damage
             self._held.close()
@@ -37,7 +34,8 @@ class SspArchive:
             raise InputError(problem) from error
         try:
             self.fmus = {
-                c.name: self._held.enter_context(Fmu(folder / c.source)) for c in system.elements
+                c.name: self._held.enter_context(Fmu(_inside(folder, str(c.source))))
+                for c in system.elements
             }
         except InputError:
             self._held.close()
@@ -74,6 +72,16 @@ class SspArchive:
                 f" every variable of its parts ({', '.join(self.fmus)}) as 'part.variable'."
             )
         return part, variable
+
+
+def _inside(folder: Path, source: str) -> Path:
+    """Return the place of a part; raises InputError if it is not one inside the archive."""
+    place = (folder / source).resolve()
+    if not place.is_relative_to(folder.resolve()):
+        raise InputError(
+            f"The part {source!a} lies outside the SSP archive; export the archive again."
+        )
+    return place
 
 
 def _parameters(system: Any) -> dict[str, dict[str, float]]:

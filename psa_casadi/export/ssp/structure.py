@@ -4,7 +4,7 @@ Source: SSP 1.0, section 5 (system structure description) and section 4.4 (commo
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import (
@@ -17,11 +17,20 @@ from psa_casadi.export.common.markup import (
 from psa_casadi.export.ssp.layout import OUTSIDE, Box, Layout, Port, Wire
 from psa_casadi.model.compose import Model
 from psa_casadi.units import parse_unit
+from psa_casadi.variables import Publication
 
 SSD = "http://ssp-standard.org/SSP1/SystemStructureDescription"
 SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+#: Namespace of the annotations of OMSimulator, which knows them by the prefix "oms" only.
+OMS = "https://raw.githubusercontent.com/OpenModelica/OMSimulator/master/schema/oms.xsd"
+#: Relative tolerance that its master asks of the parts.
+TOLERANCE = 1e-6
+#: Rows of its table of results.
+_ROWS = 1000
 SSV_TYPE = "application/x-ssp-parameter-set"
 SSM_TYPE = "application/x-ssp-parameter-mapping"
+#: What SSP calls otherwise than FMI does.
+_PUBLISHED = {"version": "fileversion"}
 
 
 @dataclass(frozen=True)
@@ -34,6 +43,7 @@ class WiredParts:
     name: str
     parts: Mapping[str, Model]
     wires: tuple[Wire, ...]
+    publication: Publication = field(default_factory=Publication)
 
     def unit(self, port: Port) -> str:
         """Return the unit of a port; that of the system is the unit of what it is wired to."""
@@ -63,15 +73,26 @@ class Binding:
 
 
 def structure_description(
-    wiring: WiredParts, layout: Layout, bindings: Sequence[Binding], stop_time: float
+    wiring: WiredParts,
+    layout: Layout,
+    bindings: Sequence[Binding],
+    stop_time: float,
+    step: float,
 ) -> str:
-    """Return the XML text of SystemStructure.ssd; FMUs are `resources/<part>.fmu`."""
+    """Return the XML text of SystemStructure.ssd; FMUs are `resources/<part>.fmu`.
+
+    SSP 1.0 has no place for a communication step: `step` [s] stands in an annotation that
+    OMSimulator reads, and without which it opens no archive. A SystemGeometry is one that it
+    refuses; without it the drawing extends over all elements, as the standard has it.
+    """
     ET.register_namespace("ssd", SSD)
     ET.register_namespace("ssc", SSC)
+    ET.register_namespace("oms", OMS)
+    said = {_PUBLISHED.get(name, name): text for name, text in wiring.publication.stated.items()}
+    attributes = {"version": "1.0", "name": wiring.name, **said}
     root = _element(
-        None, "SystemStructureDescription",
-        {"version": "1.0", "name": wiring.name, "generationTool": generation_tool()},
-    )  # fmt: skip
+        None, "SystemStructureDescription", {**attributes, "generationTool": generation_tool()}
+    )
     system = _element(root, "System", {"name": wiring.name, "description": _about(wiring)})
     _connectors(system, OUTSIDE, wiring, layout)
     _bindings(system, OUTSIDE, bindings)
@@ -79,9 +100,14 @@ def structure_description(
     for box in layout.boxes:
         _component(elements, box, wiring, layout, bindings)
     _connections(system, layout)
-    _element(system, "SystemGeometry", _corners(0.0, layout.lower, layout.width, layout.upper))
+    _master(system, step)
     _units(root, {wiring.unit(port) for wire in wiring.wires for port in (wire.start, wire.end)})
-    _element(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": number(stop_time)})
+    experiment = _element(
+        root, "DefaultExperiment", {"startTime": "0.0", "stopTime": number(stop_time)}
+    )
+    interval = _decimal(stop_time / _ROWS)
+    results = {"resultFile": f"{wiring.name}.csv", "loggingInterval": interval, "bufferSize": "10"}
+    _information(experiment, results)
     return xml_text(root)
 
 
@@ -154,6 +180,30 @@ def _connections(parent: ET.Element, layout: Layout) -> None:
                 "pointsY": " ".join(_place(y) for _, y in inner),
             }
             _element(connection, "ConnectionGeometry", points)
+
+
+def _master(system: ET.Element, step: float) -> None:
+    """Append the annotation of a master with fixed steps, as OMSimulator writes it."""
+    information = _information(system, {})
+    attributes = {
+        "description": "oms-ma",
+        "stepSize": _decimal(step),
+        "relativeTolerance": _decimal(TOLERANCE),
+    }
+    ET.SubElement(information, f"{{{OMS}}}FixedStepMaster", attributes)
+
+
+def _information(parent: ET.Element, attributes: dict[str, str]) -> ET.Element:
+    """Append OMSimulator's annotation on a simulation."""
+    listed = _element(parent, "Annotations", {})
+    annotation = ET.SubElement(listed, f"{{{SSC}}}Annotation", {"type": "org.openmodelica"})
+    own = ET.SubElement(annotation, f"{{{OMS}}}Annotations")
+    return ET.SubElement(own, f"{{{OMS}}}SimulationInformation", attributes)
+
+
+def _decimal(value: float) -> str:
+    """Return a number without exponent."""
+    return f"{value:.15f}".rstrip("0")
 
 
 def _units(root: ET.Element, names: Iterable[str]) -> None:

@@ -19,6 +19,7 @@ from psa_casadi.identification.fitting.prediction import (
 )
 from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
+from psa_casadi.interruption import current_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError
@@ -34,7 +35,7 @@ FIT_RTOL = 1e-6
 _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """The result of a prediction-error fit.
 
@@ -58,6 +59,11 @@ class Fit:
     evaluations: int
     way: Way
     simulated: tuple[Simulated, ...]
+
+    def __repr__(self) -> str:
+        """Return what was fitted and what it leaves, in one line."""
+        names = ", ".join(self.unknowns.names)
+        return f"<Fit of {names}: residual {self.rms:.3g} m rms, {self.evaluations} evaluations>"
 
     def of_record(self, experiments: Sequence[Experiment], record: int) -> slice:
         """Where the used samples of one record stand in `residuals` and `jacobian`."""
@@ -206,6 +212,7 @@ def _minimum(
         except KeyboardInterrupt:
             if before is None:  # nothing was evaluated yet
                 raise
+            current_work().stop()
             minimum, rougher = before
             ended = replace(minimum, evaluations=spent, interrupted=True, converged=False)
             return ended, rougher, []
@@ -216,7 +223,8 @@ def _minimum(
         minimum, theta = found, found.theta
         before = minimum, way
         spent += found.evaluations
-        if minimum.interrupted:  # whoever interrupts does not wait for the error
+        if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
+            current_work().stop()
             return replace(minimum, evaluations=spent), way, []
         told = simulated(model, experiments, unknowns, theta, way=way)
         if not any(t.error > a for t, a in zip(told, allowed, strict=True)):

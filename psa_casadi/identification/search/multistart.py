@@ -1,6 +1,6 @@
 """The search for a fit: several starts, the best ones to the end, then what can be told besides."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -90,14 +90,33 @@ def search(
     (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
     best and the second best are followed to the end, if that one is close or, with `thorough`, not
     far, to tell whether starts agree; with `thorough` more of them while all miss the records. A
-    keyboard interrupt ends the search at the best fit so far. Raises PsaError when no start can be
-    simulated.
+    keyboard interrupt ends the search at the best fit so far, if there is one. Raises PsaError when
+    no start can be simulated.
     """
+    so_far: list[Fit] = []
+    try:
+        return _search(model, experiments, linear, thorough, progress, so_far.append)
+    except KeyboardInterrupt:
+        if not so_far:
+            raise
+        return Search(replace(so_far[-1], interrupted=True, converged=False), (), ())
+
+
+def _search(
+    model: Model,
+    experiments: Sequence[Experiment],
+    linear: Sequence[LinearCandidate],
+    thorough: bool,
+    progress: Progress,
+    keep: Callable[[Fit], None],
+) -> Search:
+    """Search as `search` says; `keep` gets every fit that is better than those before it."""
     core = free_parameters(model)
     fastest = min(e.record.sample_time for e in experiments)
     told = resolved(model, linear, fastest)
     starts = starting_points(model, linear, [e.record for e in experiments])
-    found = _quick_fits(model, experiments, [*core, *told], starts, progress)
+    found = _quick_fits(model, experiments, [*core, *told], starts, progress, keep)
+    keep(found[0][1])
     free = found[0][1].unknowns.names
     sigma = residual_noise(found[0][1], experiments)
     polished: list[Fit] = []
@@ -111,6 +130,7 @@ def search(
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit_or_keep(quick, experiments, free, sigma)
         polished.append(ended)
+        keep(min(polished, key=lambda f: f.cost))
     best = min(polished, key=lambda f: f.cost)
     outcomes, not_unique = _outcomes(found, polished, best, experiments)
     if not best.interrupted:
@@ -119,7 +139,9 @@ def search(
         if tuned is not best:
             best = tuned
             outcomes, not_unique = _outcomes(found, polished, best, experiments)
+        keep(best)
         best = without_blur(best, experiments)
+        keep(best)
     if thorough and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)
         not_unique |= set(open_ones)
@@ -158,6 +180,7 @@ def _quick_fits(
     free: Sequence[str],
     starts: Sequence[tuple[str, dict[str, float]]],
     progress: Progress,
+    keep: Callable[[Fit], None],
 ) -> list[tuple[str, Fit]]:
     """Fit from every start with few evaluations; return those that could be simulated."""
     sigma = noise_levels(experiments)
@@ -176,6 +199,7 @@ def _quick_fits(
             found = [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
             break
         found.append((name, quick))
+        keep(min((f for _, f in found), key=lambda f: f.cost))
         if quick.interrupted:
             break
     found.sort(key=lambda pair: pair[1].cost)

@@ -151,7 +151,8 @@ def differing(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[
         return ()
     count = len(one.unknowns.names)
     there = one.unknowns.coordinates(other.model.values)
-    errors = np.sqrt(np.diag(covariance_of(one, experiments)))[:count]
+    variances = np.diag(covariance_of(one, experiments))[:count]
+    errors = np.sqrt(np.where(variances > 0.0, variances, np.inf))  # by rounding of what is open
     apart = np.abs(there - one.theta[:count]) > _APART * errors
     return tuple(n for n, far in zip(one.unknowns.names, apart, strict=True) if far)
 

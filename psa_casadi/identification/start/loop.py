@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.ordinary import static_slope
+from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
 from psa_casadi.records.quality.noise import high_frequency_noise

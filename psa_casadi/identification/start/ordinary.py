@@ -6,15 +6,17 @@ import numpy as np
 
 from psa_casadi.components import BASE
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.start.doubts import (
+    doubtful_unit,
+    refuse_unusable,
+    static_slope,
+    stray,
+)
 from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.records.record import Record
 
-#: Displacement per volt [m/V] of stacks, from a chip of 2 um at 120 V to a lever of 1 mm at 100 V,
-#: with a margin of ten.
-ORDINARY_STROKE = (1e-9, 1e-4)
 #: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
 ASSUMED_STIFFNESS = 5e7
 #: Stiffness of the wafers over that of the bonding layers, assumed.
@@ -24,14 +26,6 @@ _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
 _HYSTERESIS_SHARE = 0.1
 
-_CONSTANT = (
-    "The voltage is {:g} V throughout: a stack shows itself only where its voltage changes. Give a"
-    " record in which it does, or name its column (--columns voltage=...)."
-)
-_STUCK = (
-    "But for stuck readings, the displacement is one value: the sensor is out of its range, or"
-    " another column holds its readings (--columns displacement=...)."
-)
 #: Shapes of loop to start from: A, beta, gamma over k_L, and n.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
     {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
@@ -50,13 +44,11 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     (`capacitance_of`), else assumed. Raises InputError where that is
     far from what any stack does, or where no voltage or no displacement changes.
     """
+    refuse_unusable(records)
     doubt = doubtful_unit(records)
     k_b = stiffness or ASSUMED_STIFFNESS
     k_p = _WAFER_RATIO * k_b
     span = max(float(np.ptp(r.voltage)) for r in records)
-    if span == 0.0:
-        raise InputError([_CONSTANT.format(records[0].voltage[0])])
-    refuse_stuck(records)
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     sample_time = min(r.sample_time for r in records)
     k_l = max(abs(static_slope(records)), 1e-12) / (1.0 / k_p + 1.0 / k_b)
@@ -73,15 +65,15 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "n": LOOP_SHAPES[0]["n"],
     }
     try:
-        return compose(BASE, {**values, **_lags(values, sample_time)})
+        return compose(BASE, {**values, **_within(_lags(values, sample_time))})
     except InputError as error:
-        raise InputError([doubt]) if doubt else error from None
+        raise InputError(stray(records) or [doubt]) if doubt else error from None
 
 
-def refuse_stuck(records: Sequence[Record]) -> None:
-    """Raise InputError where no displacement that counts changes."""
-    if not any(r.range_m > 0.0 for r in records):
-        raise InputError([_STUCK])
+def _within(lags: Mapping[str, float]) -> dict[str, float]:
+    """Return lags within the bounds of their parameters, however slow or fast the sampling is."""
+    bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
+    return {name: float(np.clip(value, *bounds[name])) for name, value in lags.items()}
 
 
 def chosen_start(
@@ -139,29 +131,3 @@ def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:
     }
     lags |= {f"c_{m}": 0.05 * sample_time * values[f"k_{m}"] for m in "PB" if f"k_{m}" in values}
     return lags
-
-
-def static_slope(records: Sequence[Record]) -> float:
-    """Regression slope of displacement on voltage, records centred each [m/V]."""
-    top = bottom = 0.0
-    for record in records:
-        valid = record.mask
-        v = record.voltage[valid] - np.mean(record.voltage[valid])
-        y = measured(record)[valid]
-        top += float(v @ (y - np.mean(y)))
-        bottom += float(v @ v)
-    return top / bottom if bottom > 0 else 0.0
-
-
-def doubtful_unit(records: Sequence[Record]) -> str:
-    """Say that displacement per volt is not what stacks do; "" where it is, or is in counts."""
-    slope = abs(static_slope(records))
-    low, high = ORDINARY_STROKE
-    counts = any(r.displacement_unit == "counts" for r in records)
-    if counts or slope == 0.0 or low <= slope <= high:
-        return ""
-    side = "more" if slope > high else "less"
-    return (
-        f"The displacement changes by {slope:.1e} m per volt, {side} than piezoelectric stacks do"
-        f" ({low:.0e} to {high:.0e} m/V): its unit, or that of the voltage, is probably another."
-    )

@@ -1,4 +1,4 @@
-"""Samples that a sensor, not the stack, has made: outliers, drop-outs, a stuck sensor.
+"""Samples that a sensor, not the stack, has made: outliers, drop-outs, stuck or saturated ones.
 
 They are recognised from the record alone and masked; nothing is put in their place. What a stack
 can do (ring after a step, follow a jump of the voltage, turn sharply) is not suspect.
@@ -13,6 +13,7 @@ from scipy.ndimage import maximum_filter1d
 
 from psa_casadi.records.quality.quantum import quantum_of
 from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.quality.saturation import FlatEnd, flat_ends
 from psa_casadi.records.quality.stuck import (
     AFTER,
     BEFORE,
@@ -26,7 +27,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]
-Kind = Literal["outlier", "drop-out", "stuck"]
+Kind = Literal["outlier", "drop-out", "stuck", "saturated"]
 
 #: Samples that a running line is laid through; no spike of up to `SPIKE` samples moves it.
 WINDOW = 13
@@ -43,26 +44,40 @@ class Suspects:
     """Samples of a record that should not count: `mask` (n,) is True for them.
 
     `counts` holds the number of samples by kind; `quantum` the sensor's step, in `unit` as the
-    record is ("m" or "counts"), None where it shows none.
+    record is ("m" or "counts"), None where it shows none. `ends` are the values at which the sensor
+    was saturated.
     """
 
     mask: BoolArray
     counts: dict[Kind, int]
     quantum: float | None
     unit: Literal["m", "counts"] = "m"
+    ends: tuple[FlatEnd, ...] = ()
 
     def sentences(self, name: str) -> tuple[str, ...]:
         """Return what was found in the record of that name, one sentence for each kind."""
         said = [
             f"{name}: {_samples(count)} {_WHAT[kind]}; masked, so that they count for nothing."
             for kind, count in self.counts.items()
-            if count
+            if count and kind != "saturated"
         ]
+        said += self.saturation(name)
         if self.quantum is not None:
             scale, unit = (1e9, "nm") if self.unit == "m" else (1.0, self.unit)
             step = f"{scale * self.quantum:.3g} {unit}"
             said.append(f"{name}: the displacement is quantised in steps of {step}.")
         return tuple(said)
+
+    def saturation(self, name: str) -> tuple[str, ...]:
+        """Say at which values the sensor was saturated, one sentence for each."""
+        scale, unit = (1e6, "um") if self.unit == "m" else (1.0, self.unit)
+        return tuple(
+            f"{name}: {_samples(int(end.where.sum()))} ({100.0 * float(end.where.mean()):.0f} %)"
+            f" stay at {scale * end.value:.6g} {unit}, the {'largest' if end.upper else 'smallest'}"
+            " value, while the voltage moves the stack: the sensor is saturated there; masked, so"
+            " that they count for nothing."
+            for end in self.ends
+        )
 
 
 _WHAT: dict[Kind, str] = {
@@ -78,7 +93,7 @@ def suspects(record: Record) -> Suspects:
     A record without displacement has none. Work and memory grow with the number of samples.
     """
     mask = np.zeros(record.n, dtype=np.bool_)
-    counts: dict[Kind, int] = {"outlier": 0, "drop-out": 0, "stuck": 0}
+    counts: dict[Kind, int] = {"outlier": 0, "drop-out": 0, "stuck": 0, "saturated": 0}
     valid = np.flatnonzero(record.mask)
     if record.displacement is None or valid.size < 2 * BLOCK:
         return Suspects(mask, counts, None)
@@ -90,15 +105,20 @@ def suspects(record: Record) -> Suspects:
     stuck, dropped = equal_runs(y, record.voltage[valid], quantum)
     stuck |= missed_a_move(y, record.voltage[valid], quantum) & ~dropped
     stuck |= repeated_in_noise(y, record.voltage[valid], quantum) & ~dropped
+    ends = flat_ends(y, record.voltage[valid]) if quantum is None else ()
+    ends = tuple(e for e in ends if np.mean(dropped[e.where]) < 0.5)  # a jump away is no end
+    flat = np.any([np.zeros(valid.size, dtype=np.bool_), *(e.where for e in ends)], axis=0)
+    stuck, dropped = stuck & ~flat, dropped & ~flat
     rest = ~(stuck | dropped)
     outlying = np.zeros(valid.size, dtype=np.bool_)
     outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
+    outlying &= ~flat
     kinds: dict[Kind, NDArray[np.bool_]]
-    kinds = {"outlier": outlying, "drop-out": dropped, "stuck": stuck}
+    kinds = {"outlier": outlying, "drop-out": dropped, "stuck": stuck, "saturated": flat}
     for kind, found in kinds.items():
         counts[kind] = int(found.sum())
         mask[valid[found]] = True
-    return Suspects(mask, counts, quantum, record.displacement_unit)
+    return Suspects(mask, counts, quantum, record.displacement_unit, ends)
 
 
 def cleaned(record: Record) -> Record:

@@ -11,6 +11,9 @@ from psa_casadi.units import FloatArray
 #: Fewer samples than this describe no experiment.
 MIN_SAMPLES = 16
 
+#: Larger numbers are no measured ones, in whatever unit; their squares would soon be infinite.
+LARGEST = 1e100
+
 #: Of mistakes of one kind in one column, this many are described, the others counted.
 LISTED = 20
 
@@ -104,5 +107,11 @@ def _check_finite(column: Located, problems: Problems) -> None:
     column.complain(
         np.isinf(column.values),
         "found {value}, expected a finite number; correct the cell or remove the {place}.",
+        problems,
+    )
+    column.complain(
+        np.isfinite(column.values) & (np.abs(column.values) > LARGEST),
+        f"found {{value}}, expected a measured number, below {LARGEST:g}; correct the cell or"
+        " remove the {place}.",
         problems,
     )

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.read.header_names import understood
 from psa_casadi.units import parse_unit, units_of
 
 
@@ -71,20 +72,22 @@ def parse_header(
     column missing, misspelled or there twice, a unit that is missing or wrong.
     """
     wanted = wanted or {}
-    if all(_is_number(text) for text in texts):
+    counted = bool(wanted) and all(source.array in texts for source in wanted.values())
+    if all(_is_number(text) for text in texts) and not counted:
+        example = ",".join(COLUMNS[name].example for name in required)
         problems.add(
             f"{where}: found '{','.join(texts)[:60]}', expected a header; write a first line such "
-            f"as '{','.join(COLUMNS[name].example for name in required)}'."
+            f"as '{example}', or say which column is which: {ready_line(required)}"
         )
         return {}
     fields: dict[str, Field] = {}
-    strangers: list[str] = []
+    strangers: list[tuple[int, str]] = []
     for index, text in enumerate(texts):
         match = _HEADER.fullmatch(text.strip())
         own = match["name"].strip() if match else text
-        name = _column_of(own, wanted)
+        name = _column_of(own, text, wanted)
         if match is None or name not in COLUMNS:
-            strangers.append(own)
+            strangers.append((index, text.strip()))
         elif name in fields:
             problems.add(
                 f"{where}, column {index + 1}: '{name}' stands twice in the header (first as "
@@ -94,19 +97,63 @@ def parse_header(
             place = f"{where}, column '{own if name in wanted else name}'"
             unit = _agreed_unit(name, match["unit"], wanted, place, problems)
             fields[name] = Field(index, unit)
-    _report_absent(fields, strangers, wanted, where, problems)
-    _report_missing(fields, strangers, [r for r in required if r not in wanted], where, problems)
+    strangers = _by_other_names(strangers, fields, required, wanted, where, problems)
+    names = [m["name"] if (m := _HEADER.fullmatch(text)) else text for _, text in strangers]
+    _report_absent(fields, names, wanted, where, problems)
+    _report_missing(fields, names, [r for r in required if r not in wanted], where, problems)
     return fields
+
+
+def _by_other_names(
+    strangers: Sequence[tuple[int, str]],
+    fields: dict[str, Field],
+    required: Sequence[str],
+    wanted: ColumnMap,
+    where: str,
+    problems: Problems,
+) -> list[tuple[int, str]]:
+    """Add the columns that go by a laboratory's name for them; return the cells that do not.
+
+    What has a column's own name keeps it. Two cells for one column, or one without a unit, are told
+    with the line to type.
+    """
+    known = [(index, text, understood(text)) for index, text in strangers]
+    open_ones = [n for n in COLUMNS if n not in fields and n not in wanted]
+    left = [(index, text) for index, text, name in known if name is None]
+    for column in open_ones:
+        cells = [(i, t, n.unit) for i, t, n in known if n is not None and n.column == column]
+        with_unit = [c for c in cells if c[2] is not None]
+        if len(with_unit) == 1:
+            index, text, unit = with_unit[0]
+            check_unit(COLUMNS[column], unit, f"{where}, column '{text}'", problems)
+            fields[column] = Field(index, unit or "")
+        elif cells and column in required:
+            texts = {column: cells[0][1]}
+            texts |= {n.column: t for _, t, n in known if n is not None and n.column != column}
+            why = "has no unit" if len(cells) == 1 else "may be more than one column"
+            problems.add(
+                f"{where}: '{column}' {why} ({', '.join(t for _, t, _ in cells)}); say which, and "
+                f"in which unit: {ready_line(required, texts)}"
+            )
+            fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
+    return left
+
+
+def ready_line(required: Sequence[str], texts: Mapping[str, str] | None = None) -> str:
+    """Return the option that says which cell of the header is which column; units as usual."""
+    names = {name: (texts or {}).get(name, str(k)) for k, name in enumerate(required, 1)}
+    parts = (f"{name}={own}:{SI_UNITS.get(name, 'um')}" for name, own in names.items())
+    return f"--columns {','.join(parts)} (with your units)."
 
 
 def _plain(name: str) -> str:
     return re.sub(r"\s+", "_", name.strip().lower())
 
 
-def _column_of(own: str, wanted: ColumnMap) -> str:
-    """Return the column that a name in a header stands for, or the name itself."""
+def _column_of(own: str, text: str, wanted: ColumnMap) -> str:
+    """Return the column that a cell of a header stands for, or its name itself."""
     for name, source in wanted.items():
-        if _plain(source.array) == _plain(own):
+        if _plain(source.array) in (_plain(own), _plain(text)):
             return name
     return "" if _plain(own) in wanted else _plain(own)
 

@@ -1,6 +1,5 @@
 """From the bytes of a CSV file to named columns of numbers, with every mistake located."""
 
-import csv
 import hashlib
 import math
 import os
@@ -13,15 +12,20 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import Field
-from psa_casadi.records.read.file_bytes import read_bytes
+from psa_casadi.records.read.file_bytes import check_size, read_bytes, unpacked
+from psa_casadi.records.read.layout import cells_of, layout
 from psa_casadi.units import FloatArray
+
+#: Bytes in memory of the fewest columns that a record has: a time and one number.
+_LEAST_ON_A_LINE = 16
 
 
 @dataclass(frozen=True)
 class CsvText:
     """The text of a file, split into its header and the rows below it.
 
-    `rows` are the lines after the header; `first_line` is the line number of the first of them.
+    `rows` are the lines after the header; `first_line` is the line number of the first of them. The
+    header is empty where the file has none.
     Numbers have a decimal `point`, or a decimal comma where spreadsheets of that custom wrote them.
     """
 
@@ -31,12 +35,18 @@ class CsvText:
     delimiter: str
     rows: tuple[str, ...]
     first_line: int
+    header_line: int
     point: str = "."
 
     @property
     def where_header(self) -> str:
         """File and line of the header, as sentences about it begin."""
-        return f"{self.path}: line {self.first_line - 1}"
+        return f"{self.path}: line {self.header_line}"
+
+    def numbered(self) -> "CsvText":
+        """Return the text of a file without a header with one that counts the columns from 1."""
+        cells = cells_of(self.rows[0], self.delimiter)
+        return replace(self, header=tuple(str(k) for k in range(1, len(cells) + 1)))
 
 
 @dataclass(frozen=True)
@@ -53,32 +63,42 @@ class Numbers:
 
 
 def load_text(path: str | os.PathLike[str]) -> CsvText:
-    """Read a text file and split off its header; lines before it that begin with # are skipped.
+    """Read a text file, gzipped or not, and split off its header (see `layout`).
 
-    The delimiter is the one of comma, semicolon and tab that the header holds most often.
+    The delimiter is the one of comma, semicolon and tab that the header holds most often, else any
+    number of spaces.
 
     Raises:
-        InputError: the file is missing, a directory, empty, unreadable, not text, or only comments.
+        InputError: the file is missing, a directory, empty, unreadable, too large, not text, or
+            only comments.
     """
     data = read_bytes(path)
-    text = _decode(data, str(path)).replace("\r\n", "\n").replace("\r", "\n")
+    content = unpacked(data, path)
+    lines_at_most = max(content.count(b"\n"), content.count(b"\r"))
+    check_size(path, _LEAST_ON_A_LINE * lines_at_most, "its lines need")
+    text = _decode(content, str(path)).replace("\r\n", "\n").replace("\r", "\n")
     lines = text.split("\n")
-    start = 0
-    while start < len(lines) and (not lines[start].strip() or lines[start].startswith("#")):
-        start += 1
-    if start == len(lines):
+    found = layout(lines)
+    if found is None:
         raise InputError(f"{path}: holds no header and no data; export the record again.")
-    delimiter = max(",;\t", key=lines[start].count)
-    header = next(csv.reader([lines[start]], delimiter=delimiter, skipinitialspace=True))
     digest = hashlib.sha256(data).hexdigest()
+    rows = lines[found.first :]
+    if found.delimiter == " ":
+        rows = [_SPACES.sub(" ", row.strip()) for row in rows]
     return CsvText(
-        str(path), digest, tuple(header), delimiter, tuple(lines[start + 1 :]), start + 2
-    )
+        str(path), digest, found.header, found.delimiter, tuple(rows), found.first + 1,
+        found.header_line + 1,
+    )  # fmt: skip
 
 
 def _decode(data: bytes, path: str) -> str:
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise InputError(f"{path}: is UTF-16 text, expected UTF-8; save it as 'CSV UTF-8'.")
+        try:
+            return data.decode("utf-16")
+        except UnicodeDecodeError:
+            raise InputError(
+                f"{path}: begins as UTF-16 text and is none; save it as 'CSV UTF-8'."
+            ) from None
     if b"\0" in data:
         raise InputError(
             f"{path}: is not text but a binary file; export the record as CSV and name that file."
@@ -101,6 +121,7 @@ def parse_numbers(text: CsvText, fields: Mapping[str, Field], problems: Problems
     return quick if quick is not None else _parse_by_cell(text, fields, problems)
 
 
+_SPACES = re.compile(r"[ \t]+")
 _DECIMAL = re.compile(r"\s*[+-]?\d*([.,])\d*([eE][+-]?\d+)?\s*")
 _SWAPPED = str.maketrans(".,", ",.")
 
@@ -110,18 +131,12 @@ def _decimal_point(text: CsvText, fields: Mapping[str, Field]) -> str:
     for row in text.rows:
         if "." not in row and "," not in row:
             continue
-        cells = _cells(text, row)
+        cells = cells_of(row, text.delimiter)
         for field in fields.values():
             found = _DECIMAL.fullmatch(cells[field.index]) if field.index < len(cells) else None
             if found:
                 return found[1]
     return "."
-
-
-def _cells(text: CsvText, row: str) -> list[str]:
-    if '"' in row:
-        return next(csv.reader([row], delimiter=text.delimiter))
-    return row.split(text.delimiter)
 
 
 def _parse_at_once(text: CsvText, indices: Sequence[int]) -> Numbers | None:
@@ -156,7 +171,7 @@ def _parse_by_cell(text: CsvText, fields: Mapping[str, Field], problems: Problem
     for line, row in enumerate(text.rows, text.first_line):
         if not row.strip():
             continue
-        cells = _cells(text, row)
+        cells = cells_of(row, text.delimiter)
         if len(cells) != len(text.header):
             problems.add(_wrong_count(text, line, len(cells)))
             continue

@@ -1,19 +1,28 @@
 """The bytes of a record's file, or a sentence that says why there are none."""
 
+import gzip
+import io
 import os
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 from psa_casadi.errors import InputError
+
+#: The most bytes that a record may have, in its file or unpacked in memory.
+MOST_BYTES = 2**30
+_BLOCK = 2**20
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """Return the content of a file that is meant to hold a record.
 
     Raises:
-        InputError: the file is missing, a directory, unreadable or empty.
+        InputError: the file is missing, a directory, unreadable, empty or larger than `MOST_BYTES`.
     """
     try:
-        data = Path(path).read_bytes()
+        with Path(path).open("rb") as stream:
+            data = _most(stream.read)
     except FileNotFoundError:
         raise InputError(
             f"{path}: there is no such file; check the name and the directory it is in."
@@ -24,6 +33,46 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check that you may read it."
         ) from error
+    check_size(path, len(data), "holds")
     if not data.strip():
         raise InputError(f"{path}: the file is empty; export the record again.")
     return data
+
+
+def _most(read: Callable[[int], bytes]) -> bytes:
+    """Return the content that is read, or more than `MOST_BYTES` of it; takes no more memory."""
+    blocks, size = [], 0
+    while size <= MOST_BYTES and (block := read(_BLOCK)):
+        blocks.append(block)
+        size += len(block)
+    return b"".join(blocks)
+
+
+def check_size(path: str | os.PathLike[str], size: int, what: str) -> None:
+    """Refuse more than `MOST_BYTES`; `what` begins the sentence, such as "its columns hold".
+
+    Raises:
+        InputError: `size` is larger.
+    """
+    if size > MOST_BYTES:
+        raise InputError(
+            f"{path}: {what} more than {MOST_BYTES / 2**30:.3g} GiB, the most that is read as one "
+            f"record; leave out arrays that are not needed, or split the record."
+        )
+
+
+def unpacked(data: bytes, path: str | os.PathLike[str]) -> bytes:
+    """Return the content of a gzipped file, of any other the data itself.
+
+    Raises:
+        InputError: the file is damaged, or its content is larger than `MOST_BYTES`.
+    """
+    if not data.startswith(b"\x1f\x8b"):
+        return data
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
+            content = _most(stream.read)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
+    check_size(path, len(content), "holds")
+    return content

@@ -1,9 +1,11 @@
 """Columns from CSV files.
 
-A header names each column with its unit in brackets, in any order:
-`time [s],voltage [V],displacement [um],load_force [N],temperature [degC]`. Lines before it that
-begin with # are comments. Cells are separated by commas, semicolons or tabs, as in the header.
-Missing samples are allowed in `displacement` (an empty cell or nan).
+A header names each column with its unit, in any order:
+`time [s],voltage [V],displacement [um],load_force [N],temperature [degC]`. Laboratories' names for
+them are understood (`Time (s)`, `voltage_V`, `pos [um]`), and units in a row below. What stands
+before the header is left alone. Cells are separated by commas, semicolons, tabs or spaces, as in
+the header. A file of numbers alone needs `wanted` with the columns counted from 1. Missing samples
+are allowed in `displacement` (an empty cell or nan).
 """
 
 from collections.abc import Sequence
@@ -11,6 +13,7 @@ from collections.abc import Sequence
 from psa_casadi.errors import Problems
 from psa_casadi.records.read.columns import ColumnMap, parse_header
 from psa_casadi.records.read.csv_table import load_text, parse_numbers
+from psa_casadi.records.read.layout import cells_of
 from psa_casadi.records.read.samples import Samples
 
 
@@ -26,7 +29,10 @@ def read_csv(
         InputError: the file cannot be read, or is not text.
     """
     text = load_text(path)
-    fields = parse_header(text.header, required, text.where_header, problems, wanted)
+    if not text.header and all(source.array.isdecimal() for source in wanted.values()) and wanted:
+        text = text.numbered()
+    header = text.header or cells_of(text.rows[0], text.delimiter)
+    fields = parse_header(header, required, text.where_header, problems, wanted)
     if not fields:
         return None
     numbers = parse_numbers(text, fields, problems)

@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import COLUMNS, SI_UNITS, ColumnMap, Source, check_unit
 from psa_casadi.records.read.file_bytes import read_bytes
+from psa_casadi.records.read.mat_file import Numbers, load_arrays
 from psa_casadi.records.read.samples import Samples, whole_samples
-from psa_casadi.units import FloatArray, parse_unit
+from psa_casadi.units import parse_unit
 
 
 def read_mat(
@@ -25,12 +26,9 @@ def read_mat(
     Raises:
         InputError: the file cannot be read or is no MATLAB file.
     """
-    # SciPy's readers are slow to import, and CSV files need none of them
-    from psa_casadi.records.read.mat_file import load_arrays  # noqa: PLC0415
-
     data = read_bytes(path)
     arrays = load_arrays(path, data)
-    columns: dict[str, tuple[str, FloatArray]] = {}
+    columns: dict[str, tuple[str, Numbers]] = {}
     for name in COLUMNS:
         source = wanted.get(name) or _by_name(name, arrays)
         if source is not None and source.array in arrays:
@@ -65,7 +63,7 @@ def _unit(path: str, name: str, source: Source, problems: Problems) -> str:
     return ""
 
 
-def _by_name(name: str, arrays: Mapping[str, FloatArray]) -> Source | None:
+def _by_name(name: str, arrays: Mapping[str, Numbers]) -> Source | None:
     """Return the array called `name` or `name_unit`, such as `displacement_um`."""
     for array in arrays:
         plain = array.lower()
@@ -83,7 +81,7 @@ def _is_unit(text: str) -> bool:
         return False
 
 
-def _listed(arrays: Mapping[str, FloatArray]) -> str:
+def _listed(arrays: Mapping[str, Numbers]) -> str:
     named = [f"{name} ({array.size})" for name, array in arrays.items()]
     more = f" and {len(named) - 8} more" if len(named) > 8 else ""
     return f"arrays and their lengths: {', '.join(named[:8])}{more}" if named else "it holds none"
@@ -91,7 +89,7 @@ def _listed(arrays: Mapping[str, FloatArray]) -> str:
 
 def _lengths_differ(
     path: str,
-    columns: Mapping[str, tuple[str, FloatArray]],
+    columns: Mapping[str, tuple[str, Numbers]],
     wanted: ColumnMap,
     problems: Problems,
 ) -> bool:

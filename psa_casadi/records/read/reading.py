@@ -4,9 +4,13 @@ The format follows the ending: `.mat` (MATLAB), `.parquet` or `.pq`, and CSV for
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TypeGuard, cast
 
+import numpy as np
+
+from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.checks import (
     Located,
@@ -21,11 +25,16 @@ from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.records.read.read_csv import read_csv
 from psa_casadi.records.read.read_mat import read_mat
 from psa_casadi.records.read.read_parquet import read_parquet
+from psa_casadi.records.read.read_table import Table, read_table
 from psa_casadi.records.read.samples import Samples
 from psa_casadi.records.record import Record
 from psa_casadi.units import parse_unit, to_si
 
 AnyPath = str | os.PathLike[str]
+#: What stands for one record wherever records are asked for.
+OneRecord = Record | AnyPath | Table
+#: What stands for the records of one device.
+Records = OneRecord | Iterable[OneRecord]
 
 #: What reads a file, by its ending; a file with another ending is CSV.
 READERS = {".mat": read_mat, ".parquet": read_parquet, ".pq": read_parquet}
@@ -94,6 +103,72 @@ def read_records(
     return tuple(records)
 
 
+def record_from(
+    table: Table,
+    *,
+    name: str = "record",
+    need_displacement: bool = True,
+    columns: str | ColumnMap | None = None,
+) -> Record:
+    """Return the record in a data frame or a mapping of arrays, checked as a file is.
+
+    Names carry units as a CSV header does: `{"time [s]": t, "voltage [V]": v, "displacement [um]":
+    x}`; or `columns` says which is which, as for `read_record`.
+
+    Raises:
+        InputError: every mistake found, one sentence each.
+    """
+    problems = Problems()
+    wanted = parse_columns(columns) if isinstance(columns, str) else columns or {}
+    required = ("time", "voltage", *(("displacement",) if need_displacement else ()))
+    samples = read_table(table, name, required, wanted, problems)
+    if samples is not None:
+        _check(samples, problems, need_excitation=False)
+    problems.raise_if_any()
+    if samples is None:
+        raise InputError(f"{name}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
+    return _record(samples, source="")
+
+
+def records_given(given: Records) -> tuple[Record, ...]:
+    """Return what was given as records: one or several records, paths of files, tables.
+
+    Raises:
+        InputError: the mistakes of all of them together.
+    """
+    several = [given] if _is_one(given) else list(cast("Iterable[OneRecord]", given))
+    found: list[Record] = []
+    problems: list[str] = []
+    for k, one in enumerate(several, 1):
+        try:
+            if isinstance(one, Record):
+                found.append(one)
+            elif isinstance(one, str | os.PathLike):
+                found.append(read_record(one))
+            elif _is_table(one):
+                found.append(
+                    record_from(one, name="record" if len(several) == 1 else f"record {k}")
+                )
+            else:
+                problems.append(
+                    f"{type(one).__name__} is no record; give a Record, the path of a file, a data"
+                    " frame, or a mapping of arrays such as {'time [s]': t, 'voltage [V]': v, ...}."
+                )
+        except InputError as error:
+            problems.extend(error.problems)
+    if problems:
+        raise InputError(problems)
+    return tuple(found)
+
+
+def _is_one(given: Records) -> TypeGuard[OneRecord]:
+    return isinstance(given, Record | str | os.PathLike) or _is_table(given)
+
+
+def _is_table(given: object) -> TypeGuard[Table]:
+    return isinstance(given, Mapping) or hasattr(given, "columns")
+
+
 def _check(samples: Samples, problems: Problems, *, need_excitation: bool) -> None:
     check_length(samples.path, len(samples.lines), problems)
     for k, name in enumerate(samples.units):
@@ -115,14 +190,19 @@ def _check(samples: Samples, problems: Problems, *, need_excitation: bool) -> No
             check_excitation(column, problems)
 
 
-def _record(samples: Samples) -> Record:
+def _record(samples: Samples, source: str | None = None) -> Record:
     columns = {
         name: to_si(samples.values[:, k], unit)
         for k, (name, unit) in enumerate(samples.units.items())
     }
+    if not (np.diff(columns["time"]) > 0.0).all():
+        raise InputError(
+            f"{samples.path}: instants are the same in seconds; give the time from the start of"
+            " the record, in a unit in which neighbours differ by more than the last digit."
+        )
     in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
     return Record(
-        name=Path(samples.path).stem,
+        name=plain(Path(samples.path).stem if source is None else samples.path),
         time=columns["time"],
         voltage=columns["voltage"],
         displacement=columns.get("displacement"),
@@ -130,6 +210,6 @@ def _record(samples: Samples) -> Record:
         current=columns.get("current"),
         temperature=columns.get("temperature"),
         sha256=samples.sha256,
-        source=samples.path,
+        source=samples.path if source is None else source,
         displacement_unit="counts" if in_counts else "m",
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.units import FloatArray
 
 
@@ -28,13 +29,19 @@ class Samples:
 
 
 def whole_samples(
-    path: str, sha256: str, place: str, columns: Mapping[str, tuple[str, FloatArray]]
+    path: str, sha256: str, place: str, columns: Mapping[str, tuple[str, NDArray[np.generic]]]
 ) -> Samples:
     """Return samples of arrays of numbers, `columns` giving unit and values (n,) by name.
 
     Rows are counted from 1.
+
+    Raises:
+        InputError: the numbers need more memory than a record may.
     """
-    values = np.column_stack([array for _, array in columns.values()])
+    check_size(path, 8 * sum(array.size for _, array in columns.values()), "its columns hold")
+    values = np.column_stack(
+        [array.astype(np.float64, copy=False) for _, array in columns.values()]
+    )
     return Samples(
         path=path,
         sha256=sha256,

@@ -10,6 +10,7 @@ from typing import Any
 
 from plotly.offline import get_plotlyjs
 
+from psa_casadi.characters import plain
 from psa_casadi.report.plots.theme import DARK
 from psa_casadi.report.words.tables import Table
 
@@ -129,8 +130,8 @@ class Document:
 
 
 def _text(words: str) -> str:
-    """Return words as HTML; a percent sign stays with its number."""
-    return escape(words).replace(" %", "\u00a0%")
+    """Return words as HTML can carry them; a percent sign stays with its number."""
+    return escape(plain(words)).replace(" %", "\u00a0%")
 
 
 def _list(texts: Iterable[str]) -> str:

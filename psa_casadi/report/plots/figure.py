@@ -1,4 +1,4 @@
-"""The picture of a diagnosis: measured, base and extended, loop, residual, evidence."""
+"""Pictures of results: measured, base and extended, loop, residual, evidence."""
 
 import math
 import os
@@ -8,12 +8,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_path
-from psa_casadi.report.words.phrases import plain, share_text, verdict_sentence
+from psa_casadi.identification.identify import Identification
+from psa_casadi.report.words.phrases import length_scale, plain, share_text, verdict_sentence
 from psa_casadi.report.words.series import (
+    EXTENDED_COLOUR,
     HELD_OUT_COLOUR,
     MEASURED_COLOUR,
     NOISE_COLOUR,
@@ -21,9 +24,11 @@ from psa_casadi.report.words.series import (
     bar_colour,
     most_telling,
     series_of,
+    series_of_fit,
     spans,
     telling_window,
 )
+from psa_casadi.simulation.simulate import Trajectory
 
 _SIZE_INCHES, _DPI = (16.0, 10.0), 100
 _FONT = 13.0
@@ -37,20 +42,63 @@ def save_figure(
     Of several records it shows the one that the base model misses most. `origin`, "measured" or
     "synthetic", names the record's curve. Raises InputError when `path` cannot be written to.
     """
+    with atomic_path(path) as temporary:
+        diagnosis_figure(diagnosis, origin=origin).savefig(temporary, format="png", dpi=_DPI)
+
+
+def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
+    """Return the picture of a diagnosis: records, loop, residual and evidence."""
     series = series_of(diagnosis)
     shown = most_telling(series)
-    figure = Figure(figsize=_SIZE_INCHES, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), width_ratios=(1.0, 1.0, 0.95))
-    window = telling_window(shown)
-    _time(figure.add_subplot(grid[0, 0]), shown, slice(None), origin, window)
-    _time(figure.add_subplot(grid[0, 1]), shown, window, origin, None)
-    _loop(figure.add_subplot(grid[0, 2]), shown, origin)
+    figure, grid = _sheet()
+    _record(figure, grid, shown, origin)
     _residual(figure.add_subplot(grid[1, :2]), shown)
     _evidence(figure.add_subplot(grid[1, 2]), diagnosis)
     figure.suptitle(_title(diagnosis, series, shown, origin), fontsize=_FONT + 3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=_DPI)
+    return figure
+
+
+def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
+    """Return the picture of an identification: the record it misses most, loop and residual."""
+    series = series_of_fit(found)
+    shown = most_telling(series)
+    figure, grid = _sheet()
+    _record(figure, grid, shown, origin)
+    _residual(figure.add_subplot(grid[1, :]), shown)
+    which = f"{origin} record: {shown.name}"
+    if len(series) > 1:
+        which += f" (the one of {len(series)} that the model misses most)"
+    figure.suptitle(which, fontsize=_FONT + 3)
+    return figure
+
+
+def trajectory_figure(run: Trajectory) -> Figure:
+    """Return the picture of a simulation: displacement over time and over the voltage."""
+    figure = Figure(
+        figsize=(_SIZE_INCHES[0], 0.5 * _SIZE_INCHES[1]), dpi=_DPI, layout="constrained"
+    )
+    FigureCanvasAgg(figure)
+    over_time, loop = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
+    scale = length_scale(float(np.ptp(run.displacement)))
+    y = scale.factor * run.displacement
+    for axes, x, label in ((over_time, run.time, "time [s]"), (loop, run.voltage, "voltage [V]")):
+        axes.plot(x, y, color=EXTENDED_COLOUR, linewidth=1.2)
+        _style(axes, "Displacement" if axes is over_time else "Loop", label, f"[{scale.unit}]")
+    return figure
+
+
+def _sheet() -> tuple[Figure, GridSpec]:
+    figure = Figure(figsize=_SIZE_INCHES, dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
+    return figure, figure.add_gridspec(2, 3, **ratios)
+
+
+def _record(figure: Figure, grid: GridSpec, s: Series, origin: str) -> None:
+    window = telling_window(s)
+    _time(figure.add_subplot(grid[0, 0]), s, slice(None), origin, window)
+    _time(figure.add_subplot(grid[0, 1]), s, window, origin, None)
+    _loop(figure.add_subplot(grid[0, 2]), s, origin)
 
 
 def _title(d: Diagnosis, series: tuple[Series, ...], shown: Series, origin: str) -> str:

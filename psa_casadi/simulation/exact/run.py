@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.interruption import flag_address
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import fingerprint
 from psa_casadi.simulation.compiler import generated_library, vector_flags
@@ -40,6 +41,8 @@ _FLAGS = ("-std=gnu99", "-fno-math-errno")
 #: run long enough for -O3.
 _OPTIMISE, _OPTIMISE_LANES = ("-O1",), ("-O3", "-ftree-vectorize")
 _POINTER = ctypes.c_void_p
+#: Status of a run that an interrupt has ended.
+_STOPPED = 4
 
 
 class NotExact(Exception):  # noqa: N818 - the stepper is taken instead, which is no mistake
@@ -56,7 +59,7 @@ class _Request(ctypes.Structure):
         ("nominal", _POINTER), ("tolerance", ctypes.c_double), ("coarsest", ctypes.c_int),
         ("finest", ctypes.c_int), ("steps_limit", ctypes.c_long), ("x", _POINTER),
         ("y", _POINTER), ("shown", _POINTER), ("count", ctypes.c_int), ("which", _POINTER),
-        ("s0", _POINTER), ("dy", _POINTER), ("steps", ctypes.c_long),
+        ("s0", _POINTER), ("dy", _POINTER), ("stop", _POINTER), ("steps", ctypes.c_long),
         ("rejected", ctypes.c_long), ("forced", ctypes.c_long), ("t_failed", ctypes.c_double),
     ]  # fmt: skip
 
@@ -108,7 +111,9 @@ def _compiled(structure: Structure, output: str, lanes: int) -> Path | str:
 @cache
 def _generator() -> str:
     """Return the text of what generates: another one makes other libraries."""
-    return "".join(path.read_text() for path in sorted(Path(__file__).parent.glob("*.py")))
+    return "".join(
+        path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py"))
+    )
 
 
 @cache
@@ -234,11 +239,15 @@ def _run(
         samples=len(t),
         zero_order_hold=int(hold == "zero"),
         lengths=len(lengths),
+        stop=flag_address(),
         finest=max(FINEST, int(how["coarsest"])),
         **how,
         **{name: array.ctypes.data for name, array in {**given, **arrays}.items()},
     )
-    if library.psa_run_exact(ctypes.byref(request)):
+    status = library.psa_run_exact(ctypes.byref(request))
+    if status == _STOPPED:
+        raise KeyboardInterrupt
+    if status:
         raise NotExact(f"exact steps ended at t = {request.t_failed:.6g} s")
     return request.steps, request.rejected, request.forced
 

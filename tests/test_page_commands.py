@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from build_scripts.measured_data import ROOT
-from build_scripts.readme_commands import Block, find_blocks, run_text
+from build_scripts.page_commands import Block, find_blocks, pages, run_blocks
 from psa_casadi.effects import EFFECTS
 
 TEXT = """
@@ -35,6 +35,10 @@ Words.
 $ grep one file
 ```
 """
+
+
+def run_text(text: str) -> list[str]:
+    return run_blocks(find_blocks(text))
 
 
 def test_blocks_and_their_marks_are_found() -> None:
@@ -92,7 +96,25 @@ def test_a_mark_that_does_not_exist_and_a_block_without_end_are_refused() -> Non
 
 @pytest.mark.parametrize("place", ["plant", "drive", "sensor", "environment"])
 def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8").splitlines()
     row = next(line for line in lines if line.startswith(f"| {place} | `"))
     own = [e.name for e in EFFECTS.values() if e.belongs_to == place]
     assert re.findall(r"`(\w+)`", row) == own
+
+
+LINK = re.compile(r"\]\((?!https?:)([^)#]*)(#[^)]*)?\)")
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda p: p.name)
+def test_every_link_within_the_project_leads_somewhere(page: Path) -> None:
+    for target, anchor in LINK.findall(page.read_text(encoding="utf-8")):
+        there = (page.parent / target).resolve() if target else page
+        assert there.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", there.read_text(encoding="utf-8"), re.MULTILINE)
+            made = {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}
+            assert anchor[1:] in made, anchor
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150

@@ -1,4 +1,4 @@
-r"""Run the commands that README.md shows, so that what the reader sees is executed.
+r"""Run the commands that README.md and the pages in `docs/` show: what a reader sees is executed.
 
 Executable are the lines that begin with `$ ` in a fenced block marked `console`. Lines that end in
 a backslash go on in the next one; all other lines are output and are left alone. Each block runs
@@ -37,14 +37,20 @@ _MARK = re.compile(r"^<!--\s*run:\s*(?P<mark>[\w-]+)\s*-->\s*$")
 
 @dataclass(frozen=True)
 class Block:
-    """The commands of one fenced block, the line it begins in, and its marks."""
+    """The commands of one fenced block, its page, the line it begins in, and its marks."""
 
     line: int
     commands: tuple[str, ...]
     marks: frozenset[str]
+    page: str = "README.md"
+
+    @property
+    def place(self) -> str:
+        """Page and line, as they are told."""
+        return f"{self.page} line {self.line}"
 
 
-def find_blocks(text: str) -> tuple[Block, ...]:
+def find_blocks(text: str, page: str = "README.md") -> tuple[Block, ...]:
     """Return the console blocks and the marked programs of a text, also those to be skipped.
 
     Raises:
@@ -67,10 +73,10 @@ def find_blocks(text: str) -> tuple[Block, ...]:
             else:
                 raise ValueError(f"line {number}: this block has no end; close it with ```.")
             if fence["language"] == "console":
-                blocks.append(Block(number, find_commands(content), frozenset(marks)))
+                blocks.append(Block(number, find_commands(content), frozenset(marks), page))
             elif fence["language"] == "python" and "python" in marks:
                 program = "\n".join(("python - <<'END_OF_PROGRAM'", *content, "END_OF_PROGRAM"))
-                blocks.append(Block(number, (program,), frozenset(marks)))
+                blocks.append(Block(number, (program,), frozenset(marks), page))
             marks = set()
         elif line.strip():
             marks = set()
@@ -114,11 +120,11 @@ def run_block(block: Block, directory: Path) -> str | None:
             )
         except subprocess.TimeoutExpired as ended:
             _tell(command, ended.stdout, f"ended after {LIMIT_S} s")
-            return f"README.md line {block.line}: '{command}' ran longer than {LIMIT_S} s."
+            return f"{block.place}: '{command}' ran longer than {LIMIT_S} s."
         code, took = done.returncode, time.monotonic() - started
         _tell(command, done.stdout, f"exit code {code}, {took:.1f} s")
         if code != 0:
-            return f"README.md line {block.line}: '{command}' ended with exit code {code}."
+            return f"{block.place}: '{command}' ended with exit code {code}."
     return None
 
 
@@ -147,7 +153,7 @@ def run_chain(chain: Sequence[Block]) -> list[str]:
     with tempfile.TemporaryDirectory() as directory:
         for block in chain:
             if "needs-data" in block.marks and not measured_data_directory().is_dir():
-                sentence = f"README.md line {block.line}: the measured records are not here."
+                sentence = f"{block.place}: the measured records are not here."
                 print(f"{sentence} Set PSA_CASADI_DATA to their directory.")
                 failures.extend([sentence] if must_be_present() else [])
                 continue
@@ -156,21 +162,32 @@ def run_chain(chain: Sequence[Block]) -> list[str]:
     return failures
 
 
-def run_text(text: str) -> list[str]:
-    """Run the blocks of a Markdown text and return one sentence for each that failed."""
-    chains = chains_of(find_blocks(text))
+def run_blocks(blocks: Sequence[Block]) -> list[str]:
+    """Run blocks, chains of them side by side; return one sentence for each that failed."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        return [failure for failures in pool.map(run_chain, chains) for failure in failures]
+        chains = pool.map(run_chain, chains_of(blocks))
+        return [failure for failures in chains for failure in failures]
+
+
+def pages() -> list[Path]:
+    """Return README.md and the pages in `docs/`."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def main() -> int:
-    """Run README.md's commands; return 1 if any failed or there are none."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    if not any(block.commands for block in find_blocks(text)):
+    """Run the commands of all pages; return 1 if any failed or README.md has none."""
+    blocks = [
+        block
+        for page in pages()
+        for block in find_blocks(
+            page.read_text(encoding="utf-8"), page.relative_to(ROOT).as_posix()
+        )
+    ]
+    if not any(block.commands for block in blocks if block.page == "README.md"):
         print("README.md shows no command: mark blocks of commands as ```console.")
         return 1
-    failures = run_text(text)
-    print("\n".join(failures) or "every command of README.md ran.")
+    failures = run_blocks(blocks)
+    print("\n".join(failures) or f"every command of {len(pages())} pages ran.")
     return 1 if failures else 0
 
 

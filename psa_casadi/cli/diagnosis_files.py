@@ -1,0 +1,74 @@
+"""The files of `psa diagnose`: what was asked for, and what an interrupt leaves of it."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from psa_casadi.cli.interrupts import kept
+
+if TYPE_CHECKING:
+    from psa_casadi.diagnosis.result import Alternative, Diagnosis, DiagnosisInterrupted
+
+
+def alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative, Path]]":
+    """Return the models with another cause, each with its file beside the extended model's."""
+    if output is None:
+        return []
+    return [
+        (a, output.with_name(f"{output.stem}_{a.instead}_for_{a.cause}.json"))
+        for a in d.alternatives
+    ]
+
+
+def models(d: "Diagnosis", output: Path | None) -> list[str]:
+    """Say what the model's file holds if nothing was added, and which files are beside it."""
+    lines = [
+        f"written: {path}, with {a.instead} instead of {a.cause}"
+        for a, path in alternatives(d, output)
+    ]
+    if output is not None and not d.causes:
+        lines.append(f"nothing was added: {output} holds the base model")
+    return lines
+
+
+def keep_unfinished(stop: "DiagnosisInterrupted", outputs: Mapping[str, Path | None]) -> str:
+    """Write the best model so far, and say that."""
+    from psa_casadi.model.model_file import save_model
+
+    output = outputs["--output"]
+    if output is not None:
+        save_model(stop.model, output)
+    missing = [p for o, p in outputs.items() if o != "--output"]
+    return kept(f"there is no verdict; {stop}", [output], missing, " (marked as interrupted)")
+
+
+def keep(
+    d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str, written: list[Path]
+) -> str:
+    """Write what takes no time of a finished diagnosis, and say which files there are."""
+    quick = ("--output", "--json")
+    write(d, {o: p if o in quick else None for o, p in outputs.items()}, origin, written)
+    missing = [p for p in outputs.values() if p not in written]
+    return kept("the diagnosis was finished before", dict.fromkeys(written), missing)
+
+
+def write(
+    d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str, written: list[Path]
+) -> None:
+    """Write what was asked for, each file whole or not at all, and add it to what is `written`."""
+    import psa_casadi as psa
+    from psa_casadi.files import atomic_write
+
+    writers: dict[str, Callable[[Path], None]] = {
+        "--output": lambda path: psa.save_model(d.model, path),
+        "--json": lambda path: atomic_write(path, d.to_json()),
+        "--report": lambda path: psa.write_report(d, path, origin=origin),
+        "--figure": lambda path: psa.save_figure(d, path, origin=origin),
+    }
+    for option, path in outputs.items():
+        if path is not None:
+            writers[option](path)
+            written.append(path)
+    for a, path in alternatives(d, outputs["--output"]):
+        psa.save_model(a.model, path)
+        written.append(path)

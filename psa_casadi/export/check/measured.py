@@ -1,0 +1,115 @@
+"""The checks that run the foreign code of an FMU, in turn; their process may end in any of them."""
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.check.calls import CALLS
+from psa_casadi.export.check.comparison import compare
+from psa_casadi.export.check.description import wrong_nominals
+from psa_casadi.export.check.events import (
+    event_indicators,
+    event_mode,
+    intermediate_update,
+    wrong_indicators,
+)
+from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, figure, stopped
+from psa_casadi.export.check.structure import (
+    adjoint_error,
+    directional_error,
+    equation_error,
+    incomplete_dependencies,
+    wrong_start,
+)
+from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
+
+_DIRECTIONAL_LIMIT = 1e-5
+_ADJOINT_LIMIT = 1e-10
+_EQUATION_LIMIT = 1e-9
+
+#: The name of a check that begins now, or the row of the one that began last.
+Progress = Iterator[str | CheckRow]
+
+
+def measured(path: Path, unpacked: Path, truth: Truth | None) -> Progress:
+    """Yield names and rows of the checks of an FMU that was unpacked; `path` is for messages.
+
+    Without a model there is no truth, and nothing is compared with it.
+    """
+    loaded: list[Fmu] = []
+    yield "binary loads"
+    yield count("binary loads", _load, path, unpacked, loaded)
+    for fmu in loaded:
+        with fmu:
+            yield from _of_instances(fmu, truth)
+
+
+def _of_instances(fmu: Fmu, truth: Truth | None) -> Progress:
+    made: list[CheckRow] = []
+    for name, kind in _INTERFACES.items():
+        yield name
+        made.append(count(name, _instantiates, fmu, kind))
+        yield made[-1]
+    if not all(row.passed for row in made):
+        return
+    for name, call in (_CALLS | (_CALLS3 if fmu.version == 3 else {})).items():
+        yield name
+        yield count(name, call, fmu)
+    yield "directional derivatives"
+    yield figure("directional derivatives", _DIRECTIONAL_LIMIT, directional_error, fmu)
+    if fmu.version == 3:
+        yield "adjoint derivatives"
+        yield figure("adjoint derivatives", _ADJOINT_LIMIT, adjoint_error, fmu)
+    if truth:
+        yield from _of_model(fmu, truth)
+
+
+def _of_model(fmu: Fmu, truth: Truth) -> Progress:
+    yield "start of a run"
+    yield count("start of a run", wrong_start, fmu, truth)
+    yield "event indicators of the model"
+    yield count("event indicators of the model", wrong_indicators, fmu, truth)
+    yield "equations"
+    yield figure("equations", _EQUATION_LIMIT, equation_error, fmu, truth)
+    try:
+        for run in truth.runs:
+            yield run.name
+            yield compare(fmu, truth, run)
+        problem = truth.problem
+    except BREAKDOWNS as error:
+        problem = str(error)
+    if problem:
+        yield stopped("trajectories", f"the comparison stopped: {problem}")
+
+
+def _load(path: Path, unpacked: Path, loaded: list[Fmu]) -> Iterator[str]:
+    """Append the FMU with its binary; what prevents that is the problem."""
+    try:
+        loaded.append(Fmu(path, unpacked))
+    except InputError as error:
+        yield str(error)
+
+
+def _instantiates(fmu: Fmu, interface: int) -> Iterator[str]:
+    instance = fmu.instantiate(interface)
+    if instance is None:
+        yield "there is no instance: description and binary are not of the same export"
+    else:
+        instance.free()
+
+
+_INTERFACES = {
+    "co-simulation instantiates": CO_SIMULATION,
+    "model exchange instantiates": MODEL_EXCHANGE,
+}
+_CALLS: dict[str, Callable[[Fmu], Iterable[str]]] = {
+    **CALLS,
+    "nominal values": wrong_nominals,
+    "event indicators": event_indicators,
+    "dependencies complete": incomplete_dependencies,
+}
+_CALLS3: dict[str, Callable[[Fmu], Iterable[str]]] = {
+    "intermediate update": intermediate_update,
+    "event mode": event_mode,
+}

@@ -1,0 +1,34 @@
+"""What the process with the foreign code is asked to do, and within which limits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from psa_casadi.export.check.truth import Truth
+
+#: What foreign code may take unless told otherwise [s], [bytes].
+TIMEOUT, MEMORY = 300.0, 4 << 30
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long a check of the foreign code may take [s], and how much memory all of them [bytes].
+
+    Memory is limited on Linux only, and counts from what Python itself has when it starts.
+    """
+
+    timeout: float
+    memory: int
+
+
+@dataclass(frozen=True)
+class Task:
+    """An FMU by its path (for messages) and the folder into which it was unpacked.
+
+    `key` signs the records; `truth` is what to compare with.
+    """
+
+    path: Path
+    unpacked: Path
+    truth: Truth | None
+    key: bytes
+    limits: Limits

@@ -1,0 +1,98 @@
+"""HDF5 files are read in a process of their own: its library may crash on a damaged file.
+
+The content of the file goes to the process on standard input; the arrays come back on standard
+output as NumPy's archive, under the places of the arrays in the file as JSON lists of names.
+"""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from psa_casadi.errors import InputError
+from psa_casadi.records.read.mat_hdf5 import hdf5_arrays, require_h5py
+from psa_casadi.records.read.mat_level5 import Tree
+
+#: Exit code of a process that tells on standard error, in JSON, what is wrong with the file.
+_REFUSED = 3
+#: Longest time that a file may take [s].
+_LIMIT_S = 120.0
+
+
+def arrays_apart(path: str, data: bytes) -> dict[str, Tree]:
+    """Return what `hdf5_arrays` returns of a file's content, read in another process.
+
+    Raises:
+        InputError: what is wrong with the file; one on which the library crashes or hangs is
+            damaged.
+    """
+    require_h5py(path)
+    root = str(Path(__file__).resolve().parents[3])
+    paths = os.pathsep.join([root, *(os.path.abspath(p) for p in sys.path)])
+    command = [sys.executable, "-P", "-m", "psa_casadi.records.read.hdf5_process", path]
+    try:
+        done = subprocess.run(
+            command, input=data, capture_output=True, check=False, timeout=_LIMIT_S,
+            env={**os.environ, "PYTHONPATH": paths},
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"{path}: is no readable MATLAB file (HDF5 comes to no end); save it again."
+        ) from None
+    if done.returncode == _REFUSED:
+        raise InputError(json.loads(done.stderr.splitlines()[-1]))
+    if done.returncode:
+        raise InputError(
+            f"{path}: is no readable MATLAB file (the library of HDF5 fails on it); save it again "
+            f"with save(..., '-v7')."
+        )
+    tree: dict[str, Tree] = {}
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+        for key in arrays.files:
+            _put(tree, json.loads(key), arrays[key])
+    return tree
+
+
+def _put(tree: dict[str, Tree], place: list[str], array: Tree) -> None:
+    for name in place[:-1]:
+        inner = tree.setdefault(name, {})
+        if not isinstance(inner, dict):
+            return
+        tree = inner
+    tree[place[-1]] = array
+
+
+def _leaves(tree: Mapping[str, Tree], place: tuple[str, ...] = ()) -> Iterator[tuple[str, Tree]]:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, (*place, name))
+        else:
+            yield json.dumps([*place, name]), value
+
+
+def main() -> int:
+    """Read a file from standard input and write its arrays to standard output."""
+    path, data = sys.argv[1], sys.stdin.buffer.read()
+    try:
+        found = dict(_leaves(hdf5_arrays(path, data)))
+    except InputError as error:
+        problems = list(error.problems)
+    except Exception as error:  # noqa: BLE001 - h5py may raise anything on a damaged file
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        problems = [
+            f"{path}: is no readable MATLAB file ({reason}); save it again with save(..., '-v7')."
+        ]
+    else:
+        np.savez(sys.stdout.buffer, **found)  # type: ignore[arg-type]
+        return 0
+    sys.stderr.write(f"{json.dumps(problems)}\n")
+    return _REFUSED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

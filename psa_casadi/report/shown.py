@@ -1,0 +1,86 @@
+"""What results show of themselves: pictures, pages, a notebook's cell, a line."""
+
+import base64
+import io
+import os
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.identification.identify import Identification
+from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.page.fit_page import write_fit_report
+from psa_casadi.report.plots.figure import diagnosis_figure, fit_figure, trajectory_figure
+from psa_casadi.report.words.phrases import number, percent, plain
+from psa_casadi.report.words.text import identification_text, story
+from psa_casadi.simulation.simulate import Trajectory
+
+_FIGURES: dict[type, Callable[[Any], Figure]] = {
+    Diagnosis: diagnosis_figure,
+    Identification: fit_figure,
+    Trajectory: trajectory_figure,
+}
+
+
+def plot(result: Diagnosis | Identification | Trajectory) -> Figure:
+    """Return the picture of a result as a matplotlib figure."""
+    return _FIGURES[type(result)](result)
+
+
+def page(result: Diagnosis | Identification, path: str | os.PathLike[str]) -> None:
+    """Write the page of a result, one HTML file. Raises InputError when that cannot be."""
+    if isinstance(result, Diagnosis):
+        write_report(result, path)
+    else:
+        write_fit_report(result, path)
+
+
+def line(result: Diagnosis | Identification | Trajectory) -> str:
+    """Return a result in one line."""
+    if isinstance(result, Diagnosis):
+        return _diagnosis_line(result)
+    if isinstance(result, Identification):
+        records = _count(len(result.experiments), "record")
+        span = max(e.record.range_m for e in result.experiments)
+        rest = number(100.0 * result.fit.rms / span, 2)
+        free = len(result.determinacy.names)
+        return f"<Identification: {free} parameters from {records}; residual {rest} % of range rms>"
+    outputs = ", ".join(result.outputs)
+    return (
+        f"<Trajectory: {len(result.time)} samples from {number(float(result.time[0]))} to"
+        f" {number(float(result.time[-1]))} s; outputs {outputs}>"
+    )
+
+
+def _diagnosis_line(d: Diagnosis) -> str:
+    causes = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
+    before, after = (e.holdout_nrmse_percent for e in (d.base_errors, d.extended_errors))
+    errors = f"{number(before, 2)} % of range rms"
+    if before != after:
+        errors = f"{number(before, 2)} -> {errors.replace(number(before, 2), number(after, 2), 1)}"
+    return f"<Diagnosis {d.verdict}{': ' if causes else ''}{causes}; held-out error {errors}>"
+
+
+def cell(result: Diagnosis | Identification | Trajectory) -> str:
+    """Return a result as a notebook shows it: its words and its picture."""
+    if isinstance(result, Diagnosis):
+        words = story(result)
+    elif isinstance(result, Identification):
+        words = identification_text(result)
+    else:
+        words = line(result)
+    buffer = io.BytesIO()
+    plot(result).savefig(buffer, format="png", dpi=60)
+    picture = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return (
+        f'<pre style="white-space: pre-wrap">{escape(words)}</pre>'
+        f'<img style="max-width: 100%" alt="{escape(line(result))}"'
+        f' src="data:image/png;base64,{picture}">'
+    )
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"

@@ -1,0 +1,1 @@
+"""Damaged inputs, kills and hostile surroundings: what the package may do about them, counted."""

@@ -1,0 +1,178 @@
+"""Odd but readable records: a verdict, or a sentence that names the cause."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.identification.identify import identify
+from psa_casadi.identification.start.doubts import (
+    doubtful_sign,
+    doubtful_time,
+    doubtful_unit,
+    refuse_unusable,
+)
+from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.records.quality.suspects import suspects
+from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
+from tests.plants.base import simulate_base
+from tests.plants.excitation import loops
+from tests.plants.stack import draw_stack
+
+TABLE = [EFFECTS["slow_creep"], EFFECTS["sensor_jump"]]
+
+
+@pytest.fixture(scope="module")
+def given() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Time, voltage and displacement of an independent plant, 29 um at 60 V."""
+    rng = np.random.default_rng(3)
+    stack, time = draw_stack(rng), np.arange(600) / 200.0
+    voltage = np.round(0.95 * stack.u_rated * np.concatenate([np.zeros(10), loops(rng, 590)]), 3)
+    y = simulate_base(stack, time, voltage).displacement
+    return time, voltage, y + 2e-4 * np.ptp(y) * rng.standard_normal(y.size)
+
+
+def scaled(
+    given: tuple[FloatArray, FloatArray, FloatArray], t: float = 1.0, v: float = 1.0, y: float = 1.0
+) -> Record:
+    time, voltage, shown = given
+    return Record("r", t * time, v * voltage, y * shown)
+
+
+@pytest.mark.parametrize(
+    ("factors", "told"),
+    [
+        ({"y": 1e6}, "changes by 29 m, more than .*displacement is in um, not m .*=NAME:um"),
+        ({"y": 1e9}, "displacement is in nm, not m .*--columns displacement=NAME:nm"),
+        ({"y": 1e-12}, "changes by 2.9e-17 m, less than a stack with any sensor"),
+        ({"y": 1e-310}, "less than a stack with any sensor"),
+        ({"y": 1e290}, "The displacement reaches 2.9e[+]285: that is no reading"),
+        ({"v": 1e6}, "reaches 6e[+]07 V.* voltage is in uV, not V .*--columns voltage=NAME:uV"),
+        ({"v": 1e-310}, "changes by 6e-309 V only: that drives no stack"),
+        ({"v": 1e290}, "The voltage reaches 6e[+]291: that is no reading"),
+        ({"t": 1e12}, "Samples are 5e[+]09 s apart: the unit of time is probably another"),
+    ],
+)
+@pytest.mark.parametrize("command", [identify, diagnose])
+def test_a_unit_far_off_is_refused_with_the_likely_one(
+    command: Callable[[list[Record]], object],
+    factors: dict[str, float],
+    told: str,
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    with pytest.raises(InputError, match=told):
+        command([scaled(given, **factors)])
+
+
+@pytest.mark.parametrize(
+    ("factors", "told"),
+    [
+        ({"y": 1e3}, "displacement is in um, not mm"),
+        ({"y": 1e-3}, "displacement is in um, not nm"),
+        ({"y": 1e-6}, "displacement is in um, not pm"),
+        ({"v": 1e3}, "voltage is in mV, not V"),
+        ({"v": 1e-3}, "voltage is in kV, not V"),
+    ],
+)
+def test_a_unit_that_may_be_another_is_doubted(
+    factors: dict[str, float], told: str, given: tuple[FloatArray, FloatArray, FloatArray]
+) -> None:
+    assert told in doubtful_unit([scaled(given, **factors)])
+    assert doubtful_unit([scaled(given)]) == ""
+
+
+def test_sign_and_time_are_doubted(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    assert not doubtful_sign([scaled(given)])
+    assert "the other way round" in doubtful_sign([scaled(given, y=-1.0)])
+    assert not doubtful_time([scaled(given)])
+    assert "(--columns time=NAME:ms)" in doubtful_time([scaled(given, t=1e6)])
+    found = identify([scaled(given, y=-1.0)])
+    assert "the other way round" in found.warnings[0]
+
+
+def test_a_stray_voltage_is_named_with_its_time(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    stray = np.where(np.arange(600) == 300, 1e6, voltage)
+    with pytest.raises(InputError, match=r"voltage is 1e\+06 V at 1.5 s, and all others lie with"):
+        refuse_unusable([Record("r", time, stray, y)])
+    with pytest.raises(InputError, match=r"reaches 1e[+]09 V, and changes by 60 V.*has an offset"):
+        refuse_unusable([Record("r", time, voltage + 1e9, y)])
+    with pytest.raises(InputError, match=r"voltage changes by .* V only: that drives no stack"):
+        refuse_unusable([Record("r", time, 50.0 + 1e-7 * voltage, y)])
+
+
+@pytest.mark.parametrize(("t", "bound"), [(1e5, "R_s"), (1e-6, "c_P")])
+def test_however_slow_the_sampling_the_start_is_within_bounds(
+    t: float, bound: str, given: tuple[FloatArray, FloatArray, FloatArray]
+) -> None:
+    """A start outside would blame a parameter that nobody has given."""
+    model = starting_model([scaled(given, t=t)])
+    low, high = model.parameter(bound).bounds
+    assert low <= model.values[bound] <= high
+
+
+def test_a_spike_of_a_million_metres_moves_nothing(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    spoiled = np.where(np.arange(600) == 300, 1e6, y)
+    found = diagnose([Record("r", time, voltage, spoiled)], effects=TABLE)
+    assert found.verdict == "adequate"
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 0.6), (0.4, 1.0), (0.2, 0.8), (0.0, 0.95)])
+def test_a_saturated_sensor_is_named_and_masked(
+    low: float, high: float, given: tuple[FloatArray, FloatArray, FloatArray]
+) -> None:
+    time, voltage, y = given
+    ends = y.min() + np.array([low, high]) * np.ptp(y)
+    record = Record("r", time, voltage, np.clip(y, *ends))
+    found = suspects(record)
+    flat = (y <= ends[0]) & (low > 0.0) | (y >= ends[1]) & (high < 1.0)
+    assert np.mean(found.mask != flat) < 0.01
+    assert [e.upper for e in found.ends] == [False] * (low > 0.0) + [True] * (high < 1.0)
+    value = 1e6 * ends[1 if high < 1.0 else 0]
+    assert f"{value:.6g} um" in found.saturation("r")[-1]
+
+
+def test_a_saturated_record_is_diagnosed_without_its_flat_top(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    record = Record("r", time, voltage, np.minimum(y, y.min() + 0.6 * np.ptp(y)))
+    found = diagnose([record], effects=TABLE)
+    assert found.verdict == "adequate"
+    assert "the largest value, while the voltage moves the stack: the sensor" in found.notes[-1]
+
+
+def test_what_is_flat_for_other_reasons_is_not_a_saturated_sensor(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    quantum = np.ptp(y) / 50.0
+    assert not suspects(Record("coarse", time, voltage, quantum * np.round(y / quantum))).ends
+    held = np.minimum(voltage, 0.6 * voltage.max())
+    assert not suspects(Record("held", time, held, np.round(1e-6 * held, 9))).ends
+    assert not suspects(Record("as it is", time, voltage, y)).ends
+
+
+def test_a_coarse_sensor_is_named(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    time, voltage, y = given
+    quantum = np.ptp(y) / 9.0
+    found = diagnose([Record("r", time, voltage, quantum * np.round(y / quantum))], effects=TABLE)
+    assert "r: the sensor resolves 9 steps over the whole range." in found.notes[-1]
+
+
+def test_hardly_a_reading_left_is_refused_with_the_reason(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    tenth = np.sort(y)[12]
+    with pytest.raises(InputError, match=r"(?s)sensor is saturated there.*Only 12 of 600 reading"):
+        identify([Record("r", time, voltage, np.minimum(y, tenth))])

@@ -1,0 +1,127 @@
+"""What Python users give and get: records in any form, results that show themselves."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.records import records_given
+from tests.report_cases import diagnosis, identification
+
+T = np.arange(64) * 1e-3
+V = 50.0 - 50.0 * np.cos(40.0 * T)
+X = 0.1 * V + 0.01 * np.sin(7.0 * T)
+TABLE = {"time [ms]": 1e3 * T, "voltage [V]": V, "displacement [um]": X}
+NAMES = ("time", "voltage", "displacement")
+
+
+def assert_same(record: psa.Record) -> None:
+    for name, values in zip(NAMES, (T, V, 1e-6 * X), strict=True):
+        np.testing.assert_allclose(getattr(record, name), values, rtol=1e-12)
+
+
+def test_a_record_comes_from_a_mapping_or_a_data_frame() -> None:
+    assert_same(psa.record_from(TABLE))
+    assert_same(psa.record_from(pd.DataFrame(TABLE)))
+    bare = pd.DataFrame({"t": T, "u": V, "y": X})
+    columns = "time=t:s,voltage=u:V,displacement=y:um"
+    assert_same(psa.record_from(bare, columns=columns))
+
+
+def test_a_table_gives_the_record_that_its_file_gives(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    pd.DataFrame(TABLE).to_csv(path, index=False)
+    table, file = psa.record_from(TABLE, name="r"), psa.read_record(path)
+    assert table.name == file.name
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(table, name), getattr(file, name))
+
+
+def test_a_missing_reading_of_a_frame_is_missing() -> None:
+    y = [None if k == 3 else float(x) for k, x in enumerate(X)]
+    record = psa.record_from(pd.DataFrame({**TABLE, "displacement [um]": y}))
+    assert np.flatnonzero(~record.mask).tolist() == [3]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"displacement [um]": X[:-1]}, "different lengths"),
+        ({"displacement [um]": ["a"] * 64}, "not all numbers"),
+        ({"displacement [V]": X}, "displacement"),
+        ({"time [ms]": T[::-1]}, "time"),
+    ],
+)
+def test_a_wrong_table_is_refused_as_a_file_is(changed: dict[str, object], said: str) -> None:
+    table = {k: v for k, v in TABLE.items() if k.split()[0] != next(iter(changed)).split()[0]}
+    with pytest.raises(psa.InputError, match=said):
+        psa.record_from({**table, **changed})  # type: ignore[dict-item]
+
+
+def test_one_or_several_records_paths_and_tables_are_records(tmp_path: Path) -> None:
+    record = psa.record_from(TABLE)
+    path = tmp_path / "r.csv"
+    psa.write_record(path, {k: np.asarray(v) for k, v in TABLE.items()})
+    for one in (record, str(path), path, TABLE, pd.DataFrame(TABLE)):
+        (alone,) = records_given(one)
+        (listed,) = records_given([one])
+        assert alone.n == listed.n == 64
+    assert [r.n for r in records_given([record, path, TABLE])] == [64, 64, 64]
+
+
+def test_mistakes_of_all_that_was_given_are_told_together(tmp_path: Path) -> None:
+    with pytest.raises(psa.InputError) as caught:
+        records_given([tmp_path / "none.csv", 3, {"t": T}])  # type: ignore[list-item]
+    assert "none.csv" in str(caught.value)
+    assert "int is no record" in str(caught.value)
+    assert "record 3" in str(caught.value)
+
+
+def test_diagnose_and_identify_take_what_stands_for_a_record() -> None:
+    with pytest.raises(psa.InputError, match=r"none\.csv"):
+        psa.diagnose("none.csv")
+    with pytest.raises(psa.InputError, match=r"none\.csv"):
+        psa.identify("none.csv")
+
+
+def test_results_are_short_in_a_line() -> None:
+    d, found = diagnosis("cause_named"), identification()
+    assert repr(d).startswith("<Diagnosis cause_named: ")
+    for shown in (d, found, found.fit, d.model, d.experiments[0].record):
+        assert len(repr(shown)) < 300
+        assert "\n" not in repr(shown)
+        assert "array(" not in repr(shown)
+    assert re.fullmatch(r"<Identification: \d+ parameters from 2 records; .*rms>", repr(found))
+
+
+def test_results_draw_and_report_themselves(tmp_path: Path) -> None:
+    d, found = diagnosis("cause_named"), identification()
+    run = psa.simulate(found.model, T, V)
+    assert len(d.plot().axes) == 5
+    assert len(found.plot().axes) == 4
+    assert len(run.plot().axes) == 2
+    for result in (d, found, run):
+        cell = result._repr_html_()
+        assert cell.startswith("<pre")
+        assert "data:image/png;base64," in cell
+    for k, reported in enumerate((d, found)):
+        reported.report(tmp_path / f"{k}.html")
+        assert (tmp_path / f"{k}.html").stat().st_size > 10_000
+
+
+def test_results_are_data_frames() -> None:
+    d, found = diagnosis("cause_named"), identification()
+    samples = d.to_frame()
+    assert len(samples) == sum(e.record.n for e in d.experiments)
+    rest = samples[samples.held_out]
+    rms = float(np.sqrt(np.nanmean((rest.measured - rest.base) ** 2)))
+    assert 0.0 < rms < 1e-6
+    parameters = found.to_frame().set_index("parameter")
+    assert parameters.value.to_dict() == dict(found.model.values)
+    assert (parameters.low <= parameters.value)[parameters.low.notna()].all()
+    run = psa.simulate(found.model, T, V).to_frame()
+    np.testing.assert_array_equal(run.voltage, V)
+    assert "measured_displacement" in run
