@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from random import Random
 from typing import Any
 
@@ -174,19 +175,9 @@ _VALUES: tuple[Any, ...] = (
 )  # fmt: skip
 
 
-def _text(tree: Any, given: Any, rng: Random) -> str:
-    """Return the JSON of a tree, of the given one where a list of it was put into itself."""
-    how: dict[str, Any] = {"indent": rng.choice((None, 2)), "ensure_ascii": rng.random() < 0.5}
-    try:
-        return json.dumps(tree, **how)
-    except ValueError:
-        return json.dumps(given, **how)
-
-
 def damaged_json(tree: Any, rng: Random) -> bytes:
     """Return the JSON of a tree with nodes changed, removed, renamed or repeated; or other text."""
-    given = tree
-    tree = json.loads(json.dumps(given))
+    tree = json.loads(json.dumps(tree))
     raw = None
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         holder, key = _node(tree, rng)
@@ -194,7 +185,7 @@ def damaged_json(tree: Any, rng: Random) -> bytes:
             continue
         match rng.randrange(8):
             case 0 | 1 | 2:
-                holder[key] = rng.choice(_VALUES)
+                holder[key] = deepcopy(rng.choice(_VALUES))  # a list may be changed itself next
             case 3:
                 raw = rng.choice(_RAW)
                 holder[key] = "RAW"
@@ -207,7 +198,8 @@ def damaged_json(tree: Any, rng: Random) -> bytes:
                 holder[key] = json.loads(json.dumps(other[place] if other else None))
             case 7:
                 holder[key] = _nudged(holder[key], rng)
-    data = _text(tree, given, rng).encode("utf-8", "surrogatepass")
+    text = json.dumps(tree, indent=rng.choice((None, 2)), ensure_ascii=rng.random() < 0.5)
+    data = text.encode("utf-8", "surrogatepass")
     if raw is not None:
         data = data.replace(b'"RAW"', raw.encode())
     return damaged_bytes(data, rng, _JSON_WORDS) if rng.random() < 0.2 else data
@@ -233,7 +225,7 @@ def _rename(holder: Any, key: Any, rng: Random) -> None:
     if isinstance(holder, dict):
         holder[rng.choice(("", "x", key + " ", key.upper(), "__class__", "µ"))] = holder.pop(key)
     else:
-        holder.append(holder[key])
+        holder.append(deepcopy(holder[key]))
 
 
 #: About the largest double.
