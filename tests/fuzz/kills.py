@@ -54,6 +54,8 @@ WORKS: Mapping[str, Work] = {
         ("simulate", "--model", "given.json", "--input", "small.csv", "-o", "o.csv"), ("o.csv",)
     ),
 }  # fmt: skip
+#: Time [s] in which Python starts, before the command can do anything about a signal.
+_STARTING_S = 0.4
 #: What is run after a kill, to see that it works and sweeps.
 _AFTER = WORKS["export modelica"]
 _CODES = {"SIGTERM": (0, 143), "SIGINT": (0, 130), "SIGKILL": (0, -9), "SIGHUP": (0, 129, -1)}
@@ -132,9 +134,11 @@ def _killed(case: dict[str, object], folder: Path) -> Iterator[Found]:
         (folder / output).unlink(missing_ok=True)
         if case["old"]:
             (folder / output).write_text(_OLD)
-    ended = _run(work, folder, (getattr(signal, name), float(str(case["at"])) * usual))
+    number, at = getattr(signal, name), float(str(case["at"])) * usual
+    ended = _run(work, folder, (number, at))
     what = f"{case['command']} after {name}"
-    yield from misbehaved(ended, _CODES[name], what)
+    begun = at > _STARTING_S * _slowness()  # before that Python itself is ended
+    yield from misbehaved(ended, _CODES[name] if begun else (*_CODES[name], -int(number)), what)
     for output in work.outputs:
         if reason := not_whole(folder / output, missing=not case["old"] and ended.code != 0):
             yield Found(HALF_WRITTEN, f"{what}: {output} {reason}")
