@@ -49,6 +49,7 @@ static void do_deed(const char *deed)
             char *block = malloc(1 << 24);
             if (!block) abort();
             memset(block, 1, 1 << 24);
+            usleep(30000); /* memory is looked at from time to time */
         }
     if (!strcmp(deed, "print"))
         for (int k = 0; k < 100000; ++k) { puts(text); fputs(text, stderr); }
