@@ -1,9 +1,7 @@
 """The command `psa`; each subcommand is a small file that calls one function of the package."""
 
-import os
 import signal
 import sys
-from typing import NoReturn
 
 __all__ = ["main"]
 
@@ -19,21 +17,15 @@ def main() -> None:
         run()
     except KeyboardInterrupt:
         sys.stderr.write("Interrupted: nothing was begun.\n")
-        sys.stderr.flush()
-        _leave()
     except SystemExit as ended:
-        if ended.code == INTERRUPTED:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            _leave()
-        raise
+        if ended.code != INTERRUPTED:
+            raise
+    else:
+        return
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done; Python tidies up
+    from psa_casadi.cli.interrupts import leave
 
-
-def _leave() -> NoReturn:
-    """End at once, without temporary files and children."""
-    from psa_casadi.scratch import abandon
-
-    abandon()
-    os._exit(INTERRUPTED)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    leave()

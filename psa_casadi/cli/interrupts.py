@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
+from typing import NoReturn
 
 from psa_casadi.cli import INTERRUPTED
 from psa_casadi.interruption import Work, interruptible_work
@@ -72,7 +73,7 @@ def kept(
     return f"{told} Not written: {absent}." if absent else told
 
 
-def leave() -> None:
+def leave() -> NoReturn:
     """End the process at once, without files that are half written or children that go on."""
     abandon()
     if sys.stderr.isatty():

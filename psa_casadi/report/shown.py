@@ -58,9 +58,9 @@ def line(result: Diagnosis | Identification | Trajectory) -> str:
 def _diagnosis_line(d: Diagnosis) -> str:
     causes = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
     before, after = (e.holdout_nrmse_percent for e in (d.base_errors, d.extended_errors))
-    errors = f"{number(before, 2)} % of range rms"
+    errors = f"{number(after, 2)} % of range rms"
     if before != after:
-        errors = f"{number(before, 2)} -> {errors.replace(number(before, 2), number(after, 2), 1)}"
+        errors = f"{number(before, 2)} -> {errors}"
     return f"<Diagnosis {d.verdict}{': ' if causes else ''}{causes}; held-out error {errors}>"
 
 

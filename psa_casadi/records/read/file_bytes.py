@@ -76,3 +76,8 @@ def unpacked(data: bytes, path: str | os.PathLike[str]) -> bytes:
         raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
     check_size(path, len(content), "holds")
     return content
+
+
+def reason_of(error: Exception) -> str:
+    """Return what a library says of a damaged file, in one short line."""
+    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from psa_casadi.errors import InputError
+from psa_casadi.records.read.file_bytes import reason_of
 from psa_casadi.records.read.mat_hdf5 import hdf5_arrays, require_h5py
 from psa_casadi.records.read.mat_level5 import Tree
 
@@ -83,7 +84,7 @@ def main() -> int:
     except InputError as error:
         problems = list(error.problems)
     except Exception as error:  # noqa: BLE001 - h5py may raise anything on a damaged file
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        reason = reason_of(error)
         problems = [
             f"{path}: is no readable MATLAB file ({reason}); save it again with save(..., '-v7')."
         ]

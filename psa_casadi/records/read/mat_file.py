@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
+from psa_casadi.records.read.file_bytes import reason_of
 from psa_casadi.records.read.hdf5_process import arrays_apart
 from psa_casadi.records.read.mat_hdf5 import is_hdf5
 from psa_casadi.records.read.mat_level4 import level4_arrays
@@ -29,7 +30,7 @@ def load_arrays(path: str, data: bytes) -> Mapping[str, Numbers]:
     except InputError:
         raise
     except Exception as error:  # h5py may raise anything on a damaged file
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        reason = reason_of(error)
         raise InputError(
             f"{path}: is no readable MATLAB file ({reason}); save it again with save(..., '-v7'), "
             f"and where it was saved with -ascii, give the text a header and the ending .csv."

@@ -9,7 +9,7 @@ import numpy as np
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import ColumnMap, parse_header
-from psa_casadi.records.read.file_bytes import check_size, read_bytes
+from psa_casadi.records.read.file_bytes import check_size, read_bytes, reason_of
 from psa_casadi.records.read.samples import Samples, whole_samples
 from psa_casadi.units import FloatArray
 
@@ -63,7 +63,7 @@ def _told(path: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        reason = reason_of(error)
         raise InputError(
             f"{path}: is no readable Parquet file ({reason}); write it again, or export the record "
             f"as CSV."

@@ -1,7 +1,7 @@
 """Records from tables in memory: a data frame, or a mapping of arrays, named as a header is."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -37,11 +37,12 @@ def read_table(
     Names carry units as a CSV header does; `wanted` says which is which where they differ.
     Mistakes are added to `problems`, under the table's `name`.
     """
-    names = [str(c) for c in _names(table)]
+    own_names = list(table if isinstance(table, Mapping) else table.columns)
+    names = [str(own) for own in own_names]
     fields = parse_header(names, required, f"{name}: column names", problems, wanted)
     columns: dict[str, tuple[str, FloatArray]] = {}
     for column, field in fields.items():
-        own = list(_names(table))[field.index]
+        own = own_names[field.index]
         try:
             values = np.asarray(table[own], dtype=np.float64)
         except (TypeError, ValueError):
@@ -66,7 +67,3 @@ def read_table(
     for column, (unit, values) in columns.items():
         digest.update(f"{column} [{unit}]".encode() + np.ascontiguousarray(values).tobytes())
     return whole_samples(name, digest.hexdigest(), "row", columns)
-
-
-def _names(table: Table) -> Iterator[Any]:
-    return iter(table) if isinstance(table, Mapping) else iter(table.columns)
