@@ -16,13 +16,14 @@ from psa_casadi.component import (
 )
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured, predict_record
+from psa_casadi.identification.fitting.prediction import measured, trace_record
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import among_harmonics
 from psa_casadi.records.quality.filtering import peaks as highest_peaks
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import memory_names
+from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -233,16 +234,18 @@ def _column(
     first = 0
     for e, start in zip(experiments, memory, strict=True):
         states = dict.fromkeys(names, 0.0) | start
-        y, by_gain, _ = predict_record(
-            changed, e.record, states, [gain], stop=e.stop, rtol=fit.way.rtol if step else _RTOL
-        )
+        rtol = fit.way.rtol if step else _RTOL
+        found = trace_record(
+            changed, e.record, states, () if step else (gain,),
+            stop=e.stop, way=Way(rtol, rtol), by_start=False,
+        )  # fmt: skip
         used = e.used[: e.stop]
         count = int(used.sum())
         if step:
             index = len(parts)
             prediction = measured(e.record)[: e.stop][used] - fit.residuals[first : first + count]
-            parts.append(y[used] + fit.offset(index) - prediction)
+            parts.append(found.output[used] + fit.offset(index) - prediction)
         else:
-            parts.append(by_gain[used, 0] * scale)
+            parts.append(found.sensitivity[used, 0] * scale)
         first += count
     return np.concatenate(parts)

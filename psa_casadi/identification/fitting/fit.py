@@ -8,7 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum, minimise
+from psa_casadi.identification.fitting.levenberg_marquardt import (
+    FIRST_RADIUS,
+    Evaluate,
+    Minimum,
+    minimise,
+)
 from psa_casadi.identification.fitting.prediction import (
     Prediction,
     Simulated,
@@ -44,7 +49,8 @@ class Fit:
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
-    each record was run and how accurately; it is empty after an interrupt.
+    each record was run and how accurately; it is empty after an interrupt, and above the goal.
+    `radius` is that of the next step.
     """
 
     model: Model
@@ -59,6 +65,7 @@ class Fit:
     evaluations: int
     way: Way
     simulated: tuple[Simulated, ...]
+    radius: float = FIRST_RADIUS
 
     def __repr__(self) -> str:
         """Return what was fitted and what it leaves, in one line."""
@@ -93,16 +100,21 @@ class Fit:
 
     def predicted(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict whole records [m], held-out samples included."""
-        return [p.displacement for p in self.predictions(experiments)]
+        return [p.displacement for p in self.predictions(experiments, differentiated=False)]
 
-    def predictions(self, experiments: Sequence[Experiment]) -> list[Prediction]:
-        """Predict whole records with their derivatives by theta.
+    def predictions(
+        self, experiments: Sequence[Experiment], *, differentiated: bool = True
+    ) -> list[Prediction]:
+        """Predict whole records with their derivatives by theta, if `differentiated`.
 
         A record that is held out as a whole begins as the fitted ones do (`shared_starts`); what
         finds its offset are the samples that it may use.
         """
         theta, shared = shared_starts(self.model, self.unknowns, self.theta, experiments)
-        full = predict(self.model, experiments, self.unknowns, theta, way=self.way, everything=True)
+        full = predict(
+            self.model, experiments, self.unknowns, theta,
+            way=self.way, everything=True, differentiated=differentiated,
+        )  # fmt: skip
         for k in shared:
             own, x = experiments[k], full[k].displacement
             offset = float(np.mean((measured(own.record) - x)[own.used]))
@@ -133,14 +145,15 @@ def fit(
     tolerance: float = 1e-5,
     rtol: float = FIT_RTOL,
     goal: float = np.inf,
+    radius: float = FIRST_RADIUS,
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
     those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
-    cost will stay above the `goal`. Raises InputError when no sample can be used, SimulationError
-    when the start cannot be simulated or its numbers overflow.
+    cost will stay above the `goal`; its first step is of the `radius`. Raises InputError when no
+    sample can be used, SimulationError when the start cannot be simulated or its numbers overflow.
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
@@ -154,7 +167,7 @@ def fit(
         [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
     )
     linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
-    effort = _Effort(tolerance, evaluations, goal, linear)
+    effort = _Effort(tolerance, evaluations, goal, linear, radius)
     minimum, way, told = _minimum(model, experiments, unknowns, weights, theta, sigma, rtol, effort)
     return Fit(
         model=model.with_values(unknowns.values(minimum.theta)),
@@ -169,6 +182,7 @@ def fit(
         evaluations=minimum.evaluations,
         way=way,
         simulated=tuple(told),
+        radius=minimum.radius,
     )
 
 
@@ -180,6 +194,7 @@ class _Effort:
     evaluations: int
     goal: float
     linear: tuple[int, ...]
+    radius: float
 
 
 def _minimum(
@@ -208,6 +223,7 @@ def _minimum(
                 evaluations=max(effort.evaluations - spent, 2),
                 goal=effort.goal,
                 linear=effort.linear,
+                radius=effort.radius if before is None else before[0].radius,
             )
         except KeyboardInterrupt:
             if before is None:  # nothing was evaluated yet
@@ -225,6 +241,8 @@ def _minimum(
         spent += found.evaluations
         if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
             current_work().stop()
+            return replace(minimum, evaluations=spent), way, []
+        if minimum.cost > effort.goal:  # of no use, however accurate
             return replace(minimum, evaluations=spent), way, []
         told = simulated(model, experiments, unknowns, theta, way=way)
         if not any(t.error > a for t, a in zip(told, allowed, strict=True)):

@@ -78,23 +78,29 @@ def trace_record(
     *,
     stop: int,
     way: Way,
+    by_start: bool = True,
 ) -> Traced:
-    """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
+    """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m).
+
+    By `wanted` (n, k) alone if those `by_start` are not asked for.
+    """
     names = model.state_names
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
     memories = memory_names(model.structure)
     found = start_on(model, t, u, {n: start.get(n, 0.0) for n in memories})
     x0, searched = found.x.copy(), [names.index(n) for n in start]
-    by_start = np.zeros((len(names), len(start)))
+    moved = np.zeros((len(names), len(start)))
     for column, name in enumerate(start):
         if name in memories:
-            by_start[:, column] = found.by_memory[:, memories.index(name)]
+            moved[:, column] = found.by_memory[:, memories.index(name)]
         else:
             x0[searched[column]] += start[name]
-            by_start[searched[column], column] = 1.0
+            moved[searched[column], column] = 1.0
     columns = [model.parameter_names.index(n) for n in wanted]
-    s0 = np.hstack([found.by_parameter[:, columns], by_start])
-    unknowns: list[str | int] = [*wanted, *searched]
+    s0 = found.by_parameter[:, columns]
+    unknowns: list[str | int] = list(wanted)
+    if by_start:
+        s0, unknowns = np.hstack([s0, moved]), [*wanted, *searched]
     return trace(
         model,
         t,
@@ -148,10 +154,12 @@ def predict(
     *,
     way: Way,
     everything: bool = False,
+    differentiated: bool = True,
 ) -> list[Prediction]:
     """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
 
-    Records are simulated side by side.
+    Records are simulated side by side; `differentiated` or not, in which case the Jacobian has no
+    columns.
     """
     current = model.with_values(unknowns.values(theta))
     slopes = unknowns.slopes(theta)
@@ -163,16 +171,20 @@ def predict(
             current,
             experiment.record,
             unknowns.start(theta, index),
-            unknowns.names,
+            unknowns.names if differentiated else (),
             stop=stop,
             way=way,
+            by_start=differentiated,
         )
+        shown = found.output + unknowns.offset(theta, index)
+        if not differentiated:
+            return Prediction(shown, found.sensitivity, found.way)
         start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
         count = len(unknowns.names)
         jacobian = found.sensitivity[:, count:] @ start_slopes
         jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
         jacobian += offset_slopes
-        return Prediction(found.output + unknowns.offset(theta, index), jacobian, found.way)
+        return Prediction(shown, jacobian, found.way)
 
     return side_by_side(one, range(len(experiments)))
 
@@ -200,7 +212,9 @@ def simulated(
         experiment, start = experiments[index], unknowns.start(theta, index)
         used = experiment.used[: experiment.stop]
         plain, finer = (
-            trace_record(current, experiment.record, start, (), stop=experiment.stop, way=w)
+            trace_record(
+                current, experiment.record, start, (), stop=experiment.stop, way=w, by_start=False
+            )
             for w in (way, way.finer)
         )
         gap = (plain.output - finer.output)[used]
