@@ -238,8 +238,7 @@ APART static int set_up_columns(psa_state *state, int *theta) {
         const int none = constant ? !EX_CONSTANT : at >= 0 && at < 2 * EX_NU && zero[at % SOME(EX_NU)];
         if (!none || (k + 1 == TAIL && state->tails == 0)) state->tail[state->tails++] = k;
     }
-    for (int r = 0; r < NL + EX_NEED; ++r)
-        state->slopes_size += ex_row_size[r < NL ? r : ex_need[r - NL]] + state->tails;
+    state->slopes_size = EX_NOWN + (NL + EX_NEED) * state->tails;
     const size_t nb = (size_t)(state->blocks = (run->count + COLUMNS - 1) / COLUMNS);
     const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
     const size_t own = levels * (size_t)((state->thetas + COLUMNS - 1) / COLUMNS * state->slopes_size);

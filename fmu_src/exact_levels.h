@@ -38,7 +38,7 @@ typedef struct {
 
 /* Rows of L by blocks of one vector, the last ones 0; with lanes a row is a vector already */
 #define BLOCKS ((NL + COLUMNS - 1) / COLUMNS)
-#define ROWS (BLOCKS * COLUMNS)
+#define ROWS EX_ROWS
 #define ROWS_OF(array, b) (((column *)(array))[b])
 
 /* What a step of one length needs. Of its whole: F, a_1, a_2, c_1, and each port's weights of its values at the
