@@ -176,7 +176,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
             const int spent = ++pace->tried[lane] > run->steps_limit;
             if (spent && PSA_LANES == 1) return 3;
             if (error > 1.0 && level[lane] < finest && !spent) {
-                pace->level[lane]++;
+                pace->level[lane] += error > FAR && level[lane] + 1 < finest ? 2 : 1;
                 run->rejected++;
                 continue;
             }
