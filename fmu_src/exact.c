@@ -176,7 +176,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
             const int spent = ++pace->tried[lane] > run->steps_limit;
             if (spent && PSA_LANES == 1) return 3;
             if (error > 1.0 && level[lane] < finest && !spent) {
-                pace->level[lane]++;
+                pace->level[lane] += error > FAR && level[lane] + 1 < finest ? 2 : 1;
                 run->rejected++;
                 continue;
             }
@@ -238,8 +238,7 @@ APART static int set_up_columns(psa_state *state, int *theta) {
         const int none = constant ? !EX_CONSTANT : at >= 0 && at < 2 * EX_NU && zero[at % SOME(EX_NU)];
         if (!none || (k + 1 == TAIL && state->tails == 0)) state->tail[state->tails++] = k;
     }
-    for (int r = 0; r < NL + EX_NEED; ++r)
-        state->slopes_size += ex_row_size[r < NL ? r : ex_need[r - NL]] + state->tails;
+    state->slopes_size = EX_NOWN + (NL + EX_NEED) * state->tails;
     const size_t nb = (size_t)(state->blocks = (run->count + COLUMNS - 1) / COLUMNS);
     const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
     const size_t own = levels * (size_t)((state->thetas + COLUMNS - 1) / COLUMNS * state->slopes_size);

@@ -9,6 +9,7 @@
 #define SLOWS 0.8        /* a driver whose rate falls to less than this share of it may come to rest */
 #define FAST 1e3         /* over the driver's rate: there what a state does in time is nothing */
 #define GROWS 0.03       /* of the tolerance: the next step may be twice as long */
+#define FAR 10.0         /* times the tolerance: more than one halving mends; the next step is a quarter */
 #define TURNS 8          /* iterations for the instant at which a driver turns */
 #define LOST 1e6         /* times the tolerance: an error of the finest step from which nothing can be told */
 #define BENDS 0.05       /* of its way: a driver's course that bends by more is not a smooth one */
