@@ -1,8 +1,8 @@
 """What the help of every command shows is what was written: nothing is taken for markup."""
 
 from collections.abc import Iterator
+from typing import Any
 
-import click
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 from psa_casadi.cli.app import app
 
 
-def commands(own: click.Command, *path: str) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+def commands(own: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield a command of click, which some versions of typer hold in a room of their own."""
     yield path, own
     for name, inner in getattr(own, "commands", {}).items():
         yield from commands(inner, *path, name)
@@ -19,7 +20,7 @@ def commands(own: click.Command, *path: str) -> Iterator[tuple[tuple[str, ...], 
 EVERY = dict(commands(typer.main.get_command(app)))
 
 
-def written(own: click.Command) -> list[str]:
+def written(own: Any) -> list[str]:
     """Return the texts of a command's help, without the backslashes that keep brackets."""
     texts = [own.help, own.epilog, *(getattr(p, "help", None) for p in own.params)]
     return [" ".join(text.replace("\\[", "[").split()) for text in texts if text]

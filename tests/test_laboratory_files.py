@@ -104,7 +104,8 @@ def test_the_line_to_type_is_told_once_and_works(
     head: str, given: str | None, line: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "r.csv"
-    path.write_bytes(text(head, time=1e3 if ":ms" in line else 1.0))
+    milliseconds = 1e3 if ":ms" in line else 1.0
+    path.write_text("\n".join([head, *rows(time=milliseconds), ""]))
     with pytest.raises(InputError) as caught:
         read_record(path, columns=given)
     assert re.findall(r"--columns (\S+) \(with your units\)", str(caught.value)) == [line]
