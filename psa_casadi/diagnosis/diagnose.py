@@ -21,6 +21,7 @@ from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
+from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -67,8 +68,10 @@ def diagnose(
     with using(method.thresholds):
         with stage("preparing"):
             table = list(effects if effects is not None else known_effects().values())
-            ordered, apart = in_one_order(given), in_one_order(kept)
+            (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
+            ordered, apart = in_one_order(whole), in_one_order(held)
             clean, said, hidden = _cleaned(ordered)
+            said += [*cut, *cut_too]
             experiments = divided(clean, [cleaned(r) for r in apart])
             start, scale_given = chosen_start(clean, model, stiffness)
             refuse_stuck([e.record for e in experiments])
