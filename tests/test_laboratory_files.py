@@ -91,6 +91,28 @@ def test_what_cannot_be_decided_ends_with_the_line_to_type(form: str, tmp_path: 
     assert_read(path, columns=typed[1])
 
 
+@pytest.mark.parametrize(
+    ("head", "given", "line"),
+    [
+        ("t,V,x", None, "time=t:s,voltage=V:V,displacement=x:um"),
+        ("time [s],V,x", None, "voltage=V:V,displacement=x:um"),
+        ("t,V,x", "time=t:ms", "time=t:ms,voltage=V:V,displacement=x:um"),
+        ("t,V,x [um]", "voltage=V", "voltage=V,time=t:s"),
+    ],
+)
+def test_the_line_to_type_is_told_once_and_works(
+    head: str, given: str | None, line: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "r.csv"
+    milliseconds = 1e3 if ":ms" in line else 1.0
+    path.write_text("\n".join([head, *rows(time=milliseconds), ""]))
+    with pytest.raises(InputError) as caught:
+        read_record(path, columns=given)
+    assert re.findall(r"--columns (\S+) \(with your units\)", str(caught.value)) == [line]
+    assert len(caught.value.problems) == 1
+    assert_read(path, columns=line)
+
+
 def test_two_cells_for_one_column_are_not_guessed(tmp_path: Path) -> None:
     path = tmp_path / "r.csv"
     lines = ["time_s,voltage_V,position_um,stroke_um", *(f"{r},0" for r in rows())]

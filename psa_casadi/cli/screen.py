@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from psa_casadi.characters import visible
+
 if TYPE_CHECKING:
     from psa_casadi.report.words.tables import Table
 
@@ -126,16 +128,21 @@ def working(what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
     elif sys.stderr.isatty():
         console = Console(stderr=True)
         with console.status(what) as status:
-            yield lambda step: status.update(Text(f"{what}: {step}"))
+            yield lambda step: status.update(Text(visible(f"{what}: {step}")))
     else:
-        typer.echo(f"{what} ...", err=True)
-        yield lambda step: typer.echo(f"  {step}", err=True)
+        tell(f"{what} ...")
+        yield lambda step: tell(f"  {step}")
 
 
 def show(text: str, quiet: bool = False) -> None:
-    """Print text as it is."""
+    """Print a result, with what a terminal would obey spelled out."""
     if not quiet:
-        typer.echo(text)
+        typer.echo(visible(text))
+
+
+def tell(text: str) -> None:
+    """Print a message on stderr, with what a terminal would obey spelled out."""
+    typer.echo(visible(text), err=True)
 
 
 def show_table(table: "Table", quiet: bool = False) -> None:
@@ -143,14 +150,14 @@ def show_table(table: "Table", quiet: bool = False) -> None:
     if quiet:
         return
     if not sys.stdout.isatty():
-        typer.echo(str(table))
+        show(str(table))
         return
     drawn = RichTable(show_edge=False)
     for name in table.head:
         drawn.add_column(name, overflow="fold")
     styles = {"FAIL": "bold red", "pass": "green"}
     for row in table.rows:
-        drawn.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+        drawn.add_row(*(Text(visible(cell), style=styles.get(cell, "")) for cell in row))
     Console().print(drawn)
 
 

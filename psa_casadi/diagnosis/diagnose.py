@@ -21,6 +21,7 @@ from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
+from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -67,8 +68,10 @@ def diagnose(
     with using(method.thresholds):
         with stage("preparing"):
             table = list(effects if effects is not None else known_effects().values())
-            ordered, apart = in_one_order(given), in_one_order(kept)
-            clean, said = _cleaned(ordered)
+            (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
+            ordered, apart = in_one_order(whole), in_one_order(held)
+            clean, said, hidden = _cleaned(ordered)
+            said += [*cut, *cut_too]
             experiments = divided(clean, [cleaned(r) for r in apart])
             start, scale_given = chosen_start(clean, model, stiffness)
             refuse_stuck([e.record for e in experiments])
@@ -78,7 +81,7 @@ def diagnose(
             there = {c.name for c in start.components}
             table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
         so_far: list[Fit] = []
-        task = Task(experiments, tuple(table), method, progress, so_far.append)
+        task = Task(experiments, tuple(table), method, progress, so_far.append, hidden)
         try:
             found = _diagnose(start, task, scale_given)
             return replace(found, notes=(*found.notes, *said))
@@ -88,8 +91,10 @@ def diagnose(
             raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
-def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
+def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]:
     """Return the records without suspect samples, and where a sensor was saturated or coarse.
+
+    And the share of the readings that a saturated sensor has made.
 
     Raises InputError where hardly a sample is left.
     """
@@ -101,7 +106,8 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     for r, own in zip(records, found, strict=True):
         if own.quantum is not None and r.range_m < COARSE * own.quantum:
             said.append(COARSE_NOTE.format(r.name, r.range_m / own.quantum))
-    return clean, said
+    saturated = sum(own.counts["saturated"] for own in found)
+    return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 
 
 def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
@@ -116,7 +122,9 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     seen = driven(base, start, experiments, progress)
     if not seen.follows:
         steps = unsearched(base, task)
-        found = conclude(steps, experiments, table, scale_given, driven=seen.filtered)
+        found = conclude(
+            steps, experiments, table, scale_given, driven=seen.filtered, hidden=task.hidden
+        )
         return replace(found, notes=(*found.notes, *seen.notes))
     steps = _search(base, task)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)
@@ -125,7 +133,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         task = replace(task, experiments=experiments)
         steps = _search(_base(start, task), task)
     progress("judging")
-    found = conclude(steps, experiments, table, scale_given)
+    found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
     notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []))
     return replace(found, notes=(*found.notes, *notes))
 

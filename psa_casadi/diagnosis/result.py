@@ -137,6 +137,7 @@ class Diagnosis(Reported):
     predictions [m] of every record in full, in the order of `experiments`. `noise` is the floor of
     every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
     records with enough samples. `contenders` are the fitted rivals of an ambiguous verdict.
+    `doubt` says why held-out samples cannot confirm a cause, "" where they can.
     `budget` says where the base's held-out error goes, `patch` the unnamed correction that would
     remove most of what the named causes leave. `alternatives` are models for causes of which the
     records do not tell whether an exported plant holds them.
@@ -163,6 +164,7 @@ class Diagnosis(Reported):
     misfit: tuple[Misfit, ...] = ()
     remainder: tuple[Misfit, ...] = ()
     contenders: tuple[Contender, ...] = ()
+    doubt: str = ""
     budget: Budget | None = None
     patch: Patch | None = None
     alternatives: tuple[Alternative, ...] = ()

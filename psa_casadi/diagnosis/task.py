@@ -41,7 +41,8 @@ class Method:
 class Task:
     """The records, the table of effects to search, the method, and who is told of the progress.
 
-    `keep` gets the best fit so far where a keyboard interrupt ends the search.
+    `keep` gets the best fit so far where a keyboard interrupt ends the search; `hidden` is the
+    share of the readings that a saturated sensor has made.
     """
 
     experiments: tuple[Experiment, ...]
@@ -49,6 +50,7 @@ class Task:
     method: Method = field(default_factory=Method)
     progress: Callable[[str], None] = lambda _: None
     keep: Callable[[Fit], None] = lambda _: None
+    hidden: float = 0.0
 
     @property
     def fast(self) -> bool:

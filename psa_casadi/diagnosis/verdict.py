@@ -9,9 +9,10 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.alternatives import alternatives
 from psa_casadi.diagnosis.blind_spots import blind_spots, shown
 from psa_casadi.diagnosis.budget import Budget, Removed, budget
-from psa_casadi.diagnosis.corrections.correct import Correction, corrections
+from psa_casadi.diagnosis.corrections.correct import corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
 from psa_casadi.diagnosis.corrections.patch import patch_of
+from psa_casadi.diagnosis.held_out.confirmation import unconfirmed
 from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import (
     errors_of,
@@ -19,7 +20,7 @@ from psa_casadi.diagnosis.held_out.errors import (
     whole_residuals,
 )
 from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
-from psa_casadi.diagnosis.judgement import Weighed, told_from, verdict_of
+from psa_casadi.diagnosis.judgement import Weighed, told_from, verdict_of, withdrawn_names
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
@@ -62,10 +63,12 @@ def conclude(
     stiffness_given: bool,
     *,
     driven: bool = True,
+    hidden: float = 0.0,
 ) -> Diagnosis:
     """Judge the steps of a search and return the diagnosis.
 
-    Of records whose displacement is not `driven` by the voltage nothing more is said.
+    Of records whose displacement is not `driven` by the voltage nothing more is said. `hidden` is
+    the share of the readings that a saturated sensor has made.
     """
     first, last = steps[0], steps[-1]
     colour = last.screening.colour
@@ -88,10 +91,13 @@ def conclude(
         shares=[removed.from_base(c.predicted) for c in beside_base],
     )
     beaten = weighed.beaten_by()
+    gain = gain_of(experiments, first.predicted, last.predicted)
+    partly = last.test.alarm and len(steps) > 1
+    doubt = unconfirmed(experiments, gain, partly=partly, hidden=hidden)
     verdict: Verdict = (
         "not_driven"
         if not driven
-        else verdict_of(steps, missing=missing, beaten=beaten is not None, share=share)
+        else verdict_of(steps, missing=missing, withdrawn=bool(beaten or doubt), share=share)
     )
     named = [s for s in steps if s.chosen] if verdict in NAMING else []
     final = last if named else first
@@ -122,15 +128,19 @@ def conclude(
         noise_floor_rms_m=floor,
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
-        gain=gain_of(experiments, first.predicted, final.predicted),
+        gain=gain if named else gain_of(experiments, first.predicted, final.predicted),
         blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
         remaining=_remaining(final, Excess() if named else beyond),
         next_experiment=_next_experiment(
-            causes, verdict, same_curves(experiments, table, first.fit)
+            causes,
+            verdict,
+            same_curves(experiments, table, first.fit),
+            doubted=bool(doubt),
         ),
+        doubt=doubt if verdict in ("adequate", "unexplained") else "",
         notes=(
             *model.provenance.notes,
-            *(_withdrawn(steps, weighed, beaten) if verdict == "unexplained" else ()),
+            *(withdrawn_names(steps, weighed, beaten, doubt) if verdict == "unexplained" else ()),
             *coverage_notes(experiments),
         ),
         experiments=tuple(experiments),
@@ -163,27 +173,6 @@ def patched_model(d: Diagnosis) -> Model:
     given = d.model.provenance.force_scale == "given"
     told = determinacy(found, d.experiments)
     return with_provenance(found.model, told, [e.record for e in d.experiments], given)
-
-
-def _withdrawn(
-    steps: Sequence[Step], weighed: Weighed, beaten: Correction | None
-) -> tuple[str, ...]:
-    """Say which names were found but not told, and why."""
-    names = ", ".join(s.cause.name for s in steps if s.chosen is not None)
-    if not names:
-        return ()
-    found = (
-        f"{names}: found with a ln of the Bayes factor over the base of {weighed.evidence:.0f},"
-        f" would remove {100 * max(0.0, weighed.share):.0f} % of the held-out error above the noise"
-    )
-    if beaten is None:
-        least = 100 * thresholds().partly
-        return (f"{found}; not named, because that is less than {least:.0f} % and much remains.",)
-    share = weighed.shares[list(weighed.corrections).index(beaten)]
-    return (
-        f"{found}; not named, because an unnamed correction explains more: {beaten.kind.sentence},"
-        f" with {beaten.evidence:.0f} and {100 * share:.0f} %.",
-    )
 
 
 def _misfits(
@@ -264,11 +253,17 @@ _ADVICE = (
     " repeated step: rates separate delay, lag and creep; amplitudes separate asymmetry and memory;"
     " holds separate creep and drift; the repeat shows the noise."
 )
+_LONGER = "Record again, for longer and with the sensor in its range, so that more readings count."
+_COLUMNS = "Correct the record as the notes say, and diagnose it again."
 
 
 def _next_experiment(
-    causes: Sequence[Cause], verdict: Verdict, alike: Sequence[Sequence[str]]
+    causes: Sequence[Cause], verdict: Verdict, alike: Sequence[Sequence[str]], *, doubted: bool
 ) -> NextExperiment:
+    if verdict == "not_driven":
+        return NextExperiment(None, (), _COLUMNS)
+    if doubted:
+        return NextExperiment(None, (), _LONGER)
     rivals = tuple(dict.fromkeys(n for c in causes for n in (c.effect, *c.cannot_be_told_from)))
     if verdict == "ambiguous":
         own = (causes[0].effect, *causes[0].cannot_be_told_from)

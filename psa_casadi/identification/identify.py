@@ -25,6 +25,7 @@ from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
+from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -107,9 +108,11 @@ def identify(
     """
     given_records = records_given(records)
     refuse_still(given_records)
-    ready = [prepared(r) for r in given_records]
+    parts, cut = without_gaps(given_records)
+    ready = [prepared(r) for r in parts]
     fitted = [r for r, _ in ready]
-    refuse_few(given_records, fitted, [s for _, said in ready for s in said])
+    said = [*cut, *(s for _, own in ready for s in own)]
+    refuse_few(given_records, fitted, said)
     experiments = tuple(whole(r) for r in fitted)
     start, given = chosen_start(fitted, model, stiffness)
     linear = None
@@ -146,7 +149,7 @@ def identify(
         experiments=experiments,
         warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
-        sentences=tuple(s for _, said in ready for s in said),
+        sentences=tuple(said),
         combinations=open_ones,
         advice=advised or (),
         interrupted=advised is None,

@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from psa_casadi.errors import InputError
 from psa_casadi.units import FloatArray
 
+#: Fewer samples than this describe no experiment, and judge none.
+FEWEST_SAMPLES = 16
+
 _OPTIONAL = ("displacement", "load_force", "current", "temperature")
 
 

@@ -1,11 +1,12 @@
 """How much the data speak for one more effect: Laplace's approximation of the Bayes factor.
 
-    ln B = n/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
+    ln B = (n - k)/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
 
-S are sums of squares of the whitened residuals, the noise level being the data's own; H is the
-information on the unknowns that the effect adds, those of the model before projected out, and P
-their prior standard deviations. An unknown that the data do not tell costs nothing, a sharp one
-costs what its prior range is wider than its interval (MacKay, Neural Computation 4 (1992), 415).
+S are sums of squares of n whitened residuals, of which k unknowns of the model before have taken
+their part, the noise level being the data's own; H is the information on the unknowns that the
+effect adds, those of the model before projected out, and P their prior standard deviations. An
+unknown that the data do not tell costs nothing, a sharp one costs what its prior range is wider
+than its interval (MacKay, Neural Computation 4 (1992), 415).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,7 +27,7 @@ def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     """Return ln B of a fit with one more effect over the fit without it."""
     n = len(before.residuals)
     sums = [float(np.sum(colour.whiten(f.residuals) ** 2)) for f in (before, after)]
-    gained = 0.5 * n * float(np.log(sums[0] / max(sums[1], 1e-300)))
+    gained = 0.5 * _freedom(before) * float(np.log(sums[0] / max(sums[1], 1e-300)))
     added = _added(before, after)
     level = float(np.sqrt(sums[1] / n))
     jacobian = colour.whiten(after.jacobian) / max(level, 1e-300)
@@ -43,14 +44,14 @@ def estimated(before: Fit, screening: Screening) -> dict[str, float]:
     """Return every effect's ln B as its trial directions tell it, without a full fit.
 
     Linear in the gain g with prior N(0, s^2), s = `LINEAR_PRIOR` ordinary sizes, and estimated to
-    sigma: ln B = n/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged over
-    the probe values, each as likely as the others.
+    sigma: ln B = (n - k)/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged
+    over the probe values, each as likely as the others.
     """
     found: dict[str, list[float]] = {}
     total = float(np.sum(screening.colour.whiten(before.residuals) ** 2))
     for score in screening.scores:
         share = min(score.decrease * screening.colour.level**2 / max(total, 1e-300), 1.0 - 1e-9)
-        gained = -0.5 * len(before.residuals) * float(np.log1p(-share))
+        gained = -0.5 * _freedom(before) * float(np.log1p(-share))
         found.setdefault(score.direction.effect.name, []).append(_linear(score, gained))
     return {name: float(np.logaddexp.reduce(v) - np.log(len(v))) for name, v in found.items()}
 
@@ -101,6 +102,11 @@ def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, .
         chosen.append(name)
         total += p
     return tuple(chosen)
+
+
+def _freedom(fit: Fit) -> int:
+    """Return the number of residuals less that of the unknowns: what is left to tell the noise."""
+    return max(len(fit.residuals) - fit.unknowns.size, 0)
 
 
 def _linear(score: Score, gained: float) -> float:

@@ -1,13 +1,14 @@
 """A hypothesis: a model with a set of causes, fitted; and the one score that all are compared by.
 
     score = ln B - price * causes
-    ln B  = n/2 ln(S_0 / S) - 1/2 ln det(1 + P H P)
+    ln B  = (n - k)/2 ln(S_0 / S) - 1/2 ln det(1 + P H P)
 
-Laplace's approximation of the Bayes factor over the plain base fit. S and S_0 are sums of squares
-of the whitened residuals, the noise level being the data's own; H is the information on the
-unknowns that the base has not, those it has projected out, and P their prior standard deviations.
-An unknown that the data do not tell costs nothing, a sharp one costs what its prior range is wider
-than its interval (MacKay, Neural Computation 4 (1992), 415). The price is the prior of a cause.
+Laplace's approximation of the Bayes factor over the plain base fit, of k unknowns. S and S_0 are
+sums of squares of n whitened residuals, the noise level being the data's own; H is the information
+on the unknowns that the base has not, those it has projected out, and P their prior standard
+deviations. An unknown that the data do not tell costs nothing, a sharp one costs what its prior
+range is wider than its interval (MacKay, Neural Computation 4 (1992), 415). The price is the prior
+of a cause.
 """
 
 from collections.abc import Sequence

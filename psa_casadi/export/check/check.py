@@ -29,12 +29,12 @@ from psa_casadi.export.check.origin import (
 from psa_casadi.export.check.process import started
 from psa_casadi.export.check.rows import CheckRow, count
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
-from psa_casadi.export.check.termination import cleaned_up
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
+from psa_casadi.scratch import requests_to_end_answered
 from psa_casadi.strict_json import read_json_text
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
@@ -87,7 +87,7 @@ def check_fmu(
     if not all(row.passed for row in rows):
         return CheckReport(path, tuple(rows), compared=False)
     chosen: list[Model] = [model] if model else []
-    with cleaned_up(), Archive(path) as archive:
+    with requests_to_end_answered(), Archive(path) as archive:
         carried = (archive.directory / MODEL_ENTRY).is_file()
         with started(_INTEGRATOR if model or carried else ()) as process:
             rows += _described(archive, chosen, tuple(effects))

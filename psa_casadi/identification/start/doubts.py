@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.record import Record
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.units import FloatArray
 
 #: Displacement per volt [m/V] of stacks, from a chip of 2 um at 120 V to a lever of 1 mm at 100 V,
@@ -21,8 +21,6 @@ _USABLE_STROKES, _USABLE_SPANS = (1e-13, 0.1), (1e-3, 1e5)
 _SAMPLE_TIMES = (1e-8, 3600.0)
 #: Numbers whose squares would overflow; longest record [s].
 _LARGEST, _LONGEST = 1e30, 1e9
-#: Readings that a fit needs.
-_FEWEST = 16
 #: So few samples are stray where all others are this much closer together.
 _STRAY, _APART = 3, 30.0
 #: A voltage this many times as large as its changes is an offset, whatever its unit.
@@ -127,8 +125,8 @@ def refuse_still(records: Sequence[Record]) -> None:
 def refuse_few(given: Sequence[Record], kept: Sequence[Record], said: Sequence[str]) -> None:
     """Raise InputError where masking left hardly a reading; `said` is what it was done for."""
     before, after = (sum(int(r.mask.sum()) for r in records) for records in (given, kept))
-    if after < min(before, _FEWEST):
-        raise InputError([*said, _FEW.format(after, before, _FEWEST)])
+    if after < min(before, FEWEST_SAMPLES):
+        raise InputError([*said, _FEW.format(after, before, FEWEST_SAMPLES)])
 
 
 def stray(records: Sequence[Record]) -> list[str]:

@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import Problems
+from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import FloatArray
-
-#: Fewer samples than this describe no experiment.
-MIN_SAMPLES = 16
 
 #: Larger numbers are no measured ones, in whatever unit; their squares would soon be infinite.
 LARGEST = 1e100
@@ -46,11 +44,11 @@ class Located:
 
 
 def check_length(path: str, samples: int, problems: Problems) -> None:
-    """Demand at least `MIN_SAMPLES` samples."""
-    if samples < MIN_SAMPLES:
+    """Demand at least `FEWEST_SAMPLES` samples."""
+    if samples < FEWEST_SAMPLES:
         problems.add(
-            f"{path}: found {samples} samples, expected at least {MIN_SAMPLES}; record for longer "
-            f"or name the right file."
+            f"{path}: found {samples} samples, expected at least {FEWEST_SAMPLES}; record for "
+            f"longer or name the right file."
         )
 
 
@@ -85,10 +83,10 @@ def check_displacement(column: Located, problems: Problems) -> None:
     """Demand finite numbers, of which enough are there; missing ones are allowed."""
     _check_finite(column, problems)
     valid = int(np.isfinite(column.values).sum())
-    if column.values.size >= MIN_SAMPLES > valid:
+    if column.values.size >= FEWEST_SAMPLES > valid:
         problems.add(
             f"{column.path}: column 'displacement': found {valid or 'no'} valid values in "
-            f"{column.values.size} rows, expected at least {MIN_SAMPLES}; check that the sensor "
+            f"{column.values.size} rows, expected at least {FEWEST_SAMPLES}; check that the sensor "
             f"was recorded."
         )
 

@@ -75,9 +75,10 @@ def parse_header(
     counted = bool(wanted) and all(source.array in texts for source in wanted.values())
     if all(_is_number(text) for text in texts) and not counted:
         example = ",".join(COLUMNS[name].example for name in required)
+        numbered = {name: str(k) for k, name in enumerate(required, 1)}
         problems.add(
             f"{where}: found '{','.join(texts)[:60]}', expected a header; write a first line such "
-            f"as '{example}', or say which column is which: {ready_line(required)}"
+            f"as '{example}', or say which column is which: {ready_line(numbered)}"
         )
         return {}
     fields: dict[str, Field] = {}
@@ -115,11 +116,11 @@ def _by_other_names(
     """Add the columns that go by a laboratory's name for them; return the cells that do not.
 
     What has a column's own name keeps it. Two cells for one column, or one without a unit, are told
-    with the line to type.
+    with the line to type, once for all of them.
     """
     known = [(index, text, understood(text)) for index, text in strangers]
     open_ones = [n for n in COLUMNS if n not in fields and n not in wanted]
-    left = [(index, text) for index, text, name in known if name is None]
+    unclear: dict[str, list[str]] = {}
     for column in open_ones:
         cells = [(i, t, n.unit) for i, t, n in known if n is not None and n.column == column]
         with_unit = [c for c in cells if c[2] is not None]
@@ -128,21 +129,29 @@ def _by_other_names(
             check_unit(COLUMNS[column], unit, f"{where}, column '{text}'", problems)
             fields[column] = Field(index, unit or "")
         elif cells and column in required:
-            texts = {column: cells[0][1]}
-            texts |= {n.column: t for _, t, n in known if n is not None and n.column != column}
-            why = "has no unit" if len(cells) == 1 else "may be more than one column"
-            problems.add(
-                f"{where}: '{column}' {why} ({', '.join(t for _, t, _ in cells)}); say which, and "
-                f"in which unit: {ready_line(required, texts)}"
-            )
+            unclear[column] = [text for _, text, _ in cells]
             fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
-    return left
+    if unclear:
+        told = (
+            f"'{name}' {'has no unit' if len(own) == 1 else 'may be more than one column'}"
+            f" ({', '.join(own)})"
+            for name, own in unclear.items()
+        )
+        line = ready_line({name: own[0] for name, own in unclear.items()}, wanted)
+        problems.add(f"{where}: {', '.join(told)}; say which, and in which unit: {line}")
+    return [(index, text) for index, text, name in known if name is None]
 
 
-def ready_line(required: Sequence[str], texts: Mapping[str, str] | None = None) -> str:
-    """Return the option that says which cell of the header is which column; units as usual."""
-    names = {name: (texts or {}).get(name, str(k)) for k, name in enumerate(required, 1)}
-    parts = (f"{name}={own}:{SI_UNITS.get(name, 'um')}" for name, own in names.items())
+def ready_line(cells: Mapping[str, str], wanted: ColumnMap | None = None) -> str:
+    """Return the option that says which cell of the header is which column; units as usual.
+
+    It holds what `wanted` says already.
+    """
+    parts = [
+        f"{name}={own.array}" + ("" if own.unit is None else f":{own.unit}")
+        for name, own in (wanted or {}).items()
+    ]
+    parts += [f"{name}={own}:{SI_UNITS.get(name, 'um')}" for name, own in cells.items()]
     return f"--columns {','.join(parts)} (with your units)."
 
 

@@ -6,14 +6,13 @@ output as NumPy's archive, under the places of the arrays in the file as JSON li
 
 import io
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
 import numpy as np
 
+from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError
 from psa_casadi.records.read.file_bytes import reason_of
 from psa_casadi.records.read.mat_hdf5 import hdf5_arrays, require_h5py
@@ -31,16 +30,12 @@ def arrays_apart(path: str, data: bytes) -> dict[str, Tree]:
     Raises:
         InputError: what is wrong with the file; one on which the library crashes or hangs is
             damaged.
+        MachineError: the other process cannot be started.
     """
     require_h5py(path)
-    root = str(Path(__file__).resolve().parents[3])
-    paths = os.pathsep.join([root, *(os.path.abspath(p) for p in sys.path)])
-    command = [sys.executable, "-P", "-m", "psa_casadi.records.read.hdf5_process", path]
     try:
-        done = subprocess.run(
-            command, input=data, capture_output=True, check=False, timeout=_LIMIT_S,
-            env={**os.environ, "PYTHONPATH": paths},
-        )  # fmt: skip
+        with started_python("psa_casadi.records.read.hdf5_process", path) as child:
+            done = heard(child, data, limit=_LIMIT_S)
     except subprocess.TimeoutExpired:
         raise InputError(
             f"{path}: is no readable MATLAB file (HDF5 comes to no end); save it again."
@@ -78,6 +73,7 @@ def _leaves(tree: Mapping[str, Tree], place: tuple[str, ...] = ()) -> Iterator[t
 
 def main() -> int:
     """Read a file from standard input and write its arrays to standard output."""
+    end_with_parent()
     path, data = sys.argv[1], sys.stdin.buffer.read()
     try:
         found = dict(_leaves(hdf5_arrays(path, data)))

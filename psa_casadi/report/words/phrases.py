@@ -155,16 +155,27 @@ def gain_sentence(d: Diagnosis) -> str:
     return f"the held-out error falls by {gain:.0f} % (95 % interval {low:.0f} to {high:.0f} %)"
 
 
+_PLAIN = {
+    "adequate": "Nothing beyond the noise is missing from the base model",
+    "not_driven": "The displacement does not follow the voltage: nothing can be diagnosed",
+}
+
+
 def verdict_sentence(d: Diagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
+    if d.doubt:
+        seen = (
+            "Nothing beyond the noise is seen to be missing"
+            if d.verdict == "adequate"
+            else "Something is missing, and no cause is named"
+        )
+        return f"{seen}; {d.doubt}."
     error = (
         f"the base model's held-out error is {number(d.base_errors.holdout_nrmse_percent, 2)} %"
         " of the range"
     )
-    if d.verdict == "adequate":
-        return f"Nothing beyond the noise is missing from the base model; {error}."
-    if d.verdict == "not_driven":
-        return f"The displacement does not follow the voltage: nothing can be diagnosed; {error}."
+    if d.verdict in _PLAIN:
+        return f"{_PLAIN[d.verdict]}; {error}."
     if d.verdict == "unexplained" or not d.causes:
         return (
             "Something is missing that no effect in the table explains, so no cause is named; "
