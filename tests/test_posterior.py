@@ -73,6 +73,14 @@ def test_all_lie_within_the_bounds() -> None:
             model.with_values({name: value})
 
 
+def test_a_covariance_that_overflows_gives_no_values_that_are_none() -> None:
+    """A file may hold any numbers; what is not a number could not be read back."""
+    model = spread((1e150, 1e150, 1e150), 0.5)
+    for values in posterior_sets(model, 3).values():
+        model.with_values(values)
+        assert all(np.isfinite(v) for v in values.values())
+
+
 def test_a_value_without_spread_stays() -> None:
     model = spread((0.02, 0.05, 0.0), 1.0)  # two that are one, and one that is known
     sets = found(model, 5)

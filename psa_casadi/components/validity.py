@@ -5,13 +5,12 @@ from functools import partial
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.variables import Input, Output, Parameter
+from psa_casadi.variables import Output, Parameter
 
 #: This much beyond a range, over its size, is still inside: rounding and a sensor's noise.
 MARGIN = 0.01
 #: Name of the output.
 OUTPUT = "outside_validity"
-_ROOM = 293.15
 
 
 def _beyond(value: Expression, low: Expression, high: Expression) -> Expression:
@@ -54,7 +53,6 @@ _TEXT = (
 
 def _component(name: str, *, temperature: bool) -> Component:
     meaning = _MEANING.format(", temperature" if temperature else "")
-    warm = Input("temperature", "K", "temperature of the stack", start=_ROOM, nominal=300.0)
     return Component(
         name=name,
         description="tells how far a run has left what the records behind the model have shown",
@@ -62,9 +60,8 @@ def _component(name: str, *, temperature: bool) -> Component:
         equations=partial(_equations, temperature=temperature),
         equation_text=_TEXT.format(" + beyond(T)" if temperature else ""),
         parameters=(*_RANGES, *(_WARM if temperature else ())),
-        inputs=(warm,) if temperature else (),
         outputs=(Output(OUTPUT, "1", meaning),),
-        needs=("drive",),
+        needs=("drive", "temperature") if temperature else ("drive",),
     )
 
 

@@ -19,8 +19,8 @@ from psa_casadi.model.compose import Model
 FloatArray = npt.NDArray[np.float64]
 Sets = Mapping[str, Mapping[str, float]]
 
-#: Random samples unless told otherwise.
-SAMPLES = 20
+#: Random samples unless told otherwise, and the most.
+SAMPLES, MOST_SAMPLES = 20, 999
 #: Draws for one sample until it lies within the bounds; the last one is put on them.
 _DRAWS = 200
 #: Digits of the values: those below differ from machine to machine.
@@ -92,9 +92,13 @@ def _sample(
 
 
 def _within(model: Model, names: Sequence[str], values: FloatArray) -> dict[str, float]:
-    """Return values with so many digits, put on the bounds where they leave them."""
+    """Return values with so many digits, put on the bounds where they leave them.
+
+    What has overflowed to no number at all stays at the mean.
+    """
     found = {}
     for name, value in zip(names, values.tolist(), strict=True):
         low, high = model.parameter(name).bounds
-        found[name] = min(max(float(f"{value:.{_DIGITS}g}"), low), high)
+        digits = model.values[name] if math.isnan(value) else float(f"{value:.{_DIGITS}g}")
+        found[name] = min(max(digits, low), high)
     return found
