@@ -104,6 +104,8 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
     state->phase = PSA_INSTANTIATED;
     state->interface = interface;
+    instance->start_time = 0.0;
+    instance->outside_told = 0;
     psa_schedule(instance);
     instance->fresh = 0;
 }
@@ -125,6 +127,7 @@ psa_result psa_setup(psa_instance *instance, int tolerance_defined, double toler
         state->event_margin = EVENT_MARGIN * fmin(tolerance, LOOSEST_TOLERANCE);
     }
     psa_solver_move(&state->solver, start);
+    instance->start_time = start;
     state->input.begin = 0.0;
     state->stop_defined = stop_defined;
     state->stop_time = stop_defined ? stop : 0.0;
@@ -210,6 +213,19 @@ static void remember_inputs(psa_state *state, double begin) {
     memset(state->rate_given, 0, sizeof state->rate_given);
 }
 
+/* Whether the coming step is inside what the records have shown: of inputs that are held the rate is
+   that from step to step. */
+static void watch_step(psa_instance *instance) {
+    const psa_state *const state = &instance->state;
+    double rate[PSA_NU + 1] = {0.0};
+    for (int i = 0; i < PSA_NU; ++i) {
+        if (state->rate_given[i]) rate[i] = state->input.rate[i];
+        else if (state->stride > 0.0)
+            rate[i] = (state->input.value[i] - state->earlier[i]) / state->stride;
+    }
+    psa_watch_range(instance, state->input.value, rate);
+}
+
 /* Keep what the coming communication step starts from, for its sensitivities. */
 static void remember(psa_state *state, psa_end end) {
     psa_last_step *const last = &state->last;
@@ -247,6 +263,7 @@ static psa_result advance(psa_instance *instance, psa_end end) {
     const int sampled = PSA_NS > 0 && state->at_instant;
     const int64_t steps = solver->steps, rejected = solver->rejected;
     restart_clock(state);
+    watch_step(instance);
     aim_inputs(state, end.since);
     if (psa_leave_instant(instance) != PSA_FINE) return PSA_DISCARD;
     remember(state, end);

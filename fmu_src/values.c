@@ -10,6 +10,7 @@ psa_result psa_refresh(psa_instance *instance) {
     const psa_result result = psa_sample_now(instance);
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.since, u);
+    psa_watch_range(instance, u, NULL);
     if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
         psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y) ||
         psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z))

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from psa_casadi.cli.screen import (
+    ColumnsOption,
     EffectsOption,
     Quiet,
     show,
@@ -20,6 +21,19 @@ def check(
         Path | None,
         typer.Option(help="MODEL.json to compare with; by default the one that the FMU carries."),
     ] = None,
+    evidence: Annotated[
+        bool,
+        typer.Option(
+            "--evidence", help="Play the run that the FMU carries as evidence, and compare it."
+        ),
+    ] = False,
+    record: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Record that the model comes from (may be repeated): is its error as stated?"
+        ),
+    ] = None,
+    columns: ColumnsOption = None,
     effects: EffectsOption = None,
     timeout: Annotated[
         float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
@@ -50,9 +64,18 @@ def check(
         what = "is a directory" if fmu.is_dir() else "there is no such file"
         given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
     chosen = None if model is None else given.attempt(lambda: load_model(model, given.effects))
+    records = given.records(record, columns=columns) if record else ()
     given.check()
     with working("checking", quiet):
-        report = check_fmu(fmu, chosen, effects=given.effects, timeout=timeout, memory=memory << 20)
+        report = check_fmu(
+            fmu,
+            chosen,
+            effects=given.effects,
+            timeout=timeout,
+            memory=memory << 20,
+            evidence=evidence,
+            records=records,
+        )
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)
     if not report.passed:

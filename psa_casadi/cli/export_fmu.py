@@ -51,6 +51,26 @@ def fmu(
         bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
     ] = False,
     start_voltage: StartVoltageOption = None,
+    parameter_sets: Annotated[
+        int,
+        typer.Option(
+            help="Random parameter sets within the uncertainty to put inside, beside their mean and"
+            " sigma points; 0 leaves all of them out.",
+            min=0,
+            max=999,
+        ),
+    ] = 20,
+    sets_to: Annotated[
+        Path | None,
+        typer.Option("--sets-to", help="Folder to write the parameter sets to as well."),
+    ] = None,
+    validity_output: Annotated[
+        bool,
+        typer.Option(
+            "--validity-output",
+            help="Add the output outside_validity: how far a run has left what the records show.",
+        ),
+    ] = False,
     history: HistoryOption = None,
     sweep: SweepOption = 1.0,
     rest: RestOption = 0.0,
@@ -88,8 +108,11 @@ def fmu(
             include_sensor=include_sensor,
             platforms=wanted,
             fmi=int(fmi),
+            parameter_sets=parameter_sets,
+            validity_output=validity_output,
         )
     kept = chosen if include_sensor else chosen.plant()
+    sets = write_sets(kept, parameter_sets, sets_to)
     inside = ", ".join(c.name for c in kept.components)
     left_out = [c.name for c in chosen.components if c not in kept.components]
     show(f"inside: {inside}", quiet)
@@ -97,6 +120,7 @@ def fmu(
         show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
     show(f"start: {start_words(kept)}", quiet)
+    show(f"evidence: {evidence_words(kept, sets)}", quiet)
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"
@@ -104,6 +128,27 @@ def fmu(
             quiet,
         )
     tell_written(output, quiet=quiet)
+
+
+def write_sets(model: "Model", samples: int, folder: Path | None) -> int:
+    """Write the parameter sets to a folder, if one is named, and return how many there are."""
+    from psa_casadi.export.fmu.evidence_files import set_files
+    from psa_casadi.files import atomic_write
+
+    texts = set_files(model, samples)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        for place, text in texts.items():
+            atomic_write(folder / place.rpartition("/")[2], text)
+    return len(texts)
+
+
+def evidence_words(model: "Model", sets: int) -> str:
+    """Say what the FMU holds of what stands behind its values."""
+    if model.evidence is None:
+        return "none; a MODEL.json of `psa identify` or `psa diagnose` has it"
+    of = ", ".join(r.record for r in model.evidence.runs)
+    return f"documentation/evidence.html (records: {of}), {sets} parameter sets"
 
 
 def start_words(model: "Model") -> str:

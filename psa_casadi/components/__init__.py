@@ -10,6 +10,7 @@ from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
 from psa_casadi.components.position_controller import POSITION_CONTROLLER
 from psa_casadi.components.prestress import PRESTRESS_MECHANISM, PRESTRESS_PORT
 from psa_casadi.components.sensor import SENSOR
+from psa_casadi.components.validity import VALIDITY, VALIDITY_WITH_TEMPERATURE
 from psa_casadi.components.wafers import BOUC_WEN, CREEP_LAG, LINEAR_FORCE
 
 COMPONENTS: dict[str, Component] = {
@@ -30,6 +31,8 @@ COMPONENTS: dict[str, Component] = {
         ONLINE_IDENTIFICATION,
         PRESTRESS_MECHANISM,
         PRESTRESS_PORT,
+        VALIDITY,
+        VALIDITY_WITH_TEMPERATURE,
     )
 }
 

@@ -12,6 +12,7 @@ from psa_casadi.diagnosis.budget import Budget, Removed, budget
 from psa_casadi.diagnosis.corrections.correct import corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
 from psa_casadi.diagnosis.corrections.patch import patch_of
+from psa_casadi.diagnosis.evidence import diagnosis_evidence
 from psa_casadi.diagnosis.held_out.confirmation import unconfirmed
 from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import (
@@ -118,7 +119,11 @@ def conclude(
         floor,
     )
     model = with_provenance(
-        final.fit.model, found, [e.record for e in experiments], stiffness_given
+        final.fit.model,
+        found,
+        [e.record for e in experiments],
+        stiffness_given,
+        evidence=diagnosis_evidence(final.fit, found, experiments, final.predicted, spent),
     )
     causes = tuple(_cause(s, last.fit, found, spent) for s in named)
     return Diagnosis(
@@ -172,7 +177,9 @@ def patched_model(d: Diagnosis) -> Model:
     found = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
     given = d.model.provenance.force_scale == "given"
     told = determinacy(found, d.experiments)
-    return with_provenance(found.model, told, [e.record for e in d.experiments], given)
+    evidence = diagnosis_evidence(found, told, d.experiments, found.predicted(d.experiments))
+    records = [e.record for e in d.experiments]
+    return with_provenance(found.model, told, records, given, evidence=evidence)
 
 
 def _misfits(

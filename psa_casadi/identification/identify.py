@@ -9,6 +9,7 @@ import numpy as np
 from psa_casadi.identification.advice.advice import Advice, advice
 from psa_casadi.identification.certainty.combinations import Combination, free_combinations
 from psa_casadi.identification.certainty.determinacy import Determinacy, assumed_ratio, determinacy
+from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
@@ -25,6 +26,7 @@ from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import Evidence
 from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
@@ -134,15 +136,29 @@ def identify(
     )
     open_ones = free_combinations(best.model, determined, force_scale_given=given)
     advised: tuple[Advice, ...] | None = None
+    told: Evidence | None = None
     if not best.interrupted:
         try:
+            told = evidence_of(
+                best,
+                determined,
+                experiments,
+                best.predicted(experiments),
+                by="psa identify",
+                sampled=given_records,
+            )
             progress("what further records would tell")
             advised = advice(best, experiments, determined, force_scale_given=given)
         except KeyboardInterrupt:
             current_work().wrap_up()
     return Identification(
         model=with_provenance(
-            best.model, determined, given_records, given, interrupted=best.interrupted
+            best.model,
+            determined,
+            given_records,
+            given,
+            interrupted=best.interrupted,
+            evidence=told,
         ),
         fit=best,
         determinacy=determined,
@@ -163,6 +179,7 @@ def with_provenance(
     stiffness_given: bool,
     *,
     interrupted: bool = False,
+    evidence: Evidence | None = None,
 ) -> Model:
     """Return a fitted model that says from which records it comes and how sure its values are."""
     c_p = model.values.get("C_p", 0.0)
@@ -181,7 +198,7 @@ def with_provenance(
             *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
-    return replace(model, provenance=provenance)
+    return replace(model, provenance=provenance, evidence=evidence)
 
 
 def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
@@ -194,7 +211,7 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
         notes=(INTERRUPTED, *(() if stiffness_given else (FORCE_NOTE,))),
         interrupted=True,
     )
-    return replace(best.model, provenance=provenance)
+    return replace(best.model, provenance=provenance, evidence=None)
 
 
 def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:

@@ -2,13 +2,14 @@
 
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fmpy.validation import validate_fmu
 
 from psa_casadi.component import Component
+from psa_casadi.components.validity import OUTPUT as VALIDITY
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import (
@@ -20,6 +21,7 @@ from psa_casadi.export.check.description import (
     published_as,
     undefined_units,
 )
+from psa_casadi.export.check.evidence import Repeated, repeated, wrong_evidence
 from psa_casadi.export.check.origin import (
     not_compared,
     unreproducible_parts,
@@ -30,10 +32,12 @@ from psa_casadi.export.check.process import started
 from psa_casadi.export.check.rows import CheckRow, count
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
+from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
+from psa_casadi.records.record import Record
 from psa_casadi.scratch import requests_to_end_answered
 from psa_casadi.strict_json import read_json_text
 
@@ -66,6 +70,8 @@ def check_fmu(
     *,
     timeout: float = TIMEOUT,
     memory: int = MEMORY,
+    evidence: bool = False,
+    records: Sequence[Record] = (),
 ) -> CheckReport:
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
@@ -73,6 +79,9 @@ def check_fmu(
     none. `effects` are own ones that the model inside may have. Sensor and environment of the model
     are left out if the FMU leaves them out. A check that breaks down is a row that did not pass;
     the others still run, except those that need an instance if there is none.
+
+    With `evidence` the run of the model's evidence is played again, and so are those of `records`
+    that stand behind it: is the error what the model states?
 
     This runs the code of the FMU, in a process of its own: `timeout` [s] is what each check
     may take, `memory` [bytes] what it may take beside Python's own, on Linux. However it ends,
@@ -92,8 +101,13 @@ def check_fmu(
         with started(_INTEGRATOR if model or carried else ()) as process:
             rows += _described(archive, chosen, tuple(effects))
             truth = truth_of(chosen[0], archive.version) if chosen else None
+            again = Repeated((), ())
+            if evidence or records:
+                again = repeated(archive, chosen[0] if chosen else None, records)
+            rows += again.rows
             key, limits = secrets.token_bytes(32), Limits(timeout, memory)
-            rows += process.rows(Task(path, archive.directory, truth, key, limits))
+            task = Task(path, archive.directory, truth, key, limits, again.playbacks)
+            rows += process.rows(task)
     compared = any(row.name == "equations" for row in rows)
     return CheckReport(path, tuple(rows), compared=compared)
 
@@ -131,6 +145,8 @@ def _described(
         chosen[:] = [_as_exported(archive, chosen[0])]
         for name, compared in _ORIGIN.items():
             yield count(name, compared, archive, chosen[0])
+        if chosen[0].evidence is not None:
+            yield count("evidence inside", wrong_evidence, archive, chosen[0])
         yield _reproducible(archive, chosen[0])
 
 
@@ -158,9 +174,15 @@ def _read_model(
 
 
 def _as_exported(archive: Archive, model: Model) -> Model:
-    """Return the model as the exporter took it: whole, or without sensor and environment."""
+    """Return the model as the exporter took it: whole, or without sensor and environment.
+
+    And with the output that tells how far a run is outside of what the records have shown.
+    """
     whole = set(model.output_names) <= set(archive.names("output"))
-    return published_as(archive, model if whole else model.plant())
+    exported = model if whole else model.plant()
+    if VALIDITY in archive.names("output") and exported.evidence is not None:
+        exported = with_validity(exported)
+    return published_as(archive, exported)
 
 
 #: What the runs of a model need, imported ahead.

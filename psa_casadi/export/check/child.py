@@ -35,7 +35,7 @@ def main() -> None:
     limit_data(task.limits.memory)
     writer = Writer(records, task.key)
     try:
-        for record in measured(task.path, task.unpacked, task.truth):
+        for record in measured(task):
             faulthandler.dump_traceback_later(task.limits.timeout + _GRACE, exit=True)
             writer.write(record)
     except MemoryError:

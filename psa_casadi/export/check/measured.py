@@ -13,6 +13,7 @@ from psa_casadi.export.check.events import (
     intermediate_update,
     wrong_indicators,
 )
+from psa_casadi.export.check.playback import played_again
 from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, figure, stopped
 from psa_casadi.export.check.structure import (
     adjoint_error,
@@ -21,6 +22,7 @@ from psa_casadi.export.check.structure import (
     incomplete_dependencies,
     wrong_start,
 )
+from psa_casadi.export.check.task import Task
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 
@@ -32,20 +34,20 @@ _EQUATION_LIMIT = 1e-9
 Progress = Iterator[str | CheckRow]
 
 
-def measured(path: Path, unpacked: Path, truth: Truth | None) -> Progress:
-    """Yield names and rows of the checks of an FMU that was unpacked; `path` is for messages.
+def measured(task: Task) -> Progress:
+    """Yield names and rows of the checks of an FMU that was unpacked.
 
     Without a model there is no truth, and nothing is compared with it.
     """
     loaded: list[Fmu] = []
     yield "binary loads"
-    yield count("binary loads", _load, path, unpacked, loaded)
+    yield count("binary loads", _load, task.path, task.unpacked, loaded)
     for fmu in loaded:
         with fmu:
-            yield from _of_instances(fmu, truth)
+            yield from _of_instances(fmu, task)
 
 
-def _of_instances(fmu: Fmu, truth: Truth | None) -> Progress:
+def _of_instances(fmu: Fmu, task: Task) -> Progress:
     made: list[CheckRow] = []
     for name, kind in _INTERFACES.items():
         yield name
@@ -61,8 +63,14 @@ def _of_instances(fmu: Fmu, truth: Truth | None) -> Progress:
     if fmu.version == 3:
         yield "adjoint derivatives"
         yield figure("adjoint derivatives", _ADJOINT_LIMIT, adjoint_error, fmu)
-    if truth:
-        yield from _of_model(fmu, truth)
+    if task.truth:
+        yield from _of_model(fmu, task.truth)
+    for playback in task.playbacks:
+        yield playback.name
+        try:
+            yield played_again(fmu, playback)
+        except BREAKDOWNS as error:
+            yield stopped(playback.name, f"the run stopped: {error}")
 
 
 def _of_model(fmu: Fmu, truth: Truth) -> Progress:

@@ -8,16 +8,19 @@ from pathlib import Path
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
+from psa_casadi.export.common.posterior import SAMPLES
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
 from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.fmu.evidence_files import META_DATA, PAGE, EvidenceFiles, evidence_files
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
 from psa_casadi.export.fmu.reference_results import reference_entries
 from psa_casadi.export.fmu.sources import compiled_files, export_token, source_files
 from psa_casadi.export.fmu.terminals import terminal_entries
+from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, foreign_components
@@ -38,6 +41,8 @@ def export_fmu(
     include_sensor: bool = False,
     platforms: Sequence[str] = ("host",),
     fmi: int = 2,
+    parameter_sets: int = SAMPLES,
+    validity_output: bool = False,
 ) -> Path:
     """Write a model as an FMU (co-simulation and model exchange) and return its path.
 
@@ -45,6 +50,11 @@ def export_fmu(
     out unless `include_sensor`. `name` is the model identifier, a C identifier; by default the
     model's name. `platforms` are names of `PLATFORMS`, "host" or "all". The same model gives the
     same bytes. The file is written whole or not at all.
+
+    A model with evidence (identified or diagnosed) takes it along: a page, meta data, a run to
+    repeat, and `parameter_sets` random sets of its parameters within their uncertainty, beside
+    their mean and sigma points (0: none of them). `validity_output` adds the output
+    `outside_validity`, which tells how far a run has left what the records have shown.
 
     Raises InputError for an impossible name, an unknown platform or version, or a model without
     states, and MachineError if a compiler fails.
@@ -58,10 +68,15 @@ def export_fmu(
         raise InputError(f"FMI {fmi} is not known; choose 2 (FMI 2.0) or 3 (FMI 3.0).")
     targets = chosen_platforms(platforms)
     exported = model if include_sensor else model.plant()
+    if validity_output:
+        exported = with_validity(exported)
     token = export_token(exported, identifier, fmi)
     texts = source_files(exported, identifier, token, fmi)
     xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
-    entries = {"modelDescription.xml": xml.encode("utf-8"), **_companions(exported, fmi)}
+    entries = {
+        "modelDescription.xml": xml.encode("utf-8"),
+        **_companions(exported, fmi, parameter_sets),
+    }
     entries |= {f"sources/{n}": t.encode("utf-8") for n, t in texts.items()}
     for target in targets:
         folder = target.binaries(fmi)
@@ -73,16 +88,20 @@ def export_fmu(
     return Path(path)
 
 
-def _companions(model: Model, fmi: int) -> dict[str, bytes]:
+def _companions(model: Model, fmi: int, samples: int) -> dict[str, bytes]:
     """Return what is beside description, sources and binaries: for people and for other tools.
 
     A model that cannot be simulated with its own values is exported without a reference run.
     """
+    evidence = EvidenceFiles()
     try:
-        entries, step = reference_entries(model), held_step(model)
+        evidence = evidence_files(model, samples)
+        entries, step = reference_entries(model, evidence.related), held_step(model)
     except SimulationError:
         entries, step = {}, None
-    page = documentation(model, reference_run=bool(entries), step=step)
+    more = {n: evidence.related[n].meaning for n in (PAGE, META_DATA) if n in evidence.related}
+    page = documentation(model, reference_run=bool(entries), step=step, more=more)
+    entries |= evidence.entries
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
     entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])

@@ -70,6 +70,17 @@ def predict_record(
     return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
 
 
+def record_start(model: Model, record: Record, start: Mapping[str, float]) -> FloatArray:
+    """Return the states (nx,) at a record's first sample; `start` as in `predict_record`."""
+    time, memories = record.time - record.time[0], memory_names(model.structure)
+    memory = {n: start.get(n, 0.0) for n in memories}
+    x0 = start_on(model, time, record_inputs(model, record, record.n), memory).x.copy()
+    for name, deviation in start.items():
+        if name not in memories:
+            x0[model.state_names.index(name)] += deviation
+    return x0
+
+
 def trace_record(
     model: Model,
     record: Record,
