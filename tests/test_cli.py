@@ -84,8 +84,13 @@ def test_help_shows_an_example_that_is_a_command(command: tuple[str, ...]) -> No
 
 def test_the_version_is_one() -> None:
     assert done("--version").stdout == f"psa_casadi {psa_casadi.__version__}\n"
-    pyproject = Path(__file__).parent.parent / "pyproject.toml"
-    assert f'version = "{psa_casadi.__version__}"' in pyproject.read_text(encoding="utf-8")
+    root = Path(__file__).parent.parent
+    citation = (root / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {psa_casadi.__version__}\n" in citation
+    released = re.search(r"^date-released: (\S+)$", citation, re.MULTILINE)
+    assert released is not None
+    heading = f"\n## [{psa_casadi.__version__}] - {released[1]}\n"
+    assert heading in (root / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_every_public_name_is_there() -> None:

@@ -27,7 +27,7 @@ SENTENCES = {
     "adequate": "Nothing beyond the noise is missing",
     "cause_named": "The cause is slow creep (plant, confidence 97 %)",
     "partly_explained": "The closest known cause is slow creep",
-    "ambiguous": "cannot tell whether it is slow creep or offset drift",
+    "ambiguous": "do not decide whether it is slow creep or offset drift",
     "unexplained": "no effect in the table explains",
     "not_driven": "The displacement does not follow the voltage",
 }

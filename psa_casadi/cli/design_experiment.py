@@ -56,13 +56,13 @@ def experiment(
         list[Path] | None,
         typer.Option(
             "--record",
-            help="Record at hand (repeat for several); the rivals are fitted"
-            " to it, and its voltages and length are the design's.",
+            help="Record already measured (repeat for several); the rivals are fitted"
+            " to it, and the design has its voltages and length.",
         ),
     ] = None,
     separate: Annotated[
         list[str] | None,
-        typer.Option("--separate", help="Effect to tell from the others that are named."),
+        typer.Option("--separate", help="Effect to separate from the others that are named."),
     ] = None,
     parameter: Annotated[
         list[str] | None,
@@ -92,16 +92,16 @@ def experiment(
     starts: Annotated[int, typer.Option(help="Voltages that are improved, at most.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the drawn voltages.")] = 1,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="CSV with the voltage to play.")
+        Path | None, typer.Option("-o", "--output", help="CSV with the voltage to apply.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     columns: ColumnsOption = None,
     own: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
-    """Design the record to measure next: best for parameters, or to tell effects apart.
+    """Design the record to measure next: best for parameters, or to separate effects.
 
-    With --separate the rivals are fitted to the records at hand, or have ordinary sizes.
+    With --separate the rivals are fitted to the records given, else they have ordinary sizes.
     """
     from psa_casadi.cli import design_given
     from psa_casadi.cli.inputs import Given

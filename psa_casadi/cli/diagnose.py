@@ -62,8 +62,8 @@ def diagnose(
         Path | None,
         typer.Option(
             "--next",
-            help="VOLTAGE.csv to write if the verdict is ambiguous and a voltage would tell;"
-            " without it, beside the JSON or the page.",
+            help="VOLTAGE.csv to write if the verdict is ambiguous and a further record would"
+            " decide; by default next to the JSON file or the page.",
         ),
     ] = None,
     timings: Annotated[

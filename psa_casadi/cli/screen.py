@@ -29,7 +29,7 @@ PartOption = Annotated[
     str | None,
     typer.Option(
         "--part",
-        help="A part that stands around a stack, in place of a model: flexure_stage,"
+        help="Part around a stack, in place of a model: flexure_stage,"
         " position_controller, hysteresis_compensator, voltage_amplifier, charge_amplifier.",
     ),
 ]
@@ -47,7 +47,7 @@ ColumnsOption = Annotated[
     str | None,
     typer.Option(
         "--columns",
-        help="Arrays of the files that are the columns, where their names differ:"
+        help="Which array of the file is which column, if the names differ:"
         " time=t:ms,voltage=log.u,displacement=m.2:um",
     ),
 ]
@@ -57,14 +57,15 @@ HistoryOption = Annotated[
     str | None,
     typer.Option(
         "--history",
-        help="Voltages before [V], such as 120,0,120: swept through in turn from a relaxed 0 V.",
+        help="Earlier voltages [V], swept in turn from a relaxed 0 V, such as 120,0,120.",
     ),
 ]
 
 SweepOption = Annotated[
     float,
     typer.Option(
-        "--sweep", help="Duration of each sweep of the history \\[s]; delta and creep see it."
+        "--sweep",
+        help="Duration of each sweep of the history \\[s]; it matters to delta and creep.",
     ),
 ]
 

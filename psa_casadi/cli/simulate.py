@@ -49,9 +49,9 @@ def simulate(
 ) -> None:
     """Simulate a model on a measured or planned voltage; write every output with its unit.
 
-    It starts settled at the first voltage, hysteresis and creep where --history leaves them, else
-    relaxed. With --start-voltage, or a model file that has start values, it starts where an FMU
-    exported with the same options does. Example:
+    The stack starts settled at the first voltage, its hysteresis and creep relaxed, or as --history
+    leaves them. With --start-voltage, or a model file that has start values, it starts like an FMU
+    exported with the same options. Example:
     psa simulate --stack P-885.51 --input voltage.csv --history 120,0,120 -o out.csv
     """
     from psa_casadi.cli.inputs import Given

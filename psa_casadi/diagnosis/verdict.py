@@ -246,7 +246,7 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
 
 def _remaining(r: Step, beyond: Excess) -> Remaining:
     """Describe what is left; `beyond` the fit where that leaves nothing to be seen."""
-    where = "What remains cannot be told from noise."
+    where = "What remains cannot be distinguished from noise."
     if r.test.alarm:
         where = f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
     elif beyond:

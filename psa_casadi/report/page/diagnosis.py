@@ -119,7 +119,7 @@ def _rest(page: Document, d: Diagnosis) -> None:
     page.section("Next experiment")
     page.paragraph(d.next_experiment.why)
     if d.next_experiment.voltage_csv:
-        page.paragraph(f"Voltage to play: {d.next_experiment.voltage_csv}")
+        page.paragraph(f"Voltage to apply: {d.next_experiment.voltage_csv}")
 
 
 def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str) -> None:

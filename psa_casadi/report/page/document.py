@@ -122,10 +122,10 @@ class Document:
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
             f"<title>{_text(self._title)}</title><style>{style}</style>"
-            f"<script>{get_plotlyjs()}</script></head>\n<body>\n"
+            f"<script>{get_plotlyjs()}</script></head>\n<body><main>\n"
             + "\n".join(body)
             + f'\n<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
-            + f"\n<script>{script}</script>\n</body></html>\n"
+            + f"\n</main><script>{script}</script>\n</body></html>\n"
         )
 
 

@@ -141,7 +141,7 @@ def added(d: Diagnosis) -> bool:
 
 #: What an interval of the gain from blocks of few records says.
 OWN_VOLTAGES = (
-    "The interval is taken over blocks of the held-out samples and speaks for these voltages only;"
+    "The interval is taken over blocks of the held-out samples and holds for these voltages only;"
     " for other voltages hold out four records or more (--holdout)."
 )
 
@@ -178,7 +178,7 @@ def verdict_sentence(d: Diagnosis) -> str:
         return f"{_PLAIN[d.verdict]}; {error}."
     if d.verdict == "unexplained" or not d.causes:
         return (
-            "Something is missing that no effect in the table explains, so no cause is named; "
+            "Something is missing, and no effect in the table explains it: no cause is named; "
             f"{_unnamed(d)}{error}."
         )
     causes = listing([_cause(c) for c in d.causes])
@@ -187,7 +187,7 @@ def verdict_sentence(d: Diagnosis) -> str:
         rivals = [plain(n) for n in (first.effect, *first.cannot_be_told_from)]
         together = listing([plain(c.effect) for c in d.causes])
         return (
-            f"Something is missing, and these data cannot tell whether it is"
+            f"Something is missing, and these data do not decide whether it is"
             f" {listing(rivals, 'or')}; with {together}, {gain_sentence(d)}."
         )
     are = "cause is" if len(d.causes) == 1 else "causes are"

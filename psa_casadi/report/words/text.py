@@ -84,7 +84,7 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
             f"{plain(n)} ({probability_text(known[n])})" if first and known.get(n) else plain(n)
             for n in cause.cannot_be_told_from
         ]
-        return f"these data cannot tell it from {listing(rivals, 'or')}"
+        return f"these data cannot distinguish it from {listing(rivals, 'or')}"
     named = {c.effect for c in d.causes}
     others = [(p, n) for n, p in known.items() if n not in named]
     if not others or not first:
