@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from psa_casadi.effects import EFFECTS
     from psa_casadi.errors import InputError, MachineError, PsaError
     from psa_casadi.export.check.check import CheckReport, check_fmu
+    from psa_casadi.export.fixed_step.export import CodeExport, export_c
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
@@ -166,6 +167,7 @@ _HOMES = {
     "psa_casadi.report.plots.figure": ("save_figure",),
     "psa_casadi.report.page.diagnosis": ("write_report",),
     "psa_casadi.report.page.fit_page": ("write_fit_report",),
+    "psa_casadi.export.fixed_step.export": ("CodeExport", "export_c"),
     "psa_casadi.export.fmu.archive": ("export_fmu",),
     "psa_casadi.export.modelica.package": ("export_modelica",),
     "psa_casadi.export.ssp.archive": ("export_ssp",),
@@ -243,6 +245,8 @@ __all__ = [
     "mechanism_model",
     "port_model",
     "export_fmu",
+    "CodeExport",
+    "export_c",
     "export_modelica",
     "export_ssp",
     "CheckReport",

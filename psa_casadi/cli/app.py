@@ -14,6 +14,7 @@ from psa_casadi.cli.design_mechanism import mechanism
 from psa_casadi.cli.diagnose import diagnose
 from psa_casadi.cli.effects import effects
 from psa_casadi.cli.examples import examples
+from psa_casadi.cli.export_c import c
 from psa_casadi.cli.export_fmu import fmu
 from psa_casadi.cli.export_modelica import modelica
 from psa_casadi.cli.export_ssp import ssp
@@ -74,6 +75,7 @@ export.command(epilog="Example: psa export fmu --model extended.json -o stack.fm
 export.command(epilog="Example: psa export modelica --model extended.json -o PiezoStack.mo")(
     guarded(modelica)
 )
+export.command(epilog="Example: psa export c --stack P-885.51 --step 10us -o code")(guarded(c))
 export.command(epilog="Example: psa export ssp --stack P-885.51 -o stage.ssp")(guarded(ssp))
 app.add_typer(design, name="design")
 design.command(

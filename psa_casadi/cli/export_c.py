@@ -1,0 +1,126 @@
+"""`psa export c`: a model as two files of C for a controller."""
+
+import re
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from psa_casadi.cli.screen import (
+    AuthorOption,
+    CopyrightOption,
+    EffectsOption,
+    HistoryOption,
+    LicenseOption,
+    ModelVersionOption,
+    PartOption,
+    Quiet,
+    RestOption,
+    StackOption,
+    StartVoltageOption,
+    SweepOption,
+    show,
+    show_table,
+    tell_written,
+    working,
+)
+
+
+class PrecisionName(StrEnum):
+    """Precisions of the numbers."""
+
+    DOUBLE = "double"
+    SINGLE = "single"
+
+
+class Hold(StrEnum):
+    """What inputs do over a step."""
+
+    LINEAR = "linear"
+    ZERO = "zero"
+
+
+def c(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the two files.")],
+    step: Annotated[str, typer.Option(help="Time of a step with its unit, such as 10us.")],
+    model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
+    stack: StackOption = None,
+    part: PartOption = None,
+    precision: Annotated[
+        PrecisionName, typer.Option(help="Precision of all numbers.")
+    ] = PrecisionName.DOUBLE,
+    hold: Annotated[
+        Hold, typer.Option(help="Inputs reached at a step's end on a line, or held over it.")
+    ] = Hold.LINEAR,
+    substeps: Annotated[
+        int | None,
+        typer.Option(help="Equal parts of a step; by default as few as err by less than 0.1 %."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of files and functions; by default the model's name.")
+    ] = None,
+    include_sensor: Annotated[
+        bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
+    ] = False,
+    start_voltage: StartVoltageOption = None,
+    history: HistoryOption = None,
+    sweep: SweepOption = 1.0,
+    rest: RestOption = 0.0,
+    author: AuthorOption = None,
+    version: ModelVersionOption = None,
+    copyright_: CopyrightOption = None,
+    license_: LicenseOption = None,
+    effects: EffectsOption = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write a model as C99 for a controller: a step of fixed length and constant cost."""
+    from psa_casadi.cli.inputs import Given
+    from psa_casadi.export.fixed_step.export import export_c
+    from psa_casadi.report.words.tables import Table
+
+    given = Given(effects)
+    seconds = given.attempt(lambda: step_seconds(step))
+    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
+    chosen = given.published(
+        chosen, author=author, version=version, copyright=copyright_, license=license_
+    )
+    given.check()
+    if chosen is None or seconds is None:
+        return
+    with working("generating", quiet) as progress:
+        progress("compiling and comparing")
+        found = export_c(
+            chosen, output, step=seconds, precision=precision.value, name=name,
+            include_sensor=include_sensor, hold=hold.value, substeps=substeps,
+        )  # fmt: skip
+    kept = chosen if include_sensor else chosen.plant()
+    show(f"inside: {', '.join(q.name for q in kept.components)}", quiet)
+    left_out = [q.name for q in chosen.components if q not in kept.components]
+    if left_out:
+        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    each = "1 substep" if found.substeps == 1 else f"{found.substeps} substeps"
+    show(f"step: {seconds:g} s, {each}, {precision.value} precision", quiet)
+    rows = tuple((e.voltage, f"{e.error:.1e}") for e in found.errors)
+    show_table(Table(("voltage", "largest error over the range"), rows), quiet)
+    tell_written(found.header, found.source, quiet=quiet)
+
+
+def step_seconds(text: str) -> float:
+    """Return the time [s] of a step that is given as a number with a unit, s where it has none.
+
+    Raises InputError for anything else.
+    """
+    from psa_casadi.errors import InputError
+    from psa_casadi.units import parse_unit, to_si, units_of
+
+    found = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
+    try:
+        number = float(found["number"]) if found else 0.0
+    except ValueError:
+        found = None
+    unit = parse_unit(found["unit"] or "s", "time").name if found else ""
+    if unit not in units_of("time"):
+        raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
+    return float(to_si(number, unit))
