@@ -40,7 +40,12 @@ def shown_up_to(record: Record, share: float) -> Record:
     ("share", "effect", "told"),
     [
         (0.12, "self_heating", "only 4 of the readings that count are held out, and no model"),
-        (0.15, "hysteresis_memory", "the sensor is saturated in 94 % of the readings"),
+        pytest.param(
+            0.15,
+            "hysteresis_memory",
+            "the sensor is saturated in 94 % of the readings",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_record_that_hides_nearly_all_names_no_cause(
@@ -72,9 +77,9 @@ def held(record: Record, count: int) -> tuple[Experiment, ...]:
     [
         (15, (50.0, 60.0), False, 0.0, "only 15 of the readings that count"),
         (16, (50.0, 60.0), False, 0.51, "saturated in 51 % of the readings"),
-        (16, (-1.0, 67.0), True, 0.0, "gain, -1 to 67 %, does not leave out"),
-        (16, (-1.0, 67.0), False, 0.5, ""),
-        (16, (1.0, 67.0), True, 0.5, ""),
+        (16, (-101.0, 98.0), False, 0.0, "gain, -101 to 98 %, reaches from an error that doubles"),
+        (16, (-101.0, 97.0), False, 0.0, ""),
+        (16, (-99.0, 98.0), True, 0.5, ""),
     ],
 )
 def test_what_held_out_samples_confirm(
@@ -86,7 +91,8 @@ def test_what_held_out_samples_confirm(
     triangle: Record,
 ) -> None:
     experiments = held(triangle, count)
-    said = unconfirmed(experiments, Gain(40.0, interval), partly=partly, hidden=hidden)
+    gain = Gain(40.0, interval)
+    said = unconfirmed(experiments, gain, whole=97.5, partly=partly, hidden=hidden)
     assert told in said
     assert bool(said) == bool(told)
     few = [n for n in coverage_notes(experiments) if n.startswith("Only")]

@@ -13,9 +13,12 @@ from psa_casadi.identification.start.doubts import (
     doubtful_sign,
     doubtful_time,
     doubtful_unit,
+    doubtful_voltage,
     refuse_unusable,
 )
 from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
+from psa_casadi.identification.start.readings import refuse_few
 from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
@@ -176,3 +179,56 @@ def test_hardly_a_reading_left_is_refused_with_the_reason(
     tenth = np.sort(y)[12]
     with pytest.raises(InputError, match=r"(?s)sensor is saturated there.*Only 12 of 600 reading"):
         identify([Record("r", time, voltage, np.minimum(y, tenth))])
+
+
+@pytest.mark.parametrize("command", [identify, diagnose])
+def test_a_sensor_that_wraps_round_is_named(
+    command: Callable[[list[Record]], object], given: tuple[FloatArray, FloatArray, FloatArray]
+) -> None:
+    time, voltage, y = given
+    period = 0.6 * np.ptp(y)
+    wrapped = Record("r", time, voltage, (y - y.min() + 0.1 * period) % period)
+    with pytest.raises(
+        InputError, match=r"jumps \d+ times by 1[67].\d+ um, up or down, and follows"
+    ):
+        command([wrapped])
+
+
+def test_what_jumps_otherwise_is_not_wrapped(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    switched = np.where(time % 1.0 < 0.5, 0.0, voltage)
+    refuse_wrapped([scaled(given), Record("steps", time, switched, 4e-7 * switched)])
+    stray = np.where(np.isin(np.arange(600), (200, 400)), y - np.ptp(y), y)
+    refuse_wrapped([Record("stray", time, voltage, stray)])
+
+
+def test_a_rate_and_an_integral_are_doubted(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    assert not doubtful_quantity([scaled(given)])
+    integral = Record("r", time, voltage, np.cumsum(y - y.mean()) * 5e-3)
+    assert "the rate of the displacement follows the voltage" in doubtful_quantity([integral])
+    rate = Record("r", time, voltage, np.gradient(y, time))
+    assert "the integral of the displacement follows" in doubtful_quantity([rate])
+
+
+def test_a_voltage_in_counts_is_doubted(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    time, voltage, y = given
+    assert not doubtful_voltage([scaled(given)])
+    counts = Record("r", time, np.round(32768.0 + 200.0 * voltage), y)
+    found = diagnose([counts], effects=[])
+    assert any("no stack bears more than 2000 V" in note for note in found.notes)
+
+
+def test_hardly_a_reading_that_differs_is_refused(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    ordered = np.sort(y)
+    hardly, enough = (Record("r", time, voltage, np.maximum(y, ordered[-k])) for k in (16, 17))
+    with pytest.raises(InputError, match=r"Only 15 readings of the displacement differ from"):
+        refuse_few([hardly], [hardly], [])
+    refuse_few([enough], [enough], [])

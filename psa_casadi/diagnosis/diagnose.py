@@ -16,8 +16,9 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
-from psa_casadi.identification.start.doubts import refuse_few, refuse_still, refuse_stuck
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.identification.start.other_quantities import refuse_wrapped
+from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
@@ -99,6 +100,7 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]
     Raises InputError where hardly a sample is left.
     """
     refuse_still(records)
+    refuse_wrapped(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
     said = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]

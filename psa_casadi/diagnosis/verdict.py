@@ -42,6 +42,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
+from psa_casadi.identification.start.other_quantities import doubtful_quantity
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
@@ -94,7 +95,9 @@ def conclude(
     beaten = weighed.beaten_by()
     gain = gain_of(experiments, first.predicted, last.predicted)
     partly = last.test.alarm and len(steps) > 1
-    doubt = unconfirmed(experiments, gain, partly=partly, hidden=hidden)
+    other = doubtful_quantity([e.record for e in experiments])
+    whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
+    doubt = unconfirmed(experiments, gain, whole=whole, partly=partly, hidden=hidden, other=other)
     verdict: Verdict = (
         "not_driven"
         if not driven

@@ -18,12 +18,13 @@ from psa_casadi.identification.start.doubts import (
     doubtful_sign,
     doubtful_time,
     doubtful_unit,
-    refuse_few,
-    refuse_still,
+    doubtful_voltage,
 )
 from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
+from psa_casadi.identification.start.readings import refuse_few, refuse_still
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
@@ -110,6 +111,7 @@ def identify(
     """
     given_records = records_given(records)
     refuse_still(given_records)
+    refuse_wrapped(given_records)
     parts, cut = without_gaps(given_records)
     ready = [prepared(r) for r in parts]
     fitted = [r for r, _ in ready]
@@ -254,8 +256,15 @@ def _warnings(
 
 
 def _doubts(records: Sequence[Record]) -> list[str]:
-    """Say what of the records is unlike a stack's: unit, time, sign."""
-    return [s for doubt in (doubtful_unit, doubtful_time, doubtful_sign) if (s := doubt(records))]
+    """Say what of the records is unlike a stack's: unit, voltage, time, sign."""
+    doubts = (
+        doubtful_unit,
+        doubtful_voltage,
+        doubtful_time,
+        doubtful_sign,
+        doubtful_quantity,
+    )
+    return [s for doubt in doubts if (s := doubt(records))]
 
 
 def _disagreement(searched: Search) -> list[str]:

@@ -6,6 +6,8 @@ from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment
 
+#: Gain [%] of an error that doubles.
+_DOUBLED = -100.0
 #: Share of the readings from which on a saturated sensor hides more than it shows.
 _HIDDEN = 0.5
 
@@ -22,13 +24,20 @@ def too_few_held_out(experiments: Sequence[Experiment]) -> str:
 
 
 def unconfirmed(
-    experiments: Sequence[Experiment], gain: Gain, *, partly: bool, hidden: float
+    experiments: Sequence[Experiment],
+    gain: Gain,
+    *,
+    whole: float,
+    partly: bool,
+    hidden: float,
+    other: str = "",
 ) -> str:
     """Say why held-out samples do not confirm the causes of an extended model; "" where they do.
 
-    `hidden` is the share of the readings that a saturated sensor has made. Where the causes explain
-    the records `partly` and much remains, the interval of the held-out `gain` must leave no gain
-    out.
+    `hidden` is the share of the readings that a saturated sensor has made. The interval of the
+    held-out `gain` tells nothing where it reaches from an error that doubles to the `whole` gain
+    [%], which leaves the noise alone. Where the causes explain the records `partly` and much
+    remains, the displacement may not be an `other` quantity, as a sentence says.
     """
     few = too_few_held_out(experiments)
     if few:
@@ -38,10 +47,12 @@ def unconfirmed(
             f"the sensor is saturated in {100 * hidden:.0f} % of the readings, so that more of the"
             " motion is hidden than shown"
         )
+    if partly and other:
+        return "much would remain, and the displacement may be another quantity"
     low, high = gain.interval
-    if partly and low <= 0.0:
+    if low <= _DOUBLED and high >= whole:
         return (
-            f"much would remain, and the 95 % interval of the held-out gain, {low:.0f} to"
-            f" {high:.0f} %, does not leave out that there is none"
+            f"the 95 % interval of the held-out gain, {low:.0f} to {high:.0f} %, reaches from an"
+            " error that doubles to noise alone"
         )
     return ""

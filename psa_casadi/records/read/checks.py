@@ -57,8 +57,10 @@ def check_time(time: Located, problems: Problems) -> None:
     check_complete(time, problems)
     known = np.flatnonzero(np.isfinite(time.values))
     wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
-    problems.add_uncounted(max(0, wrong.size - LISTED))
-    for row, before in zip(known[wrong + 1][:LISTED], known[wrong][:LISTED], strict=True):
+    if wrong.size > LISTED:
+        problems.add(_disorder(time, known[wrong], known[wrong + 1]))
+        return
+    for row, before in zip(known[wrong + 1], known[wrong], strict=True):
         now, last = time.values[row], time.values[before]
         what = "stands still" if now == last else "goes back"
         problems.add(
@@ -67,6 +69,19 @@ def check_time(time: Located, problems: Problems) -> None:
             f"instant in every {time.place}; remove repeated {time.place}s or split the file where "
             f"a new record begins."
         )
+
+
+def _disorder(time: Located, before: NDArray[np.intp], after: NDArray[np.intp]) -> str:
+    """Say in one sentence what is wrong with the order of many rows."""
+    first, still = after[0], time.values[after] == time.values[before]
+    places = f"{time.place}s"
+    where = (
+        f"{time.path}: column 'time': {after.size} of {time.values.size} {places} are not later"
+        f" than the one before, {time.place} {time.lines[first]} the first of them"
+    )
+    if np.all(still):
+        return f"{where}: their time stands still; remove repeated {places}."
+    return f"{where}: the {places} are not in the order of time; sort them by it."
 
 
 def check_complete(column: Located, problems: Problems) -> None:
