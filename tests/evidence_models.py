@@ -22,7 +22,8 @@ NOISE, OFFSET = 2e-8, 3e-7
 def noisy_record() -> Record:
     """Return 640 samples in 0.64 s: 0 to 80 V, with drawn noise and an offset of the sensor."""
     time = np.arange(640) * 1e-3
-    voltage = 40.0 * (1.0 - np.cos(25.0 * time)) * (1.0 - 0.5 * time)
+    swept = 40.0 * (1.0 - np.cos(25.0 * time)) * (1.0 - 0.5 * time)
+    voltage = np.asarray(swept, dtype=np.float64)
     found = simulate(stack_model("demo"), time, voltage).displacement
     noise = NOISE * np.random.default_rng(3).standard_normal(len(time))
     return Record("short", time, voltage, found + noise + OFFSET)

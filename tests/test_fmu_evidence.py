@@ -28,9 +28,14 @@ from psa_casadi.export.fmu.validity import seen_inputs, with_validity
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
+from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.evidence import evidence_of
+from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.prepare import prepared
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
 from psa_casadi.records.record import Record
+from psa_casadi.records.split import whole
 from psa_casadi.variables import Interval
 from tests.evidence_models import evident_model, noisy_record
 from tests.fmu_models import assert_valid, rewritten
@@ -172,6 +177,35 @@ def test_the_run_and_the_held_out_error_hold(fmi: int) -> None:
     assert all(r.passed for r in rows.values()), rows
     assert rows["reference run"].figure < (2e-6 if fmi == 2 else 2e-4)
     assert rows["held-out error of short"].figure < (1e-4 if fmi == 2 else 2e-3)
+
+
+@pytest.mark.slow
+def test_a_record_that_was_averaged_is_averaged_again() -> None:
+    time = np.arange(8000) * 1e-4
+    voltage = np.asarray(50.0 - 50.0 * np.cos(8.0 * time), dtype=np.float64)
+    noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
+    clean = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
+    record = Record("fast", time, voltage, clean + noise)
+    shorter, _ = prepared(record)
+    assert shorter.n < record.n
+    found = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])
+    told = evidence_of(
+        found, determinacy(found, (whole(shorter),)), (whole(shorter),),
+        found.predicted((whole(shorter),)), by="test", sampled=[record],
+    )  # fmt: skip
+    model = replace(found.model.plant(), evidence=replace(told, reference=None))
+    with Archive(evident_fmu()) as archive:
+        again = repeated(archive, model, [record])
+        gone = repeated(archive, model, [record.slice(0, 7000)])
+    (playback,) = again.playbacks
+    assert len(playback.times) == shorter.n
+    x0 = np.array([playback.start[n] for n in model.state_names])
+    inputs = np.column_stack([playback.inputs.values[:, 0], np.zeros(shorter.n)])
+    y = psa.run(model, playback.times, inputs, x0, rtol=1e-9).y
+    error = playback.expected - y[:, model.output_names.index("displacement")]
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(playback.stated, rel=1e-4)
+    assert not gone.rows[-1].passed
+    assert f"{shorter.n} are stated" in gone.rows[-1].remark
 
 
 def test_another_record_is_not_one_of_those() -> None:
