@@ -74,8 +74,8 @@ def test_a_record_is_played_again_from_what_is_said_of_it() -> None:
 
 def test_the_reference_run_tells_the_voltage_in_few_samples() -> None:
     """A record of 6000 samples, whose voltage moves for a moment only: every eighth tells it."""
-    time = np.arange(6000) * 1e-3
-    voltage = np.asarray(50.0 - 50.0 * np.cos(6.0 * time), dtype=np.float64)
+    time = np.asarray(np.arange(6000) * 1e-3, dtype=np.float64)
+    voltage = 50.0 - 50.0 * np.cos(6.0 * time)
     record = Record("long", time, voltage, 1e-7 * voltage)
     model = psa.stack_model("demo")
     experiments = (whole(record),)
@@ -95,8 +95,8 @@ def test_the_reference_run_tells_the_voltage_in_few_samples() -> None:
 
 
 def test_averaged_records_are_said_to_be() -> None:
-    time = np.arange(8000) * 1e-4
-    voltage = np.asarray(50.0 - 50.0 * np.cos(8.0 * time), dtype=np.float64)
+    time = np.asarray(np.arange(8000) * 1e-4, dtype=np.float64)
+    voltage = 50.0 - 50.0 * np.cos(8.0 * time)
     noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
     record = Record("fast", time, voltage, 1e-7 * voltage + noise)
     shorter, factor = decimated(record, 1e-7, 1e-7)
