@@ -1,11 +1,14 @@
 """A model with evidence: three values fitted to a short noisy record, judged on held-out blocks."""
 
+import tempfile
+import zipfile
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from psa_casadi.diagnosis.evidence import diagnosis_evidence
+from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.identification.certainty.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.identify import with_provenance
@@ -15,13 +18,14 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import divided
 from psa_casadi.simulation.simulate import simulate
 
+_FOLDER = tempfile.TemporaryDirectory()
 NOISE, OFFSET = 2e-8, 3e-7
 
 
 @cache
 def noisy_record() -> Record:
     """Return 640 samples in 0.64 s: 0 to 80 V, with drawn noise and an offset of the sensor."""
-    time = np.arange(640) * 1e-3
+    time = np.asarray(np.arange(640) * 1e-3, dtype=np.float64)
     voltage = 40.0 * (1.0 - np.cos(25.0 * time)) * (1.0 - 0.5 * time)
     found = simulate(stack_model("demo"), time, voltage).displacement
     noise = NOISE * np.random.default_rng(3).standard_normal(len(time))
@@ -42,10 +46,16 @@ def evident_model() -> Model:
     return with_provenance(found.model, told, [record], False, evidence=evidence)
 
 
-def write_record(folder: Path, record: Record) -> Path:
-    """Write a record as a CSV file, every digit kept."""
-    path = folder / f"{record.name}.csv"
-    columns = np.column_stack([record.time, record.voltage, np.asarray(record.displacement)])
-    head = "time [s],voltage [V],displacement [m]"
-    np.savetxt(path, columns, fmt="%.17g", delimiter=",", header=head, comments="")
-    return path
+@cache
+def evident_fmu(fmi: int = 2) -> Path:
+    """Return the FMU of that model, with two random parameter sets and the output."""
+    path = Path(_FOLDER.name) / f"evident_{fmi}.fmu"
+    return export_fmu(
+        evident_model(), path, name="evident", fmi=fmi, parameter_sets=2, validity_output=True
+    )
+
+
+def files_inside(path: Path) -> dict[str, bytes]:
+    """Return the files of an archive by their place."""
+    with zipfile.ZipFile(path) as archive:
+        return {n: archive.read(n) for n in archive.namelist()}

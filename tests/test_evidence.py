@@ -13,6 +13,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.certainty.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
@@ -67,13 +68,13 @@ def test_a_record_is_played_again_from_what_is_said_of_it() -> None:
     inputs = record_inputs(model, record, record.n)
     y = run(model, record.time - record.time[0], inputs, x0, rtol=1e-9).y
     found = y[:, model.output_names.index("measured_displacement")] + said.offset_m
-    error = np.concatenate([(record.displacement - found)[a:b] for a, b in said.held_out])
+    error = np.concatenate([(measured(record) - found)[a:b] for a, b in said.held_out])
     assert np.sqrt(np.mean(error**2)) == pytest.approx(said.held_out_m, rel=1e-4)
 
 
 def test_the_reference_run_tells_the_voltage_in_few_samples() -> None:
     """A record of 6000 samples, whose voltage moves for a moment only: every eighth tells it."""
-    time = np.arange(6000) * 1e-3
+    time = np.asarray(np.arange(6000) * 1e-3, dtype=np.float64)
     voltage = 50.0 - 50.0 * np.cos(6.0 * time)
     record = Record("long", time, voltage, 1e-7 * voltage)
     model = psa.stack_model("demo")
@@ -94,7 +95,7 @@ def test_the_reference_run_tells_the_voltage_in_few_samples() -> None:
 
 
 def test_averaged_records_are_said_to_be() -> None:
-    time = np.arange(8000) * 1e-4
+    time = np.asarray(np.arange(8000) * 1e-4, dtype=np.float64)
     voltage = 50.0 - 50.0 * np.cos(8.0 * time)
     noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
     record = Record("fast", time, voltage, 1e-7 * voltage + noise)

@@ -1,67 +1,26 @@
-"""The evidence inside an FMU: its files, runs played again, and what is said outside the range."""
+"""The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them."""
 
 import re
-import zipfile
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from xml.etree import ElementTree as ET
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.components.validity import OUTPUT
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.export.check.check import CheckReport, check_fmu
-from psa_casadi.export.check.evidence import repeated, wrong_evidence
+from psa_casadi.export.check.evidence import repeated
 from psa_casadi.export.check.playback import played_again
-from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.fmu import evidence_files as files
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.reference_results import FOLDER
-from psa_casadi.export.fmu.validity import seen_inputs, with_validity
-from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
-from psa_casadi.export.importer.masters import Signals, communicate
-from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import loads
-from psa_casadi.records.record import Record
-from psa_casadi.variables import Interval
-from tests.evidence_models import evident_model, noisy_record
-from tests.fmu_models import assert_valid, rewritten
-from tests.tiers import slow_but
-
-_FOLDER = TemporaryDirectory()
-_SAID = "From here on the results are extrapolated."
-
-
-@cache
-def evident_fmu(fmi: int = 2) -> Path:
-    path = Path(_FOLDER.name) / f"evident_{fmi}.fmu"
-    return export_fmu(
-        evident_model(), path, name="evident", fmi=fmi, parameter_sets=2, validity_output=True
-    )
-
-
-def inside(path: Path) -> dict[str, bytes]:
-    with zipfile.ZipFile(path) as archive:
-        return {n: archive.read(n) for n in archive.namelist()}
-
-
-def carried(path: Path) -> Model:
-    return loads(inside(path)["resources/model.json"].decode())
-
-
-# Files
+from psa_casadi.export.importer.fmu import Fmu
+from tests.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
+from tests.fmu_models import assert_valid
 
 
 def test_the_manifest_tells_the_role_of_every_file_of_evidence() -> None:
-    found = inside(evident_fmu())
+    found = files_inside(evident_fmu())
     root = ET.fromstring(found[f"{FOLDER}/fmi-ls-manifest.xml"])
     roles = {}
     for related in root:
@@ -80,7 +39,7 @@ def test_the_manifest_tells_the_role_of_every_file_of_evidence() -> None:
 
 
 def test_experiments_name_files_that_are_there() -> None:
-    found = inside(evident_fmu())
+    found = files_inside(evident_fmu())
     (whole,) = ET.fromstring(found[files.VALIDATION])
     spread = ET.fromstring(found[files.UNCERTAINTY])
     assert [e.tag for e in whole] == ["Parameters", "Stimuli", "References"]
@@ -91,7 +50,7 @@ def test_experiments_name_files_that_are_there() -> None:
 
 def test_meta_data_and_page_say_the_same() -> None:
     """Names and order as the schema of SSP Traceability 1.0 has them (SRMD.xsd, STC.xsd)."""
-    found, model = inside(evident_fmu()), evident_model()
+    found, model = files_inside(evident_fmu()), evident_model()
     root = ET.fromstring(found[files.META_DATA])
     space = "{http://ssp-standard.org/SSPTraceability1/%s}"
     assert root.tag == space % "SimulationResourceMetaData" + "SimulationResourceMetaData"
@@ -119,7 +78,7 @@ def test_meta_data_and_page_say_the_same() -> None:
 
 
 def test_parameter_sets_are_as_their_schema_has_them() -> None:
-    found = inside(evident_fmu())
+    found = files_inside(evident_fmu())
     sets = [n for n in found if n.endswith(".ssv")]
     assert len(sets) == 9 + 2
     for name in sets:
@@ -156,179 +115,15 @@ def test_what_a_person_says_of_a_record_stays_text() -> None:
     assert f"{name}, sha256" in read
 
 
-# Runs played again
-
-
-def play(path: Path, *records: Record) -> list[CheckRow]:
-    with Fmu(path) as fmu:
-        again = repeated(fmu, carried(path), records)
-        return [*again.rows, *(played_again(fmu, p) for p in again.playbacks)]
-
-
-@pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
-def test_the_run_and_the_held_out_error_hold(fmi: int) -> None:
-    rows = {r.name: r for r in play(evident_fmu(fmi), noisy_record())}
-    assert list(rows) == ["records as stated", "reference run", "held-out error of short"]
-    assert all(r.passed for r in rows.values()), rows
-    assert rows["reference run"].figure < (2e-6 if fmi == 2 else 2e-4)
-    assert rows["held-out error of short"].figure < (1e-4 if fmi == 2 else 2e-3)
-
-
-def test_another_record_is_not_one_of_those() -> None:
-    other = noisy_record().slice(0, 100)
-    rows = play(evident_fmu(), replace(other, name="other", sha256="f" * 64))
-    strange = next(r for r in rows if r.name == "records as stated")
-    assert not strange.passed
-    assert "other has sha256 ffffffffffff..." in strange.remark
-    assert not any("error of" in r.name for r in rows)
-
-
-def test_an_error_that_is_stated_too_small_is_found(tmp_path: Path) -> None:
-    def smaller(content: bytes) -> bytes:
-        return re.sub(rb'("held_out_m": )[\d.e+-]+', rb"\g<1>1.5e-08", content)
-
-    path = rewritten(evident_fmu(), tmp_path / "m.fmu", {"resources/model.json": smaller})
-    failed = [r for r in play(path, noisy_record()) if not r.passed]
-    assert [r.name for r in failed] == ["held-out error of short"]
-    assert "stated 0.015 um" in failed[0].remark
-
-
-def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
-    def moved(content: bytes) -> bytes:
-        lines = content.decode().splitlines()
-        column = lines[0].split(",").index("displacement")
-        values = lines[100].split(",")
-        values[column] = repr(1.01 * float(values[column]))
-        return "\n".join([*lines[:100], ",".join(values), *lines[101:], ""]).encode()
-
-    changes = {files.OUTPUTS: moved, files.PAGE: lambda c: c.replace(b"held-out", b"hold-out")}
-    path = rewritten(evident_fmu(), tmp_path / "m.fmu", changes)
-    with Archive(path) as archive:
-        assert list(wrong_evidence(archive, carried(path))) == [
-            f"{files.PAGE} is not what the model says"
-        ]
-    with Archive(evident_fmu()) as archive:
-        assert list(wrong_evidence(archive, carried(path))) == []
-    (row,) = play(path)
-    assert row.name == "reference run"
-    assert not row.passed
-    assert row.figure > 1e-3
-
-
-def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
-    drift = EFFECTS["offset_drift"]
-    model = evident_model()
-    assert model.evidence is not None
-    told = replace(model.evidence, outside=(drift.name,))
-    with Archive(evident_fmu()) as archive:
-        again = repeated(archive, replace(model.plant(), evidence=told), [noisy_record()])
-    assert again.rows[-1].passed
-    assert "not compared: the FMU leaves out offset_drift" in again.rows[-1].remark
-
-
 @pytest.mark.slow
-def test_the_whole_check_with_evidence() -> None:
-    report = check_fmu(evident_fmu(), evidence=True, records=[noisy_record()])
-    assert report.passed, report.failures
-    names = [r.name for r in report.rows]
-    assert {"evidence inside", "reproducible", "reference run"} < set(names)
-    assert names[-1] == "held-out error of short"
-
-
-@pytest.mark.slow
-def test_an_fmu_without_evidence_does_not_pass_when_it_is_asked_for(tmp_path: Path) -> None:
-    path = export_fmu(psa.stack_model("demo"), tmp_path / "plain.fmu", name="plain")
-    assert failures(check_fmu(path, evidence=True)) == ["evidence"]
-    assert failures(check_fmu(path)) == []
-
-
-def failures(report: CheckReport) -> list[str]:
-    return [r.name for r in report.failures]
-
-
-# Outside of what the records have shown
-
-
-def messages(
-    fmi: int, peak: float, duration: float, *, start: float = 0.0, steps: int = 100
-) -> tuple[list[str], np.ndarray]:
-    """Return what an FMU says of a triangle, and the output, in co-simulation."""
-    times = start + np.linspace(0.0, duration, steps + 1)
-    volts = peak * (1.0 - np.abs(np.linspace(-1.0, 1.0, steps + 1)))
-    inputs = Signals(("voltage",), times, volts[:, None])
-    with Fmu(evident_fmu(fmi)) as fmu, fmu.start(CO_SIMULATION, start_time=start) as instance:
-        found = communicate(instance, times, inputs, [OUTPUT])
-        return [m for m in instance.messages if _SAID in m], found[:, 0]
-
-
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_inside_nothing_is_said(fmi: int) -> None:
-    said, outside = messages(fmi, 75.0, 0.5, start=1e3)
-    assert said == []
-    assert np.all(outside == 0.0)
-
-
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
-    said, outside = messages(fmi, 120.0, 0.6)
-    (line,) = said
-    assert line.startswith("voltage is 7")
-    seen = evident_model().evidence
-    assert seen is not None
-    high = seen.seen.voltage.high
-    assert f"from {seen.seen.voltage.low:.6g} to {high:.6g}." in line
-    beyond = (120.0 - high) / (high - seen.seen.voltage.low) - 0.01
-    assert np.max(outside) == pytest.approx(beyond, abs=2e-3)
-    assert outside[0] == outside[-1] == 0.0
-
-
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
-    said, outside = messages(fmi, 75.0, 0.01)
-    assert len(said) == 1
-    assert said[0].startswith("The rate per second of voltage is 1")
-    assert np.max(outside) > 1.0
-    said, outside = messages(fmi, 75.0, 0.8)
-    assert len(said) == 1
-    assert said[0].startswith("The time since the start is 0.64")
-    assert np.all(outside == 0.0)
-
-
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_model_exchange_says_it_too(fmi: int) -> None:
-    with Fmu(evident_fmu(fmi)) as fmu, fmu.start(MODEL_EXCHANGE) as instance:
-        rest = instance.get(fmu.states())
-        for volts in (50.0, 100.0, 120.0):
-            instance.derivatives(0.1, rest, {"voltage": volts})
-        assert sum(_SAID in m for m in instance.messages) == 1
-
-
-def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
-    model = evident_model()
-    assert model.evidence is not None
-    seen = replace(model.evidence.seen, temperature=Interval(290.0, 300.0))
-    told = replace(model.evidence, seen=seen)
-    assert "seen_temperature_low" not in with_validity(replace(model, evidence=told)).values
-    warm = replace(model.with_effect(EFFECTS["temperature"]), evidence=told)
-    watched = with_validity(warm)
-    column = watched.output_names.index(OUTPUT)
-    x = [q.start for q in watched.structure.states]
-    for kelvins, outside in ((295.0, 0.0), (300.05, 0.0), (310.0, 0.99), (285.0, 0.49)):
-        u = [kelvins if n == "temperature" else 0.0 for n in watched.input_names]
-        y = watched.structure.f(0.0, x, u, watched.parameter_vector())[1]
-        assert float(y[column]) == pytest.approx(outside, abs=1e-12)
-    assert seen_inputs(watched)[watched.input_names.index("temperature")] == (290.0, 300.0, np.inf)
-
-
-@pytest.mark.slow
-def test_the_command_writes_sets_and_tells_what_is_inside(tmp_path: Path) -> None:
+def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) -> None:
     psa.save_model(evident_model(), tmp_path / "m.json")
     path, sets = tmp_path / "m.fmu", tmp_path / "sets"
     line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
     said = CliRunner().invoke(app, f"{line} --parameter-sets 1 --sets-to {sets}".split())
     assert said.exit_code == 0, said.output
     assert "documentation/evidence.html (records: short), 8 parameter sets" in said.output
-    found = inside(path)
+    found = files_inside(path)
     assert len(list(sets.iterdir())) == 8
     for file in sets.iterdir():
         assert found[f"{files.SETS}/{file.name}"] == file.read_bytes()
@@ -336,12 +131,3 @@ def test_the_command_writes_sets_and_tells_what_is_inside(tmp_path: Path) -> Non
         (playback,) = repeated(fmu, evident_model(), [noisy_record()]).playbacks[1:]
         assert playback.output == "measured_displacement"
         assert played_again(fmu, playback).figure < 1e-4
-
-
-def test_the_output_is_there_on_request_only() -> None:
-    model = evident_model()
-    assert OUTPUT not in files.evidence_texts(model.plant(), 0)[files.INPUTS]
-    with Archive(evident_fmu()) as archive:
-        assert OUTPUT in archive.names("output")
-    with pytest.raises(InputError, match="does not say what its records have shown"):
-        export_fmu(psa.stack_model("demo"), Path("never.fmu"), validity_output=True)

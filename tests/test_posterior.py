@@ -31,7 +31,7 @@ def coordinates(model: Model, sets: dict[str, dict[str, float]], chosen: str) ->
     mean = np.array(list(sets["mean"].values()))
     rows = np.array([list(v.values()) for n, v in sets.items() if n.startswith(chosen)])
     log = [model.parameter(n).log for n in names]
-    return np.where(log, np.log(rows / mean), rows / mean - 1.0)
+    return np.array(np.where(log, np.log(rows / mean), rows / mean - 1.0))
 
 
 def found(model: Model, samples: int) -> dict[str, dict[str, float]]:

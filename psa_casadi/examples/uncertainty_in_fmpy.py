@@ -66,7 +66,7 @@ def deviation(runs: dict[str, Any]) -> np.ndarray:
         0.5 * (runs[f"{n}_plus"]["displacement"] - runs[f"{n}_minus"]["displacement"])
         for n in pairs
     ]
-    return np.sqrt(np.sum(np.square(halves), axis=0))
+    return np.array(np.sqrt(np.sum(np.square(halves), axis=0)))
 
 
 def _run(unpacked: Path, values: dict[str, float]) -> Any:

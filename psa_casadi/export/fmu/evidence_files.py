@@ -50,6 +50,11 @@ _PAGE_NOTE = """\
 These are statements of the model file about records that are not in this archive. With a record at
 hand, `psa check --evidence --record FILE` plays it through this FMU and tells what holds."""
 
+_PAGE_FILES = f"""\
+<code>{VALIDATION}</code> lists the run to repeat: the first part of a record, its inputs, what the
+model says of it, and what was measured. Parameter sets within the uncertainty, where the export
+made them, lie in <code>{SETS}</code>: the mean, pairs of sigma points, random samples."""
+
 
 @dataclass(frozen=True)
 class EvidenceFiles:
@@ -105,6 +110,7 @@ def evidence_page(model: Model) -> str:
     for chapter in chapters(model, model.evidence) if model.evidence else ():
         said = [(s.keyword, s.text) for s in chapter.said if not s.keyword.startswith("covariance")]
         parts += [f"<h2>{html.escape(chapter.title)}</h2>", table_of(("", ""), said)]
+    parts += ["<h2>In this archive</h2>", f"<p>{_PAGE_FILES}</p>"]
     parts.append('<p><a href="index.html">The model</a></p>')
     return page(f"{model.name}: evidence", parts, "The page on the evidence")
 
