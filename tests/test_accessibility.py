@@ -20,6 +20,7 @@ pytestmark = pytest.mark.xdist_group("browser")
 #: One page of every kind: text and tables, code, a gallery, a notebook, what is made from code.
 SITE = (
     "index.html",
+    "ablation/index.html",
     "evidence/index.html",
     "howto/simulink/index.html",
     "effects/index.html",
