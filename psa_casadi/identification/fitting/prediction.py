@@ -169,8 +169,9 @@ def predict(
         )
         start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
         count = len(unknowns.names)
-        jacobian = found.sensitivity[:, count:] @ start_slopes
-        jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
+        by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
+        by_theta[:count, :count] = slopes
+        jacobian = found.sensitivity @ by_theta
         jacobian += offset_slopes
         return Prediction(found.output + unknowns.offset(theta, index), jacobian, found.way)
 
