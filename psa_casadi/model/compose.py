@@ -66,7 +66,7 @@ class Model:
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the parameter vector."""
-        return tuple(p.name for p in self.structure.parameters)
+        return self.structure.parameter_names
 
     @property
     def input_names(self) -> tuple[str, ...]:

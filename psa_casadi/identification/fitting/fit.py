@@ -266,7 +266,7 @@ def objective(
     """Return the weighted residuals (predicted - measured, then priors) with their Jacobian."""
     target = np.concatenate([measured(e.record)[e.used] for e in experiments])
     used = [e.used[: e.stop] for e in experiments]
-    prior = 1.0 / unknowns.prior
+    prior, samples, share = 1.0 / unknowns.prior, len(target), 1.0 / weights
 
     def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         try:
@@ -274,11 +274,17 @@ def objective(
         except PsaError:
             return None
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
-        j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
-        residual = np.concatenate([(y - target) / weights, theta * prior])
-        jacobian = np.vstack([j / weights[:, None], np.diag(prior)])
+        residual = np.concatenate([(y - target) * share, theta * prior])
+        jacobian = np.empty((samples + len(theta), len(theta)))
+        first = 0
+        for part, u in zip(parts, used, strict=True):  # no copy but this one
+            last = first + int(np.count_nonzero(u))
+            np.compress(u, part.jacobian, axis=0, out=jacobian[first:last])
+            first = last
+        jacobian[:samples] *= share[:, None]
+        jacobian[samples:] = np.diag(prior)
         with np.errstate(over="ignore", invalid="ignore"):
-            finite = np.isfinite(residual @ residual + np.sum(jacobian**2))
+            finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
         return (residual, jacobian) if finite else None
 
     return evaluate

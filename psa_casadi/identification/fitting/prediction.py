@@ -192,8 +192,9 @@ def predict(
             return Prediction(shown, found.sensitivity, found.way)
         start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
         count = len(unknowns.names)
-        jacobian = found.sensitivity[:, count:] @ start_slopes
-        jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
+        by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
+        by_theta[:count, :count] = slopes
+        jacobian = found.sensitivity @ by_theta
         jacobian += offset_slopes
         return Prediction(shown, jacobian, found.way)
 
