@@ -113,6 +113,12 @@ CORE = {
         "state->input.rate[index] = 0.0 * rate[i];",
         {"co-simulation, step 0.001 s"},
     ),
+    "no line of the input": (
+        "instance.c",
+        "if (state->stride > 0.0)",
+        "if (state->stride < 0.0)",
+        {"line of the input"},
+    ),
     "parameters without effect during a run": (
         "values.c",
         "else state->p[v->index] = value;",

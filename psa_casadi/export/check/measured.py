@@ -13,6 +13,7 @@ from psa_casadi.export.check.events import (
     intermediate_update,
     wrong_indicators,
 )
+from psa_casadi.export.check.input_line import input_line_error
 from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, figure, stopped
 from psa_casadi.export.check.structure import (
     adjoint_error,
@@ -22,11 +23,13 @@ from psa_casadi.export.check.structure import (
     wrong_start,
 )
 from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 
 _DIRECTIONAL_LIMIT = 1e-5
 _ADJOINT_LIMIT = 1e-10
 _EQUATION_LIMIT = 1e-9
+_LINE_LIMIT = 0.1
 
 #: The name of a check that begins now, or the row of the one that began last.
 Progress = Iterator[str | CheckRow]
@@ -61,6 +64,9 @@ def _of_instances(fmu: Fmu, truth: Truth | None) -> Progress:
     if fmu.version == 3:
         yield "adjoint derivatives"
         yield figure("adjoint derivatives", _ADJOINT_LIMIT, adjoint_error, fmu)
+    if INPUT_LINE.name in fmu.references:
+        yield "line of the input"
+        yield figure("line of the input", _LINE_LIMIT, input_line_error, fmu)
     if truth:
         yield from _of_model(fmu, truth)
 
