@@ -14,6 +14,7 @@ from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import (
     inconsistent_units,
+    misplaced_binaries,
     missing_functions,
     missing_notices,
     needless_symbols,
@@ -193,6 +194,7 @@ _DESCRIBED: dict[str, Callable[[Archive], Iterable[str]]] = {
     "functions present": missing_functions,
     "no other symbols": needless_symbols,
     "GNU libc 2.17": new_libraries,
+    "binaries in their folders": misplaced_binaries,
     "licence inside": missing_notices,
 }
 _ORIGIN: dict[str, Callable[[Archive, Model], Iterable[str]]] = {

@@ -13,6 +13,7 @@ from psa_casadi.export.check.events import (
     intermediate_update,
     wrong_indicators,
 )
+from psa_casadi.export.check.input_line import input_line_error
 from psa_casadi.export.check.playback import played_again
 from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, figure, stopped
 from psa_casadi.export.check.structure import (
@@ -24,11 +25,13 @@ from psa_casadi.export.check.structure import (
 )
 from psa_casadi.export.check.task import Task
 from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 
 _DIRECTIONAL_LIMIT = 1e-5
 _ADJOINT_LIMIT = 1e-10
 _EQUATION_LIMIT = 1e-9
+_LINE_LIMIT = 0.1
 
 #: The name of a check that begins now, or the row of the one that began last.
 Progress = Iterator[str | CheckRow]
@@ -63,6 +66,9 @@ def _of_instances(fmu: Fmu, task: Task) -> Progress:
     if fmu.version == 3:
         yield "adjoint derivatives"
         yield figure("adjoint derivatives", _ADJOINT_LIMIT, adjoint_error, fmu)
+    if INPUT_LINE.name in fmu.references:
+        yield "line of the input"
+        yield figure("line of the input", _LINE_LIMIT, input_line_error, fmu)
     if task.truth:
         yield from _of_model(fmu, task.truth)
     for playback in task.playbacks:

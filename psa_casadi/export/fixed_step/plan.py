@@ -11,9 +11,7 @@ from psa_casadi.export.fixed_step.step import StepExpression
 from psa_casadi.model.compose import Model
 
 _KEYWORDS = set(
-    "auto break case char const continue default do double else enum extern float for"
-    " goto if inline int long register restrict return short signed sizeof static struct"
-    " switch typedef union unsigned void volatile while".split()  # fmt: skip  # noqa: SIM905 - as a list they take 37 lines
+    ["auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while"]  # fmt: skip
 )
 
 
