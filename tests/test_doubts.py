@@ -220,6 +220,7 @@ def test_a_voltage_in_counts_is_doubted(given: tuple[FloatArray, FloatArray, Flo
     assert not doubtful_voltage([scaled(given)])
     counts = Record("r", time, np.round(32768.0 + 200.0 * voltage), y)
     found = diagnose([counts], effects=[])
+    assert "no stack bears such a voltage, and what depends on its level" in found.doubt
     assert any("no stack bears more than 2000 V" in note for note in found.notes)
 
 

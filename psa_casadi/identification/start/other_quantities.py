@@ -59,14 +59,15 @@ def _wrapped(record: Record) -> str:
 def doubtful_quantity(records: Sequence[Record]) -> str:
     """Say that the rate or the integral of a displacement follows the voltage in its place; or "".
 
-    A stack behind a lag that is long beside the voltage's changes looks so too.
+    A stack behind a lag that is long beside the voltage's changes looks so too. Nothing is said of
+    a record of which less than half is read: what it shows may follow the rate by itself.
     """
     return next((s for r in records if (s := _rate_or_integral(r))), "")
 
 
 def _rate_or_integral(record: Record) -> str:
     y, v = _readings(record)
-    if y.size < FEWEST_SAMPLES or abs(own := _correlation(y, v)) > _FOLLOWS:
+    if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
         return ""
     step = np.diff(record.time[record.mask])
     rate = _correlation(np.diff(y) / step, 0.5 * (v[1:] + v[:-1]))
