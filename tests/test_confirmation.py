@@ -11,6 +11,7 @@ from psa_casadi.diagnosis.held_out.confirmation import unconfirmed
 from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.start.other_quantities import doubtful_quantity
 from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
@@ -64,6 +65,14 @@ def test_an_end_is_told_however_little_is_shown_below_it(share: float, triangle:
     assert y is not None
     (end,) = suspects(record).ends
     np.testing.assert_array_equal(end.where, y == y.max())
+
+
+def test_a_window_of_the_motion_is_no_integral(triangle: Record) -> None:
+    """Within it, the voltage of rises is higher than that of falls: it follows the rate."""
+    y = triangle.displacement
+    assert y is not None
+    seen = np.abs(y - y.min() - 0.5 * np.ptp(y)) < 0.03 * np.ptp(y)
+    assert not doubtful_quantity([replace(triangle, displacement=np.where(seen, y, np.nan))])
 
 
 def held(record: Record, count: int) -> tuple[Experiment, ...]:

@@ -204,13 +204,15 @@ def test_what_jumps_otherwise_is_not_wrapped(
     refuse_wrapped([Record("stray", time, voltage, stray)])
 
 
-def test_a_rate_and_an_integral_are_doubted(
+def test_a_rate_an_integral_and_a_rectified_displacement_are_doubted(
     given: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
     time, voltage, y = given
     assert not doubtful_quantity([scaled(given)])
     integral = Record("r", time, voltage, np.cumsum(y - y.mean()) * 5e-3)
     assert "the rate of the displacement follows the voltage" in doubtful_quantity([integral])
+    rectified = Record("r", time, voltage, np.abs(y - y.min() - 0.5 * np.ptp(y)))
+    assert "V the displacement follows the voltage" in doubtful_quantity([rectified])
     rate = Record("r", time, voltage, np.gradient(y, time))
     assert "the integral of the displacement follows" in doubtful_quantity([rate])
 
@@ -220,6 +222,7 @@ def test_a_voltage_in_counts_is_doubted(given: tuple[FloatArray, FloatArray, Flo
     assert not doubtful_voltage([scaled(given)])
     counts = Record("r", time, np.round(32768.0 + 200.0 * voltage), y)
     found = diagnose([counts], effects=[])
+    assert "no stack bears such a voltage, and what depends on its level" in found.doubt
     assert any("no stack bears more than 2000 V" in note for note in found.notes)
 
 
@@ -232,3 +235,40 @@ def test_hardly_a_reading_that_differs_is_refused(
     with pytest.raises(InputError, match=r"Only 15 readings of the displacement differ from"):
         refuse_few([hardly], [hardly], [])
     refuse_few([enough], [enough], [])
+
+
+def _heavy(y: FloatArray) -> FloatArray:
+    return y + 1e-3 * np.ptp(y) * np.random.default_rng(9).standard_t(1.5, y.size)
+
+
+def _torn(y: FloatArray) -> FloatArray:
+    return np.where(np.arange(y.size) % 200 < 60, np.nan, y)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("late", "change"),
+    [(30.0, lambda y: y), (0.0, _heavy), (0.0, _torn)],
+    ids=["late", "heavy", "torn"],
+)
+def test_an_odd_record_of_a_sound_stack_is_adequate(
+    late: float,
+    change: Callable[[FloatArray], FloatArray],
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """A record that starts late, noise with heavy tails, runs of missing readings."""
+    time, voltage, y = given
+    found = diagnose([Record("r", time + late, voltage, change(y))], effects=TABLE)
+    assert found.verdict == "adequate"
+    assert not found.doubt
+
+
+@pytest.mark.slow
+def test_a_voltage_with_the_other_sign_is_told(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    found = diagnose([Record("r", time, -voltage, y)], effects=TABLE)
+    assert found.verdict == "not_driven"
+    assert any("connected the other way round" in note for note in found.notes)
+    assert found.next_experiment.why.startswith("Correct the record")

@@ -42,6 +42,7 @@ def test_what_happened_in_a_gap_is_no_cause(whole: Record) -> None:
     assert "r: no sample for 1.005 s from 1.495 s on, while the voltage moves" in found.notes[-1]
 
 
+@pytest.mark.slow
 def test_parts_are_identified_together(whole: Record) -> None:
     found = identify([without(whole, (300, 500))])
     assert [e.record.n for e in found.experiments] == [300, 400]

@@ -88,7 +88,8 @@ def driven(
             " and no more with the other sign: check that both columns are of the same device and"
             " the same time.",
         )
-        return Driven(follows=False, notes=(*said, *notes))
+        quantity = doubtful_quantity(records)
+        return Driven(follows=False, notes=(*said, quantity) if quantity else said)
     return Driven(follows=True, notes=notes)
 
 

@@ -42,7 +42,6 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
-from psa_casadi.identification.start.other_quantities import doubtful_quantity
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
@@ -95,9 +94,8 @@ def conclude(
     beaten = weighed.beaten_by()
     gain = gain_of(experiments, first.predicted, last.predicted)
     partly = last.test.alarm and len(steps) > 1
-    other = doubtful_quantity([e.record for e in experiments])
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
-    doubt = unconfirmed(experiments, gain, whole=whole, partly=partly, hidden=hidden, other=other)
+    doubt = unconfirmed(experiments, gain, whole=whole, partly=partly, hidden=hidden)
     verdict: Verdict = (
         "not_driven"
         if not driven
@@ -263,7 +261,7 @@ _ADVICE = (
     " repeated step: rates separate delay, lag and creep; amplitudes separate asymmetry and memory;"
     " holds separate creep and drift; the repeat shows the noise."
 )
-_LONGER = "Record again, for longer and with the sensor in its range, so that more readings count."
+_AGAIN = "Correct the record, or record again, so that what the verdict says of it no longer holds."
 _COLUMNS = "Correct the record as the notes say, and diagnose it again."
 
 
@@ -273,7 +271,7 @@ def _next_experiment(
     if verdict == "not_driven":
         return NextExperiment(None, (), _COLUMNS)
     if doubted:
-        return NextExperiment(None, (), _LONGER)
+        return NextExperiment(None, (), _AGAIN)
     rivals = tuple(dict.fromkeys(n for c in causes for n in (c.effect, *c.cannot_be_told_from)))
     if verdict == "ambiguous":
         own = (causes[0].effect, *causes[0].cannot_be_told_from)

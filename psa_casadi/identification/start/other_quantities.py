@@ -14,6 +14,8 @@ from psa_casadi.units import FloatArray
 _FOLLOWS = 0.95
 #: A step over the range, between two samples, that is a wrap, and by how much wraps may differ.
 _STEP, _ALIKE = 0.5, 0.2
+#: Shares of the readings below whose voltage the sign is turned.
+_TURNS = np.arange(0.02, 0.99, 0.02)
 #: Fewest wraps.
 _WRAPS = 2
 
@@ -25,6 +27,10 @@ _WRAPPED = (
 _OTHER = (
     "Record '{}': the {} the displacement follows the voltage (correlation {:.3f}), the"
     " displacement itself does not ({:.3f}): the column may hold {} it."
+)
+_TURNED = (
+    "Record '{}': with its sign turned below {:.4g} V the displacement follows the voltage"
+    " (correlation {:.3f}), as it is it does not ({:.3f}): it may be rectified."
 )
 
 
@@ -57,16 +63,17 @@ def _wrapped(record: Record) -> str:
 
 
 def doubtful_quantity(records: Sequence[Record]) -> str:
-    """Say that the rate or the integral of a displacement follows the voltage in its place; or "".
+    """Say that a rate, an integral, or the sign turned below a voltage follows it better; else "".
 
-    A stack behind a lag that is long beside the voltage's changes looks so too.
+    A stack behind a lag that is long beside the voltage's changes looks so too. Nothing is said of
+    a record of which less than half is read: what it shows may follow the rate by itself.
     """
-    return next((s for r in records if (s := _rate_or_integral(r))), "")
+    return next((s for r in records if (s := _rate_or_integral(r) or _rectified(r))), "")
 
 
 def _rate_or_integral(record: Record) -> str:
     y, v = _readings(record)
-    if y.size < FEWEST_SAMPLES or abs(own := _correlation(y, v)) > _FOLLOWS:
+    if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
         return ""
     step = np.diff(record.time[record.mask])
     rate = _correlation(np.diff(y) / step, 0.5 * (v[1:] + v[:-1]))
@@ -79,6 +86,16 @@ def _rate_or_integral(record: Record) -> str:
     if abs(integral) > _FOLLOWS:
         return _OTHER.format(record.name, "integral of", integral, own, "the rate of")
     return ""
+
+
+def _rectified(record: Record) -> str:
+    """Say that a displacement follows the voltage where its sign is turned below one voltage."""
+    y, v = _readings(record)
+    if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
+        return ""
+    turned = [(abs(_correlation(np.where(v < u, -y, y), v)), u) for u in np.quantile(v, _TURNS)]
+    found, at = max(turned)
+    return _TURNED.format(record.name, at, found, own) if found > _FOLLOWS else ""
 
 
 def _readings(record: Record) -> tuple[FloatArray, FloatArray]:
