@@ -115,6 +115,16 @@ def test_what_a_person_says_of_a_record_stays_text() -> None:
     assert f"{name}, sha256" in read
 
 
+def test_a_file_is_no_folder_for_sets(tmp_path: Path) -> None:
+    place = tmp_path / "taken"
+    place.write_text("")
+    line = f"export fmu --stack demo -o {tmp_path / 'm.fmu'} --sets-to {place}"
+    said = CliRunner().invoke(app, line.split())  # ends before anything is compiled
+    assert said.exit_code != 0
+    assert not (tmp_path / "m.fmu").exists()
+    assert "name a folder for the parameter sets" in " ".join(said.output.split())
+
+
 @pytest.mark.slow
 def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) -> None:
     psa.save_model(evident_model(), tmp_path / "m.json")

@@ -89,6 +89,8 @@ def fmu(
 
     given = Given(effects)
     given.outputs({"--output": output}, [model])
+    if sets_to is not None and sets_to.exists() and not sets_to.is_dir():
+        given.add(f"{sets_to}: is a file; name a folder for the parameter sets.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
@@ -136,7 +138,7 @@ def write_sets(model: "Model", samples: int, folder: Path | None) -> int:
     from psa_casadi.files import atomic_write
 
     texts = set_files(model, samples)
-    if folder is not None:
+    if folder is not None and texts:
         folder.mkdir(parents=True, exist_ok=True)
         for place, text in texts.items():
             atomic_write(folder / place.rpartition("/")[2], text)
