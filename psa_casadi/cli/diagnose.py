@@ -196,7 +196,7 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
         return replace(d, next_experiment=replace(d.next_experiment, why=why))
     write_voltage(path, design.record)
     said = " ".join(sentences(design, d.model.values.get("C_p")))
-    why = f"Play {path} and diagnose all records together. {said} {same}".rstrip()
+    why = f"Apply {path} and diagnose all records together. {said} {same}".rstrip()
     following = NextExperiment(str(path), design.names, why, dict(design.chance))
     return replace(d, next_experiment=following)
 

@@ -35,8 +35,8 @@ MORE = 3
 #: Steps of a sensor over a record's range below which it is coarse, and what is said then.
 COARSE = 32
 COARSE_NOTE = (
-    "{}: the sensor resolves {:.0f} steps over the whole range. They are what the model's error is"
-    " made of: nothing that is smaller can be told from them."
+    "{}: the sensor resolves {:.0f} steps over the whole range. They make up the model's error:"
+    " nothing smaller can be distinguished from them."
 )
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."

@@ -257,7 +257,7 @@ def _remaining(r: Step, beyond: Excess) -> Remaining:
 
 
 _ADVICE = (
-    "Play a hold of several seconds, the same loop at three rates and at three amplitudes, and a"
+    "Record a hold of several seconds, the same loop at three rates and at three amplitudes, and a"
     " repeated step: rates separate delay, lag and creep; amplitudes separate asymmetry and memory;"
     " holds separate creep and drift; the repeat shows the noise."
 )

@@ -1,9 +1,9 @@
-"""A triangle leaves two causes open; the designed record of the same length tells them apart.
+"""A triangle leaves two causes open; the designed record of the same length separates them.
 
-A stack's gain grows with the field, which a triangle cannot tell from a bent sensor: every loop is
-the same. Three further records of the same length and the same range of voltages are played to the
-simulated device, with noise: a sine, a triangle again, and the one that `psa design experiment`
-designs, which comes to its levels by different ways.
+A stack's gain grows with the field. A triangle cannot distinguish that from a bent sensor: every
+loop is the same. Three further records of the same length and the same range of voltages are
+simulated, with noise: a sine, a triangle again, and the one that `psa design experiment` designs,
+which comes to its levels by different ways.
 """
 
 from pathlib import Path
@@ -54,7 +54,7 @@ def measured(record: Record, seed: int) -> Record:
 
 
 def said(d: Diagnosis) -> str:
-    """Return what a diagnosis names, with what it cannot tell it from."""
+    """Return what a diagnosis names, with what cannot be distinguished from it."""
     names = [n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)]
     return " or ".join(names) or d.verdict
 
