@@ -190,6 +190,7 @@ class Diagnosis(Reported):
         return {
             "format": FORMAT,
             "verdict": self.verdict,
+            "doubt": self.doubt,
             "causes": [asdict(c) for c in self.causes],
             "candidates": [asdict(c) for c in self.candidates],
             "errors": {
