@@ -71,10 +71,19 @@ def test_meta_data_and_page_say_the_same() -> None:
     assert entries["temperature"] == ["not recorded"]
     row = [float(v) for v in entries["covariance.A"][0].split()]
     assert row == list(model.evidence.covariance.matrix[1])
-    for keyword in ("record", "held-out error", "voltage", "duration"):
+    assert re.fullmatch(r"[\d.]+ N/V, standard error [\d.e-]+", entries["k_L"][0])
+    for keyword in ("record", "held-out error", "voltage", "duration", "k_L"):
         assert entries[keyword][0] in page
     assert all(link in ("index.html",) for link in re.findall(r'href="([^"]*)"', page))
     assert "../documentation/evidence.html" in found["documentation/index.html"].decode()
+
+
+def test_meta_data_say_who_publishes_the_model() -> None:
+    by = psa.Publication(author="A. N. Other", version="2.1", license="CC BY 4.0")
+    root = ET.fromstring(files.meta_data(replace(evident_model(), publication=by)))
+    assert {n: root.attrib[n] for n in ("author", "fileversion", "license", "version")} == {
+        "author": "A. N. Other", "fileversion": "2.1", "license": "CC BY 4.0", "version": "1.0.0",
+    }  # fmt: skip
 
 
 def test_parameter_sets_are_as_their_schema_has_them() -> None:

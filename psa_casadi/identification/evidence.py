@@ -18,6 +18,7 @@ from psa_casadi.model.evidence import (
     SeenRange,
 )
 from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.quality.runs import runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
@@ -87,7 +88,7 @@ def _runs(
                 averaged=factor,
                 fitted_m=_rms(errors[e.used]),
                 held_out_m=_rms(errors[e.held_out]) if held else None,
-                held_out=_stretches(e.held_out),
+                held_out=tuple(zip(*(k.tolist() for k in runs_of(e.held_out)), strict=True)),
             )
         )
     return tuple(runs)
@@ -106,12 +107,6 @@ def _shown(model: Model, record: Record, x0: FloatArray) -> float:
     inputs = record_inputs(model, record, 1)[0]
     y = np.array(model.structure.f(0.0, x0, inputs, model.parameter_vector())[1]).ravel()
     return float(y[model.output_names.index(OUTPUT)])
-
-
-def _stretches(mask: npt.NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
-    """Return [first, stop) of every run of True."""
-    edges = np.flatnonzero(np.diff(np.r_[False, mask, False])).tolist()
-    return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _factor(record: Record, sampled: Record) -> int:

@@ -118,8 +118,9 @@ def _seen(evidence: Evidence) -> Iterator[Said]:
 def _sure(model: Model, c: Covariance) -> Iterator[Said]:
     """Yield the standard errors, and the covariance row by row."""
     for k, name in enumerate(c.names):
-        p = model.parameter(name)
-        yield Said(name, f"{model.values[name]:.6g} +- {c.matrix[k][k] ** 0.5:.3g} {p.unit}")
+        unit = model.parameter(name).unit
+        value = f"{model.values[name]:.6g}{'' if unit == '1' else f' {unit}'}"
+        yield Said(name, f"{value}, standard error {c.matrix[k][k] ** 0.5:.3g}")
     if c.names:
         yield Said("covariance of", " ".join(c.names))
         for name, row in zip(c.names, c.matrix, strict=True):
