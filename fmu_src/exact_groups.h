@@ -108,7 +108,7 @@ static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int 
 }
 
 /* The states at a node, by Hermite's cubic over the way of the leg on which it lies */
-static void group_node(psa_state *state, psa_trial *trial, int g, int n, double theta) {
+static void group_node(psa_trial *trial, int g, int n, double theta) {
     psa_stages *const stages = trial->stages + g;
     const int u = ex_linear[ex_group_driver[g]];
     real basis[2][4];
@@ -306,8 +306,8 @@ static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
         }
     }
     find_drift(state, trial, g, slopes);
-    group_node(state, trial, g, HALF, 0.5);
-    group_node(state, trial, g, QUARTER, 0.25);
+    group_node(trial, g, HALF, 0.5);
+    group_node(trial, g, QUARTER, 0.25);
 }
 
 #endif
