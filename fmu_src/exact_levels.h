@@ -25,6 +25,7 @@
 #include "exact_math.h"
 
 #define NL EX_NL
+#define LINE 64 /* bytes of a cache line: a vector that lies across two is dearer */
 #define NV (2 * EX_NU + 1 + 3 * EX_NPORT) /* vectors beside F: a_1, a_2, c_1, q_1, q_2, q_3 */
 #define TAYLOR 12                         /* terms; enough to 1e-17 where |M d| <= 1/4 */
 #define SMALL 0.25
@@ -43,7 +44,12 @@ typedef struct {
 /* Rows of L by blocks of one vector, the last ones 0; with lanes a row is a vector already */
 #define BLOCKS ((NL + COLUMNS - 1) / COLUMNS)
 #define ROWS EX_ROWS
-#define ROWS_OF(array, b) (((column *)(array))[b])
+#if PSA_LANES == 1
+typedef double rows __attribute__((vector_size(32), aligned(8)));
+#else
+typedef real rows;
+#endif
+#define ROWS_OF(array, b) (((rows *)(array))[b])
 
 /* What a step of one length needs. Of its whole: F, a_1, a_2, c_1, and each port's weights of its values at the
    start, the half and the end, by columns. Of its half and its quarter: the same (a_2 over the step's whole
@@ -185,6 +191,21 @@ typedef struct {
     int depth;          /* levels below h that are there */
     psa_block *blocks;  /* [depth + 1][EX_NCH + 1][count + 1] */
 } psa_ladder;
+
+/* Zeroed memory that begins with a cache line, NULL where there is none; what is before it says what to free */
+static void *lined(size_t size) {
+    char *const memory = calloc(1, size + 2 * LINE);
+    if (!memory) return NULL;
+    char *const begin = memory + LINE + (LINE - (uintptr_t)memory % LINE) % LINE;
+    memcpy(begin - sizeof memory, &memory, sizeof memory);
+    return begin;
+}
+
+static void free_lined(void *begin) {
+    char *memory = NULL;
+    if (begin) memcpy(&memory, (char *)begin - sizeof memory, sizeof memory);
+    free(memory);
+}
 
 static const psa_block *rung(const psa_ladder *ladder, int level) {
     const size_t each = (size_t)(EX_NCH + 1) * (size_t)(ladder->count + 1);

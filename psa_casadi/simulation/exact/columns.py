@@ -77,7 +77,7 @@ def _product(reach: npt.NDArray[np.bool_], rows: Sequence[int], linear: Sequence
         inside = place - len(linear)
         factors = [
             (f"f[{j} * EX_ROWS + {i}]" if inside < 0 else f"half[{inside}][{j}]", j)
-            for j in np.flatnonzero(reach[i])
+            for j in np.flatnonzero(reach[i]).tolist()
         ]
         terms = [f"x[{linear[i]}]", *(f"{q} * x[{linear[j]}]" for q, j in factors)]
         lines.append(f"    out[{place}] = {' + '.join(terms)};")
