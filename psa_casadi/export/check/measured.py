@@ -31,7 +31,7 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 _DIRECTIONAL_LIMIT = 1e-5
 _ADJOINT_LIMIT = 1e-10
 _EQUATION_LIMIT = 1e-9
-_LINE_LIMIT = 0.1
+_LINE_LIMIT = 0.05
 
 #: The name of a check that begins now, or the row of the one that began last.
 Progress = Iterator[str | CheckRow]
