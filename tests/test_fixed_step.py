@@ -110,7 +110,7 @@ def test_slow_ramps_are_not_lost_in_single_precision() -> None:
         found = fixed_step(model, name="stack", step=STEP, precision=precision, substeps=1)
         gains.append(np.diff(play(found, voltage)[[5000, -1]])[0])
     assert gains[0] > 2e-8
-    assert gains[1] == pytest.approx(gains[0], rel=0.02)
+    assert gains[1] == pytest.approx(gains[0], rel=0.05)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

@@ -73,11 +73,5 @@ def test_a_cortex_m4_gives_the_same_displacement_at_constant_cost(
     host = Probe(plan, texts(precision)).play(u)[:, model.output_names.index("displacement")]
     assert np.ptp(host) > 5e-6
     assert np.max(np.abs(found - host)) <= LIMITS[precision] * np.ptp(host)
-    print(
-        precision,
-        instructions.mean(),
-        instructions.max(),
-        np.max(np.abs(found - host)) / np.ptp(host),
-    )
     assert instructions.max() <= 1.5 * instructions.mean()
     assert 500 < instructions.mean() < (120_000 if precision == "double" else 5_000)
