@@ -1,6 +1,5 @@
 """`psa export c`: a model as two files of C for a controller."""
 
-import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -75,7 +74,7 @@ def c(
     quiet: Quiet = False,
 ) -> None:
     """Write a model as C99 for a controller: a step of fixed length and constant cost."""
-    from psa_casadi.cli.inputs import Given
+    from psa_casadi.cli.inputs import Given, step_seconds
     from psa_casadi.export.fixed_step.export import export_c
     from psa_casadi.report.words.tables import Table
 
@@ -105,22 +104,3 @@ def c(
     rows = tuple((e.voltage, f"{e.error:.1e}") for e in found.errors)
     show_table(Table(("voltage", "largest error over the range"), rows), quiet)
     tell_written(found.header, found.source, quiet=quiet)
-
-
-def step_seconds(text: str) -> float:
-    """Return the time [s] of a step that is given as a number with a unit, s where it has none.
-
-    Raises InputError for anything else.
-    """
-    from psa_casadi.errors import InputError
-    from psa_casadi.units import parse_unit, to_si, units_of
-
-    found = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
-    try:
-        number = float(found["number"]) if found else 0.0
-    except ValueError:
-        found = None
-    unit = parse_unit(found["unit"] or "s", "time").name if found else ""
-    if unit not in units_of("time"):
-        raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
-    return float(to_si(number, unit))

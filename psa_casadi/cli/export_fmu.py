@@ -35,6 +35,13 @@ class FmiVersion(StrEnum):
     THREE = "3"
 
 
+class Solver(StrEnum):
+    """Ways through a communication step."""
+
+    ADAPTIVE = "adaptive"
+    FIXED = "fixed"
+
+
 def fmu(
     output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
@@ -44,6 +51,12 @@ def fmu(
     platforms: Annotated[
         str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
     ] = "host",
+    solver: Annotated[
+        Solver, typer.Option(help="adaptive: to a tolerance; fixed: steps of constant cost.")
+    ] = Solver.ADAPTIVE,
+    step: Annotated[
+        str | None, typer.Option(help="Time of a fixed step with its unit, such as 10us.")
+    ] = None,
     name: Annotated[
         str | None, typer.Option(help="Model identifier, a C name; by default the model's name.")
     ] = None,
@@ -71,6 +84,7 @@ def fmu(
     given.outputs({"--output": output}, [model])
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
+    seconds = given.fixed_step(step, wanted=solver is Solver.FIXED)
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     chosen = given.published(
@@ -88,6 +102,7 @@ def fmu(
             include_sensor=include_sensor,
             platforms=wanted,
             fmi=int(fmi),
+            step=seconds,
         )
     kept = chosen if include_sensor else chosen.plant()
     inside = ", ".join(c.name for c in kept.components)

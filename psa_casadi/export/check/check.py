@@ -31,6 +31,7 @@ from psa_casadi.export.check.rows import CheckRow, count
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
 from psa_casadi.export.check.termination import cleaned_up
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
+from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
 from psa_casadi.model.compose import Model
@@ -80,7 +81,7 @@ def check_fmu(
     open to the code. An archive that would leave its folder, has links, is damaged or a bomb is not
     unpacked, and nothing of it runs.
 
-    Raises InputError if the file is no FMU.
+    Raises InputError if the file is no FMU, or one with a fixed step.
     """
     path = Path(path)
     rows = _archive_rows(path)
@@ -88,6 +89,13 @@ def check_fmu(
         return CheckReport(path, tuple(rows), compared=False)
     chosen: list[Model] = [model] if model else []
     with cleaned_up(), Archive(path) as archive:
+        step = fixed_step_of(archive.directory)
+        if step is not None:
+            raise InputError(
+                f"{path}: this FMU takes fixed steps of {step:g} s; `psa check` knows FMUs with the"
+                " adaptive solver only. Its error was measured at export, and its description tells"
+                " it."
+            )
         carried = (archive.directory / MODEL_ENTRY).is_file()
         with started(_INTEGRATOR if model or carried else ()) as process:
             rows += _described(archive, chosen, tuple(effects))

@@ -9,14 +9,21 @@ from pathlib import Path
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
+from psa_casadi.export.fixed_step.planning import fixed_step
 from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.fmu.fixed import fixed_description, fixed_sources
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
 from psa_casadi.export.fmu.reference_results import reference_entries
-from psa_casadi.export.fmu.sources import compiled_files, export_token, source_files
+from psa_casadi.export.fmu.sources import (
+    compiled_files,
+    export_token,
+    source_files,
+    token_of,
+)
 from psa_casadi.export.fmu.terminals import terminal_entries
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
@@ -38,6 +45,7 @@ def export_fmu(
     include_sensor: bool = False,
     platforms: Sequence[str] = ("host",),
     fmi: int = 2,
+    step: float | None = None,
 ) -> Path:
     """Write a model as an FMU (co-simulation and model exchange) and return its path.
 
@@ -46,8 +54,12 @@ def export_fmu(
     model's name. `platforms` are names of `PLATFORMS`, "host" or "all". The same model gives the
     same bytes. The file is written whole or not at all.
 
-    Raises InputError for an impossible name, an unknown platform or version, or a model without
-    states, and MachineError if a compiler fails.
+    With a `step` [s] the FMU is for co-simulation only and takes steps of this fixed length and of
+    constant cost, as `export_c` writes them: communication steps are multiples of it and parameters
+    are constants. The description tells the error that was measured.
+
+    Raises InputError for an impossible name, an unknown platform or version, a model without
+    states, or one that does not fit a fixed step, and MachineError if a compiler fails.
     """
     identifier = name or model.name
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
@@ -58,9 +70,17 @@ def export_fmu(
         raise InputError(f"FMI {fmi} is not known; choose 2 (FMI 2.0) or 3 (FMI 3.0).")
     targets = chosen_platforms(platforms)
     exported = model if include_sensor else model.plant()
-    token = export_token(exported, identifier, fmi)
-    texts = source_files(exported, identifier, token, fmi)
-    xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+    if step is None:
+        token = export_token(exported, identifier, fmi)
+        texts = source_files(exported, identifier, token, fmi)
+        xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+    else:
+        fixed = fixed_step(exported, name=identifier, step=step)
+        bare = fixed_sources(source_files(exported, identifier, "", fmi), fixed)
+        token = token_of(exported, identifier, bare, fmi)
+        texts = fixed_sources(source_files(exported, identifier, token, fmi), fixed)
+        ordinary = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+        xml = fixed_description(ordinary, fixed)
     entries = {"modelDescription.xml": xml.encode("utf-8"), **_companions(exported, fmi)}
     entries |= {f"sources/{n}": t.encode("utf-8") for n, t in texts.items()}
     for target in targets:
