@@ -286,8 +286,12 @@ static psa_result advance(psa_instance *instance, psa_end end) {
     const psa_status status = run_solver(instance);
     remember_inputs(state, begin);
     psa_arrive(instance);
+#ifdef PSA_FIXED_STEP
+    (void)steps, (void)rejected; /* the sentence would take as long as the step */
+#else
     psa_whisper(instance, "Step from %.9g s to %.9g s: %ld solver steps, %ld rejected.", begin, solver->t,
             (long)(solver->steps - steps), (long)(solver->rejected - rejected));
+#endif
     if (status == PSA_OK) return PSA_FINE;
     state->phase = PSA_STEP_FAILED;
     state->last.kind = PSA_STEP_BROKEN;

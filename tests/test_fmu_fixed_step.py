@@ -15,6 +15,7 @@ from psa_casadi.cli.app import app
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.export.fixed_step.probe import VOLTAGES
+from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.importer.calls import CO_SIMULATION
 from psa_casadi.export.importer.fmu import Fmu, FmuError
@@ -127,7 +128,10 @@ def test_the_description_says_what_it_is(fmi: int, tmp_path: Path) -> None:
     assert list(validate_fmu(str(path))) == []
     with zipfile.ZipFile(path) as archive:
         root = ET.fromstring(archive.read("modelDescription.xml"))
+        page = archive.read(DOCUMENTATION_ENTRY)
         archive.extractall(tmp_path / "unpacked")
+    assert b"A communication step is a multiple of it" in page
+    assert b"Parameters are tunable" not in page
     assert root.find("ModelExchange") is None
     assert "fixed step of 1e-05 s" in root.attrib["description"]
     stepping, variables = root.find("CoSimulation"), root.find("ModelVariables")

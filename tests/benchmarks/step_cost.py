@@ -14,8 +14,10 @@ import numpy.typing as npt
 
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fixed_step.export import export_c
+from psa_casadi.export.fixed_step.planning import fixed_step
 from psa_casadi.export.fixed_step.probe import VOLTAGES
-from psa_casadi.export.fmu.sources import export_token, write_sources
+from psa_casadi.export.fmu.fixed import fixed_sources
+from psa_casadi.export.fmu.sources import compiled_files, export_token, source_files
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.words.tables import Table
@@ -38,20 +40,30 @@ def voltage(model: Model) -> FloatArray:
     return np.asarray(model.values["u_rated"] * np.concatenate(parts))
 
 
-def measured(model: Model, repetitions: int) -> FloatArray:
-    """Return the time [ns] of every step, (1000, 2): of the generated code and of the FMU."""
+def measured(model: Model, repetitions: int, *, fixed: bool) -> FloatArray:
+    """Return the time [ns] of every step, (1000, 2): of the generated code and of an FMU.
+
+    The FMU is the ordinary one, or the one with a `fixed` step.
+    """
     table = {v.name: k for k, v in enumerate(variable_table(model))}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         export_c(model, folder, step=STEP, name="stack", substeps=1)
-        sources = [p.name for p in write_sources(model, folder) if p.suffix == ".c"]
+        token = export_token(model, model.name)
+        texts = source_files(model, model.name, token)
+        if fixed:
+            step = fixed_step(model, name="stack", step=STEP, substeps=1)
+            texts = fixed_sources(texts, step)
+        for file, text in texts.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        sources = compiled_files(texts)
         headers = Path(fmpy.__file__).parent / "c-code"
         command = [*compiler_command(), *OPTIMISE, "-I.", f"-I{headers}"]
         files = [str(_SOURCE), "stack.c", *sources, "-lm", "-o", "step_cost"]
         run_compiler([*command, *files], folder)
         given = [str(repetitions), str(table["voltage"]), str(table["displacement"])]
         done = subprocess.run(
-            [str(folder / "step_cost"), export_token(model, model.name), *given],
+            [str(folder / "step_cost"), token, *given],
             input="\n".join(map(repr, voltage(model).tolist())),
             capture_output=True, text=True, check=True,
         )  # fmt: skip
@@ -61,10 +73,16 @@ def measured(model: Model, repetitions: int) -> FloatArray:
 def cost_table(progress: Progress, *, quick: bool) -> TitledTable:
     """Return mean, worst and their ratio for a stack."""
     progress("cost of a step")
-    cost = measured(stack_model("P-885.51").plant(), 50 if quick else 400)
+    model, repetitions = stack_model("P-885.51").plant(), 50 if quick else 400
+    ordinary, fixed = (measured(model, repetitions, fixed=f).T for f in (False, True))
+    ways = {
+        "psa export c": ordinary[0],
+        "psa export fmu --solver fixed": fixed[1],
+        "psa export fmu": ordinary[1],
+    }
     rows = tuple(
         (name, f"{c.mean():.0f}", f"{c.max():.0f}", f"{c.max() / c.mean():.2f}")
-        for name, c in zip(("psa export c", "psa export fmu"), cost.T, strict=True)
+        for name, c in ways.items()
     )
     return TitledTable(
         f"cost of a step of {1e6 * STEP:g} us, P-885.51: ramps, holds, tones and jumps",

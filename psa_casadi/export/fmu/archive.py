@@ -9,11 +9,11 @@ from pathlib import Path
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
-from psa_casadi.export.fixed_step.planning import fixed_step
+from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
 from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.fmu.fixed import fixed_description, fixed_sources
+from psa_casadi.export.fmu.fixed import fixed_description, fixed_sources, use_of
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
@@ -70,6 +70,7 @@ def export_fmu(
         raise InputError(f"FMI {fmi} is not known; choose 2 (FMI 2.0) or 3 (FMI 3.0).")
     targets = chosen_platforms(platforms)
     exported = model if include_sensor else model.plant()
+    fixed = None
     if step is None:
         token = export_token(exported, identifier, fmi)
         texts = source_files(exported, identifier, token, fmi)
@@ -81,7 +82,7 @@ def export_fmu(
         texts = fixed_sources(source_files(exported, identifier, token, fmi), fixed)
         ordinary = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
         xml = fixed_description(ordinary, fixed)
-    entries = {"modelDescription.xml": xml.encode("utf-8"), **_companions(exported, fmi)}
+    entries = {"modelDescription.xml": xml.encode("utf-8"), **_companions(exported, fmi, fixed)}
     entries |= {f"sources/{n}": t.encode("utf-8") for n, t in texts.items()}
     for target in targets:
         folder = target.binaries(fmi)
@@ -93,16 +94,21 @@ def export_fmu(
     return Path(path)
 
 
-def _companions(model: Model, fmi: int) -> dict[str, bytes]:
+def _companions(model: Model, fmi: int, fixed: FixedStep | None) -> dict[str, bytes]:
     """Return what is beside description, sources and binaries: for people and for other tools.
 
-    A model that cannot be simulated with its own values is exported without a reference run.
+    A model that cannot be simulated with its own values is exported without a reference run, and so
+    is one with a fixed step, which takes neither the run's parameters nor any step of its rows.
     """
     try:
         entries, step = reference_entries(model), held_step(model)
     except SimulationError:
         entries, step = {}, None
-    page = documentation(model, reference_run=bool(entries), step=step)
+    if fixed is not None:
+        entries = {}
+        page = documentation(model, reference_run=False, step=step, use=use_of(fixed))
+    else:
+        page = documentation(model, reference_run=bool(entries), step=step)
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
     entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])

@@ -83,11 +83,14 @@ common: enter event mode at a jump, or leave the option at 0. Between 0 and 1 th
 slope counts. Model exchange knows no steps and ignores the option."""
 
 
-def documentation(model: Model, *, reference_run: bool = True, step: HeldStep | None = None) -> str:
+def documentation(
+    model: Model, *, reference_run: bool = True, step: HeldStep | None = None, use: str = _USE
+) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
     `reference_run` says whether the archive holds one, with its notes; `step` is the communication
-    step that was measured on it. Raises InputError for a character that HTML cannot carry.
+    step that was measured on it, `use` tells how the FMU integrates. Raises InputError for a
+    character that HTML cannot carry.
     """
     table = variable_table(model)
     name = html.escape(model.name)
@@ -100,7 +103,7 @@ def documentation(model: Model, *, reference_run: bool = True, step: HeldStep | 
         *(f"<p>{html.escape(note)}</p>" for note in model.provenance.notes),
         _publication(model),
         "<h2>Use</h2>",
-        f"<p>{_USE}</p>",
+        f"<p>{html.escape(use)}</p>",
         f"<p>{_INPUTS}</p>" if model.input_names else "",
         _sampling(model, table),
         _step(step),

@@ -11,6 +11,7 @@ from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import number, xml_text
 from psa_casadi.export.fixed_step.planning import FixedStep
+from psa_casadi.export.fixed_step.probe import STEPS, shown_output
 from psa_casadi.export.fixed_step.source import function_code
 
 _HEADER, _SOURCE = "fmi_config.h", "fmi_data.c"
@@ -48,6 +49,18 @@ def fixed_description(xml: str, fixed: FixedStep) -> str:
         experiment.set("stepSize", number(steps * step))
     _constants(root, third=third)
     return xml_text(root)
+
+
+def use_of(fixed: FixedStep) -> str:
+    """Return what the page of the FMU says of its steps."""
+    found = ", ".join(f"{e.voltage} {e.error:.1e}" for e in fixed.errors)
+    output = shown_output(fixed.plan.model)
+    return (
+        f"Co-simulation takes steps of {fixed.plan.step:g} s: the same operations each time,"
+        " without iteration or allocation. A communication step is a multiple of it; another one is"
+        " an error. Parameters are constants, for whose values the step was made. Largest errors of"
+        f" {output} over its range, measured at export on voltages of {STEPS} steps: {found}."
+    )
 
 
 def fixed_step_of(directory: Path) -> float | None:
