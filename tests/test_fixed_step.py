@@ -89,6 +89,7 @@ def test_held_inputs_are_those_of_a_zero_order_hold() -> None:
     assert errors(base(hold="zero")) != errors(base())
 
 
+@slow
 def test_single_precision_rests_in_a_hold() -> None:
     """Half a second of rest after a ramp, where a rounded rate would go on for ever."""
     ramp = np.linspace(0.0, 87.3, 2000)
@@ -98,6 +99,7 @@ def test_single_precision_rests_in_a_hold() -> None:
     assert np.ptp(single[-10_000:]) <= 1e-6 * np.ptp(single)
 
 
+@slow
 def test_slow_ramps_are_not_lost_in_single_precision() -> None:
     """A step of the ramp is a third of what the precision resolves of the voltage.
 

@@ -1,5 +1,6 @@
 """FMUs with a fixed step: results, communication steps, states, parameters, description."""
 
+import json
 import zipfile
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.export.fixed_step.probe import VOLTAGES
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
+from psa_casadi.export.fmu.fixed import FIXED_ENTRY
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.importer.calls import CO_SIMULATION
 from psa_casadi.export.importer.fmu import Fmu, FmuError
@@ -41,7 +43,7 @@ def exported(fmi: int) -> Fmu:
 
 def signals(*, held: bool = False) -> Signals:
     share = np.linspace(0.0, 1.0, SAMPLES)
-    times = STEP * np.arange(SAMPLES)
+    times = STEP * np.arange(SAMPLES, dtype=np.float64)
     return Signals(("voltage",), times, 100.0 * VOLTAGES["tones"][1](share)[:, None], held)
 
 
@@ -172,3 +174,8 @@ def test_the_command_wants_both_options_or_neither(tmp_path: Path) -> None:
         assert not (tmp_path / "fixed.fmu").exists()
     done = CliRunner().invoke(app, [*base, "--solver", "fixed", "--step", "10us"])
     assert done.exit_code == 0, done.output
+    assert "step: 1e-05 s, 1 substep, double precision" in done.output
+    with zipfile.ZipFile(tmp_path / "fixed.fmu") as archive:
+        told = json.loads(archive.read(FIXED_ENTRY))
+    assert set(told["errors"]) == set(VOLTAGES)
+    assert all(f"{error:.1e}" in done.output for error in told["errors"].values())

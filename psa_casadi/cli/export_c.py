@@ -1,8 +1,9 @@
 """`psa export c`: a model as two files of C for a controller."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,6 +25,9 @@ from psa_casadi.cli.screen import (
     tell_written,
     working,
 )
+
+if TYPE_CHECKING:
+    from psa_casadi.report.words.tables import Table
 
 
 class PrecisionName(StrEnum):
@@ -76,7 +80,6 @@ def c(
     """Write a model as C99 for a controller: a step of fixed length and constant cost."""
     from psa_casadi.cli.inputs import Given, step_seconds
     from psa_casadi.export.fixed_step.export import export_c
-    from psa_casadi.report.words.tables import Table
 
     given = Given(effects)
     seconds = given.attempt(lambda: step_seconds(step))
@@ -99,8 +102,20 @@ def c(
     left_out = [q.name for q in chosen.components if q not in kept.components]
     if left_out:
         show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
-    each = "1 substep" if found.substeps == 1 else f"{found.substeps} substeps"
-    show(f"step: {seconds:g} s, {each}, {precision.value} precision", quiet)
-    rows = tuple((e.voltage, f"{e.error:.1e}") for e in found.errors)
-    show_table(Table(("voltage", "largest error over the range"), rows), quiet)
+    show(step_words(seconds, found.substeps, precision.value), quiet)
+    show_table(error_table({e.voltage: e.error for e in found.errors}), quiet)
     tell_written(found.header, found.source, quiet=quiet)
+
+
+def step_words(step: float, substeps: int, precision: str) -> str:
+    """Say what a fixed step is."""
+    each = "1 substep" if substeps == 1 else f"{substeps} substeps"
+    return f"step: {step:g} s, {each}, {precision} precision"
+
+
+def error_table(errors: Mapping[str, float]) -> "Table":
+    """Return a table of the errors of a fixed step by reference voltage."""
+    from psa_casadi.report.words.tables import Table
+
+    rows = tuple((voltage, f"{error:.1e}") for voltage, error in errors.items())
+    return Table(("voltage", "largest error over the range"), rows)

@@ -1,5 +1,7 @@
 """`psa export fmu`: a model as an FMU."""
 
+import json
+import zipfile
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,6 +22,7 @@ from psa_casadi.cli.screen import (
     StartVoltageOption,
     SweepOption,
     show,
+    show_table,
     tell_written,
     working,
 )
@@ -75,8 +78,10 @@ def fmu(
     quiet: Quiet = False,
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
+    from psa_casadi.cli.export_c import error_table, step_words
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu.archive import export_fmu
+    from psa_casadi.export.fmu.fixed import FIXED_ENTRY
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
@@ -112,6 +117,11 @@ def fmu(
         show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
     show(f"start: {start_words(kept)}", quiet)
+    if seconds is not None:
+        with zipfile.ZipFile(output) as archive:
+            fixed = json.loads(archive.read(FIXED_ENTRY))
+        show(step_words(seconds, fixed["substeps"], "double"), quiet)
+        show_table(error_table(fixed["errors"]), quiet)
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"

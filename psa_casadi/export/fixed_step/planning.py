@@ -119,12 +119,13 @@ def _planned(model: Model, wish: _Wish) -> tuple[CodePlan, str]:
     if not blamed:
         raise InputError(
             f"The model '{model.name}' has no step of fixed length and constant cost: {found}."
+            " Export an FMU with the adaptive solver."
         )
     who = " or ".join(f"'{name}'" for name in blamed)
     raise InputError(
         f"The effect {who} does not fit a step of fixed length and constant cost: with it the"
         f" model is not of the form that is needed ({found}). Leave the effect out, or export an"
-        " FMU with its own solver."
+        " FMU with the adaptive solver."
     )
 
 

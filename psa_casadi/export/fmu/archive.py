@@ -13,7 +13,13 @@ from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
 from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.fmu.fixed import fixed_description, fixed_sources, use_of
+from psa_casadi.export.fmu.fixed import (
+    FIXED_ENTRY,
+    fixed_description,
+    fixed_entry,
+    fixed_sources,
+    use_of,
+)
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
@@ -105,7 +111,7 @@ def _companions(model: Model, fmi: int, fixed: FixedStep | None) -> dict[str, by
     except SimulationError:
         entries, step = {}, None
     if fixed is not None:
-        entries = {}
+        entries = {FIXED_ENTRY: fixed_entry(fixed)}
         page = documentation(model, reference_run=False, step=step, use=use_of(fixed))
     else:
         page = documentation(model, reference_run=bool(entries), step=step)

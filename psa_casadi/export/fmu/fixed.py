@@ -4,6 +4,7 @@ Sources and description are those of the ordinary FMU, changed where the step is
 constants, as the step is made for their values, and there is no model exchange.
 """
 
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,8 @@ from psa_casadi.export.fixed_step.planning import FixedStep
 from psa_casadi.export.fixed_step.probe import STEPS, shown_output
 from psa_casadi.export.fixed_step.source import function_code
 
+#: Where an FMU carries the step [s], its substeps and the measured errors by voltage.
+FIXED_ENTRY = "resources/fixed_step.json"
 _HEADER, _SOURCE = "fmi_config.h", "fmi_data.c"
 
 
@@ -49,6 +52,13 @@ def fixed_description(xml: str, fixed: FixedStep) -> str:
         experiment.set("stepSize", number(steps * step))
     _constants(root, third=third)
     return xml_text(root)
+
+
+def fixed_entry(fixed: FixedStep) -> bytes:
+    """Return the text of `FIXED_ENTRY`; errors have two digits, as they have elsewhere."""
+    errors = {e.voltage: float(f"{e.error:.1e}") for e in fixed.errors}
+    content = {"step": fixed.plan.step, "substeps": fixed.plan.substeps, "errors": errors}
+    return (json.dumps(content, indent=2) + "\n").encode("utf-8")
 
 
 def use_of(fixed: FixedStep) -> str:
