@@ -48,6 +48,12 @@ typedef struct {
 extern const psa_range psa_seen[PSA_NU + 1]; /* of each input */
 extern const double psa_seen_duration;
 
+#ifdef PSA_FIXED_STEP
+/* One step of PSA_FIXED_STEP [s] from time t: the states after it. The inputs u change by `change` over it;
+   the parameters are those at export. */
+void psa_fixed_step(double t, double *x, const double *u, const double *change);
+#endif
+
 /* Derivative of (x', y, z) along a direction (dt, dx, du, dp) at the point (t, x, u, p): exact, by
    automatic differentiation. A result that is NULL is left out. */
 int psa_model_directional(double t, const double *x, const double *u, const double *p, double dt,

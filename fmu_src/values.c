@@ -89,6 +89,11 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
     if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT &&
         v->kind != PSA_PARAMETER && v->kind != PSA_OPTION)
         return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be set.", v->name);
+#ifdef PSA_FIXED_STEP
+    if (v->kind == PSA_PARAMETER)
+        return psa_say(instance, PSA_ERROR, "'%s' is constant: the fixed step was made for its value.",
+                       v->name);
+#endif
     if (value < v->low || value > v->high)
         return psa_say(instance, PSA_ERROR, "'%s' cannot be set to %.9g: it must be at %s %.9g.", v->name,
                        value, value < v->low ? "least" : "most", value < v->low ? v->low : v->high);

@@ -1,9 +1,9 @@
 """`psa export c`: a model as two files of C for a controller."""
 
-import re
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,6 +25,9 @@ from psa_casadi.cli.screen import (
     tell_written,
     working,
 )
+
+if TYPE_CHECKING:
+    from psa_casadi.report.words.tables import Table
 
 
 class PrecisionName(StrEnum):
@@ -75,9 +78,8 @@ def c(
     quiet: Quiet = False,
 ) -> None:
     """Write a model as C99 for a controller: a step of fixed length and constant cost."""
-    from psa_casadi.cli.inputs import Given
+    from psa_casadi.cli.inputs import Given, step_seconds
     from psa_casadi.export.fixed_step.export import export_c
-    from psa_casadi.report.words.tables import Table
 
     given = Given(effects)
     seconds = given.attempt(lambda: step_seconds(step))
@@ -100,27 +102,20 @@ def c(
     left_out = [q.name for q in chosen.components if q not in kept.components]
     if left_out:
         show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
-    each = "1 substep" if found.substeps == 1 else f"{found.substeps} substeps"
-    show(f"step: {seconds:g} s, {each}, {precision.value} precision", quiet)
-    rows = tuple((e.voltage, f"{e.error:.1e}") for e in found.errors)
-    show_table(Table(("voltage", "largest error over the range"), rows), quiet)
+    show(step_words(seconds, found.substeps, precision.value), quiet)
+    show_table(error_table({e.voltage: e.error for e in found.errors}), quiet)
     tell_written(found.header, found.source, quiet=quiet)
 
 
-def step_seconds(text: str) -> float:
-    """Return the time [s] of a step that is given as a number with a unit, s where it has none.
+def step_words(step: float, substeps: int, precision: str) -> str:
+    """Say what a fixed step is."""
+    each = "1 substep" if substeps == 1 else f"{substeps} substeps"
+    return f"step: {step:g} s, {each}, {precision} precision"
 
-    Raises InputError for anything else.
-    """
-    from psa_casadi.errors import InputError
-    from psa_casadi.units import parse_unit, to_si, units_of
 
-    found = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
-    try:
-        number = float(found["number"]) if found else 0.0
-    except ValueError:
-        found = None
-    unit = parse_unit(found["unit"] or "s", "time").name if found else ""
-    if unit not in units_of("time"):
-        raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
-    return float(to_si(number, unit))
+def error_table(errors: Mapping[str, float]) -> "Table":
+    """Return a table of the errors of a fixed step by reference voltage."""
+    from psa_casadi.report.words.tables import Table
+
+    rows = tuple((voltage, f"{error:.1e}") for voltage, error in errors.items())
+    return Table(("voltage", "largest error over the range"), rows)

@@ -1,5 +1,7 @@
 """`psa export fmu`: a model as an FMU."""
 
+import json
+import zipfile
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,6 +22,7 @@ from psa_casadi.cli.screen import (
     StartVoltageOption,
     SweepOption,
     show,
+    show_table,
     tell_written,
     working,
 )
@@ -35,6 +38,13 @@ class FmiVersion(StrEnum):
     THREE = "3"
 
 
+class Solver(StrEnum):
+    """Ways through a communication step."""
+
+    ADAPTIVE = "adaptive"
+    FIXED = "fixed"
+
+
 def fmu(
     output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
@@ -44,6 +54,12 @@ def fmu(
     platforms: Annotated[
         str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
     ] = "host",
+    solver: Annotated[
+        Solver, typer.Option(help="adaptive: to a tolerance; fixed: steps of constant cost.")
+    ] = Solver.ADAPTIVE,
+    step: Annotated[
+        str | None, typer.Option(help="Time of a fixed step with its unit, such as 10us.")
+    ] = None,
     name: Annotated[
         str | None, typer.Option(help="Model identifier, a C name; by default the model's name.")
     ] = None,
@@ -82,8 +98,10 @@ def fmu(
     quiet: Quiet = False,
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
+    from psa_casadi.cli.export_c import error_table, step_words
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu.archive import export_fmu
+    from psa_casadi.export.fmu.fixed import FIXED_ENTRY
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
@@ -93,6 +111,7 @@ def fmu(
         given.add(f"{sets_to}: is a file; name a folder for the parameter sets.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
+    seconds = given.fixed_step(step, wanted=solver is Solver.FIXED)
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     chosen = given.published(
@@ -112,6 +131,7 @@ def fmu(
             fmi=int(fmi),
             parameter_sets=parameter_sets,
             validity_output=validity_output,
+            step=seconds,
         )
     kept = chosen if include_sensor else chosen.plant()
     sets = write_sets(kept, parameter_sets, sets_to)
@@ -123,6 +143,11 @@ def fmu(
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
     show(f"start: {start_words(kept)}", quiet)
     show(f"evidence: {evidence_words(kept, sets)}", quiet)
+    if seconds is not None:
+        with zipfile.ZipFile(output) as archive:
+            fixed = json.loads(archive.read(FIXED_ENTRY))
+        show(step_words(seconds, fixed["substeps"], "double"), quiet)
+        show_table(error_table(fixed["errors"]), quiet)
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"

@@ -1,6 +1,7 @@
 """What a command is given, checked as a whole before any long work starts."""
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,6 +19,7 @@ from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.column_map import parse_columns
 from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.simulation.history import settled_at
+from psa_casadi.units import parse_unit, to_si, units_of
 
 T = TypeVar("T")
 
@@ -146,6 +148,12 @@ class Given:
             self.add(f"{option} is '{text}'; give {what} with commas between, such as 150,0.")
             return ()
 
+    def fixed_step(self, text: str | None, *, wanted: bool) -> float | None:
+        """Return the time [s] of a fixed step, where one is wanted."""
+        if wanted != (text is not None):
+            self.add("--solver fixed and --step belong together; give both or neither.")
+        return self.attempt(lambda: step_seconds(text)) if text is not None and wanted else None
+
     def started(
         self, model: Model | None, voltage: float | None, history: str | None, **durations: float
     ) -> Model | None:
@@ -204,3 +212,19 @@ class Given:
                 f"{path}: cannot write, {path.resolve().parent} may not be written to; choose"
                 " another place."
             )
+
+
+def step_seconds(text: str) -> float:
+    """Return the time [s] of a step that is given as a number with a unit, s where it has none.
+
+    Raises InputError for anything else.
+    """
+    found = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
+    try:
+        number = float(found["number"]) if found else 0.0
+    except ValueError:
+        found = None
+    unit = parse_unit(found["unit"] or "s", "time").name if found else ""
+    if unit not in units_of("time"):
+        raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
+    return float(to_si(number, unit))

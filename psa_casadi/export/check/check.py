@@ -33,6 +33,7 @@ from psa_casadi.export.check.process import started
 from psa_casadi.export.check.rows import CheckRow, count
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
+from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
@@ -90,7 +91,7 @@ def check_fmu(
     open to the code. An archive that would leave its folder, has links, is damaged or a bomb is not
     unpacked, and nothing of it runs.
 
-    Raises InputError if the file is no FMU.
+    Raises InputError if the file is no FMU, or one with a fixed step.
     """
     path = Path(path)
     rows = _archive_rows(path)
@@ -98,6 +99,13 @@ def check_fmu(
         return CheckReport(path, tuple(rows), compared=False)
     chosen: list[Model] = [model] if model else []
     with requests_to_end_answered(), Archive(path) as archive:
+        step = fixed_step_of(archive.directory)
+        if step is not None:
+            raise InputError(
+                f"{path}: this FMU takes fixed steps of {step:g} s; `psa check` knows FMUs with the"
+                " adaptive solver only. Its error was measured at export, and its description tells"
+                " it."
+            )
         carried = (archive.directory / MODEL_ENTRY).is_file()
         with started(_INTEGRATOR if model or carried else ()) as process:
             rows += _described(archive, chosen, tuple(effects))

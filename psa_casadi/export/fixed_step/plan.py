@@ -10,9 +10,12 @@ from psa_casadi.export.fixed_step.expressions import Precision
 from psa_casadi.export.fixed_step.step import StepExpression
 from psa_casadi.model.compose import Model
 
-_KEYWORDS = set(
-    ["auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while"]  # fmt: skip
-)
+#: Words that C keeps for itself.
+_KEYWORDS = """
+    auto break case char const continue default do double else enum extern float for goto if inline
+    int long register restrict return short signed sizeof static struct switch typedef union
+    unsigned void volatile while
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,7 @@ def check_names(plan: CodePlan) -> None:
     own += [f"low_of_{q.name}" for q in s.states]
     own += [f"port_of_{q}" for q in plan.expression.port_names]
     names = [q.name for table in (s.states, s.inputs, s.outputs) for q in table]
-    wrong = sorted({n for n in names if n in _KEYWORDS or n in own})
+    wrong = sorted({n for n in names if n in _KEYWORDS.split() or n in own})
     if wrong:
         raise InputError(
             f"{', '.join(wrong)} cannot name a field in C, where it is a keyword or taken; rename"

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.errors import InputError
 from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
 from psa_casadi.export.fixed_step.header import header_code
@@ -112,16 +113,19 @@ def _planned(model: Model, wish: _Wish) -> tuple[CodePlan, str]:
     if not isinstance(found, str):
         check_names(found[0])
         return found
-    blamed = [c.name for c in model.components if _fits_without(model, c.name, wish)]
+    own = {c.name for c in (*BASE, *SIMPLIFIED)}
+    without = [c.name for c in model.components if _fits_without(model, c.name, wish)]
+    blamed = [name for name in without if name not in own]
     if not blamed:
         raise InputError(
             f"The model '{model.name}' has no step of fixed length and constant cost: {found}."
+            " Export an FMU with the adaptive solver."
         )
     who = " or ".join(f"'{name}'" for name in blamed)
     raise InputError(
         f"The effect {who} does not fit a step of fixed length and constant cost: with it the"
         f" model is not of the form that is needed ({found}). Leave the effect out, or export an"
-        " FMU with its own solver."
+        " FMU with the adaptive solver."
     )
 
 

@@ -53,17 +53,16 @@ class VoltageError:
 
 
 def played_inputs(model: Model, shape: FloatArray) -> FloatArray:
-    """Return inputs (n, nu) from their start values: the voltage, or the first one, takes a shape.
+    """Return inputs (n, nu): the voltage takes a shape, or all inputs of a model without one.
 
-    Shapes go from 0 to 1; the input goes from its start to its usual size.
+    Shapes go from 0 to 1; an input goes from its start value to its usual size.
     """
     s = model.structure
     u = np.tile([q.start for q in s.inputs], (len(shape), 1))
-    if s.inputs:
-        names = model.input_names
-        place = names.index("voltage") if "voltage" in names else 0
-        full = nominal_value(s.inputs[place].nominal, model.values)
-        u[:, place] += (full - s.inputs[place].start) * shape
+    for place, declared in enumerate(s.inputs):
+        if declared.name == "voltage" or "voltage" not in model.input_names:
+            full = nominal_value(declared.nominal, model.values)
+            u[:, place] += (full - declared.start) * shape
     return u
 
 
@@ -112,7 +111,7 @@ def errors(plan: CodePlan, texts: dict[str, str]) -> tuple[VoltageError, ...]:
         true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
         # held inputs hold from the instant on that they are given for
         own = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
-        size = float(np.ptp(true)) or 1.0
+        size = float(np.ptp(true)) or float(model.output_nominals()[output])
         worst = float(np.max(np.abs(own - true))) / size
         found.append(VoltageError(name, worst if np.isfinite(worst) else float("inf")))
     return tuple(found)

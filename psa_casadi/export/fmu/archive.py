@@ -10,15 +10,28 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
 from psa_casadi.export.common.posterior import SAMPLES
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
+from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
 from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.evidence_files import META_DATA, PAGE, EvidenceFiles, evidence_files
+from psa_casadi.export.fmu.fixed import (
+    FIXED_ENTRY,
+    fixed_description,
+    fixed_entry,
+    fixed_sources,
+    use_of,
+)
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
 from psa_casadi.export.fmu.reference_results import reference_entries
-from psa_casadi.export.fmu.sources import compiled_files, export_token, source_files
+from psa_casadi.export.fmu.sources import (
+    compiled_files,
+    export_token,
+    source_files,
+    token_of,
+)
 from psa_casadi.export.fmu.terminals import terminal_entries
 from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.files import atomic_path
@@ -43,6 +56,7 @@ def export_fmu(
     fmi: int = 2,
     parameter_sets: int = SAMPLES,
     validity_output: bool = False,
+    step: float | None = None,
 ) -> Path:
     """Write a model as an FMU (co-simulation and model exchange) and return its path.
 
@@ -56,8 +70,12 @@ def export_fmu(
     their mean and sigma points (0: none of them). `validity_output` adds the output
     `outside_validity`, which tells how far a run has left what the records have shown.
 
-    Raises InputError for an impossible name, an unknown platform or version, or a model without
-    states, and MachineError if a compiler fails.
+    With a `step` [s] the FMU is for co-simulation only and takes steps of this fixed length and of
+    constant cost, as `export_c` writes them: communication steps are multiples of it and parameters
+    are constants. The description tells the error that was measured.
+
+    Raises InputError for an impossible name, an unknown platform or version, a model without
+    states, or one that does not fit a fixed step, and MachineError if a compiler fails.
     """
     identifier = name or model.name
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
@@ -70,12 +88,21 @@ def export_fmu(
     exported = model if include_sensor else model.plant()
     if validity_output:
         exported = with_validity(exported)
-    token = export_token(exported, identifier, fmi)
-    texts = source_files(exported, identifier, token, fmi)
-    xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+    fixed = None
+    if step is None:
+        token = export_token(exported, identifier, fmi)
+        texts = source_files(exported, identifier, token, fmi)
+        xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+    else:
+        fixed = fixed_step(exported, name=identifier, step=step)
+        bare = fixed_sources(source_files(exported, identifier, "", fmi), fixed)
+        token = token_of(exported, identifier, bare, fmi)
+        texts = fixed_sources(source_files(exported, identifier, token, fmi), fixed)
+        ordinary = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+        xml = fixed_description(ordinary, fixed)
     entries = {
         "modelDescription.xml": xml.encode("utf-8"),
-        **_companions(exported, fmi, parameter_sets),
+        **_companions(exported, fmi, parameter_sets, fixed),
     }
     entries |= {f"sources/{n}": t.encode("utf-8") for n, t in texts.items()}
     for target in targets:
@@ -88,10 +115,11 @@ def export_fmu(
     return Path(path)
 
 
-def _companions(model: Model, fmi: int, samples: int) -> dict[str, bytes]:
+def _companions(model: Model, fmi: int, samples: int, fixed: FixedStep | None) -> dict[str, bytes]:
     """Return what is beside description, sources and binaries: for people and for other tools.
 
-    A model that cannot be simulated with its own values is exported without a reference run.
+    A model that cannot be simulated with its own values is exported without a reference run, and so
+    is one with a fixed step, which takes neither the run's parameters nor any step of its rows.
     """
     evidence = EvidenceFiles()
     try:
@@ -99,9 +127,13 @@ def _companions(model: Model, fmi: int, samples: int) -> dict[str, bytes]:
         entries, step = reference_entries(model, evidence.related), held_step(model)
     except SimulationError:
         entries, step = {}, None
-    more = {n: evidence.related[n].meaning for n in (PAGE, META_DATA) if n in evidence.related}
-    page = documentation(model, reference_run=bool(entries), step=step, more=more)
-    entries |= evidence.entries
+    if fixed is not None:
+        entries = {FIXED_ENTRY: fixed_entry(fixed)}
+        page = documentation(model, reference_run=False, step=step, use=use_of(fixed))
+    else:
+        more = {n: evidence.related[n].meaning for n in (PAGE, META_DATA) if n in evidence.related}
+        page = documentation(model, reference_run=bool(entries), step=step, more=more)
+        entries |= evidence.entries
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
     entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])

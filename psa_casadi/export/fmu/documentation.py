@@ -77,11 +77,13 @@ def documentation(
     reference_run: bool = True,
     step: HeldStep | None = None,
     more: Mapping[str, str] | None = None,
+    use: str = _USE,
 ) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
     `reference_run` says whether the archive holds one, with its notes; `step` is the communication
     step that was measured on it. `more` are further files to name: what they are, by their place.
+    `use` tells how the FMU integrates.
     Raises InputError for a character that HTML cannot carry.
     """
     table = variable_table(model)
@@ -95,7 +97,7 @@ def documentation(
         *(f"<p>{html.escape(note)}</p>" for note in model.provenance.notes),
         _publication(model),
         "<h2>Use</h2>",
-        f"<p>{_USE}</p>",
+        f"<p>{html.escape(use)}</p>",
         f"<p>{_INPUTS}</p>" if model.input_names else "",
         _sampling(model, table),
         _step(step),
