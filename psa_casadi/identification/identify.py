@@ -12,7 +12,8 @@ from psa_casadi.identification.certainty.determinacy import Determinacy, assumed
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
-from psa_casadi.identification.search.refitting import Progress, record_rms, refit
+from psa_casadi.identification.search.refitting import Progress, record_rms, refit, relevelled
+from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.doubts import (
     doubtful_sign,
     doubtful_time,
@@ -110,8 +111,10 @@ def identify(
     ready = [prepared(r) for r in given_records]
     fitted = [r for r, _ in ready]
     refuse_few(given_records, fitted, [s for _, said in ready for s in said])
-    experiments = tuple(whole(r) for r in fitted)
     start, given = chosen_start(fitted, model, stiffness)
+    columns = columns_of(start, fitted)
+    start = columns.model
+    experiments = with_levels([whole(r) for r in fitted], columns.fitted)
     linear = None
     if model is None:
         progress("starting values from the records")
@@ -123,7 +126,8 @@ def identify(
         thorough=True,
         progress=progress,
     )
-    best = _with_own_levels(found.best, experiments, progress)
+    best, experiments = relevelled(found.best, experiments)
+    best = _with_own_levels(best, experiments, progress)
     if best.interrupted:
         current_work().wrap_up()
     determined = determinacy(
@@ -146,7 +150,7 @@ def identify(
         experiments=experiments,
         warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
-        sentences=tuple(s for _, said in ready for s in said),
+        sentences=(*(s for _, said in ready for s in said), *columns.left_out),
         combinations=open_ones,
         advice=advised or (),
         interrupted=advised is None,

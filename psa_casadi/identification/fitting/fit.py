@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.further import Further, further_of, scaled
 from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum, minimise
 from psa_casadi.identification.fitting.prediction import (
     Prediction,
@@ -44,7 +45,8 @@ class Fit:
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
-    each record was run and how accurately; it is empty after an interrupt.
+    each record was run and how accurately; it is empty after an interrupt. `further` are the fits of
+    the columns beside the displacement.
     """
 
     model: Model
@@ -59,6 +61,7 @@ class Fit:
     evaluations: int
     way: Way
     simulated: tuple[Simulated, ...]
+    further: tuple[Further, ...] = ()
 
     def __repr__(self) -> str:
         """Return what was fitted and what it leaves, in one line."""
@@ -136,6 +139,7 @@ def fit(
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
+    Of the displacement and of the experiments' `further` columns, each by its own level.
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
     those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
@@ -156,8 +160,10 @@ def fit(
     linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
     effort = _Effort(tolerance, evaluations, goal, linear)
     minimum, way, told = _minimum(model, experiments, unknowns, weights, theta, sigma, rtol, effort)
+    further = further_of(model, experiments, unknowns, minimum.theta, way=way)
+    found, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
-        model=model.with_values(unknowns.values(minimum.theta)),
+        model=found,
         unknowns=unknowns,
         theta=minimum.theta,
         residuals=-minimum.residual[: len(weights)] * weights,
@@ -169,6 +175,7 @@ def fit(
         evaluations=minimum.evaluations,
         way=way,
         simulated=tuple(told),
+        further=further,
     )
 
 
@@ -245,7 +252,10 @@ def objective(
     weights: FloatArray,
     way: Way,
 ) -> Evaluate:
-    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian."""
+    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian.
+
+    Those of the displacement, then those of the further columns.
+    """
     target = np.concatenate([measured(e.record)[e.used] for e in experiments])
     used = [e.used[: e.stop] for e in experiments]
     prior = 1.0 / unknowns.prior
@@ -253,12 +263,17 @@ def objective(
     def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         try:
             parts = predict(model, experiments, unknowns, theta, way=way)
+            beside = further_of(model, experiments, unknowns, theta, way=way)
         except PsaError:
             return None
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
         j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
-        residual = np.concatenate([(y - target) / weights, theta * prior])
-        jacobian = np.vstack([j / weights[:, None], np.diag(prior)])
+        residual = np.concatenate(
+            [(y - target) / weights, *(-b.residuals / b.level for b in beside), theta * prior]
+        )
+        jacobian = np.vstack(
+            [j / weights[:, None], *(b.jacobian / b.level for b in beside), np.diag(prior)]
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             finite = np.isfinite(residual @ residual + np.sum(jacobian**2))
         return (residual, jacobian) if finite else None

@@ -58,14 +58,16 @@ def predict_record(
     *,
     stop: int,
     rtol: float,
+    output: str = OUTPUT,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacement (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
+    """Return an output (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
 
     `start` holds deviations of the initial states from where the first inputs and their rates put
     them, in the states' units. Time counts from the record's first sample. `rtol` is the tolerance
     of a step.
     """
-    found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
+    way = Way(rtol, rtol)
+    found = trace_record(model, record, start, wanted, stop=stop, way=way, output=output)
     count = len(wanted)
     return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
 
@@ -78,8 +80,9 @@ def trace_record(
     *,
     stop: int,
     way: Way,
+    output: str = OUTPUT,
 ) -> Traced:
-    """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
+    """Return one output (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
     names = model.state_names
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
     memories = memory_names(model.structure)
@@ -101,7 +104,7 @@ def trace_record(
         u,
         x0,
         way=way,
-        output=OUTPUT,
+        output=output,
         unknowns=unknowns,
         s0=s0,
         steps_limit=_STEPS,
@@ -140,6 +143,33 @@ def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
     }
 
 
+def traced_by_theta(
+    model: Model,
+    record: Record,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    index: int,
+    *,
+    stop: int,
+    way: Way,
+    slopes: FloatArray,
+    output: str = OUTPUT,
+) -> tuple[FloatArray, FloatArray, str]:
+    """Return an output (stop,) of one record, its derivative by theta, and the way it was run.
+
+    Without the sensor's offset. `slopes` are `unknowns.slopes(theta)`.
+    """
+    current = model.with_values(unknowns.values(theta))
+    start = unknowns.start(theta, index)
+    found = trace_record(
+        current, record, start, unknowns.names, stop=stop, way=way, output=output
+    )
+    count = len(unknowns.names)
+    jacobian = found.sensitivity[:, count:] @ unknowns.place_slopes(theta, index)[0]
+    jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
+    return found.output, jacobian, found.way
+
+
 def predict(
     model: Model,
     experiments: Sequence[Experiment],
@@ -153,26 +183,16 @@ def predict(
 
     Records are simulated side by side.
     """
-    current = model.with_values(unknowns.values(theta))
     slopes = unknowns.slopes(theta)
 
     def one(index: int) -> Prediction:
         experiment = experiments[index]
         stop = experiment.record.n if everything else experiment.stop
-        found = trace_record(
-            current,
-            experiment.record,
-            unknowns.start(theta, index),
-            unknowns.names,
-            stop=stop,
-            way=way,
+        x, jacobian, way_taken = traced_by_theta(
+            model, experiment.record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
         )
-        start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
-        count = len(unknowns.names)
-        jacobian = found.sensitivity[:, count:] @ start_slopes
-        jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
-        jacobian += offset_slopes
-        return Prediction(found.output + unknowns.offset(theta, index), jacobian, found.way)
+        jacobian += unknowns.place_slopes(theta, index)[1]
+        return Prediction(x + unknowns.offset(theta, index), jacobian, way_taken)
 
     return side_by_side(one, range(len(experiments)))
 

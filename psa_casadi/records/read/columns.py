@@ -29,6 +29,10 @@ COLUMNS: dict[str, Column] = {
         Column("load_force", ("force",), "load_force [N]"),
         Column("current", ("current",), "current [mA]"),
         Column("temperature", ("temperature",), "temperature [degC]"),
+        Column("monitor_voltage", ("voltage",), "monitor_voltage [V]"),
+        Column("charge", ("charge",), "charge [uC]"),
+        Column("displacement_2", ("length",), "displacement_2 [um]"),
+        Column("strain", ("ratio",), "strain [ppm]"),
     )
 }
 
@@ -53,7 +57,10 @@ class Source:
 ColumnMap = Mapping[str, Source]
 
 #: Where nobody names a unit, a column is taken to be in this one; a displacement never is.
-SI_UNITS = {"time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K"}
+SI_UNITS = {
+    "time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K",
+    "monitor_voltage": "V", "charge": "C", "strain": "1",
+}  # fmt: skip
 
 _HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 

@@ -1,0 +1,136 @@
+"""What each further column of the records decided: the search with it against one without it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.judgement import told_from
+from psa_casadi.diagnosis.result import Decision
+from psa_casadi.diagnosis.screening.evidence import further_gains
+from psa_casadi.diagnosis.search.steps import Step
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.identification.fitting.further import COLUMNS
+from psa_casadi.records.split import Experiment
+
+#: What the places are called that effects belong to.
+PLACES = {
+    "drive": "the amplifier",
+    "sensor": "the sensor",
+    "plant": "the stack",
+    "environment": "the surroundings",
+}
+#: Probability below which an effect is no rival.
+_RIVAL = 0.01
+LOAD = "load_force"
+
+
+def measured_load(experiments: Sequence[Experiment]) -> bool:
+    """Whether the load on the stack is measured in every record."""
+    return all(e.record.load_force is not None for e in experiments)
+
+
+def without_column(experiments: Sequence[Experiment], column: str) -> tuple[Experiment, ...]:
+    """Return the experiments as if a column had not been measured."""
+    return tuple(
+        replace(
+            e,
+            record=replace(e.record, **{column: None}),
+            further=tuple(q for q in e.further if q.column != column),
+        )
+        for e in experiments
+    )
+
+
+def decisions(
+    steps: Sequence[Step],
+    task: Task,
+    table: Sequence[Component],
+    search: Callable[[Task], Sequence[Step]],
+) -> tuple[Decision, ...]:
+    """Return what every fitted column, and a measured load, decided.
+
+    `table` are all effects, `search` finds the steps of a task. Each column costs a search.
+    """
+    experiments = task.experiments
+    columns = [q.column for q in experiments[0].further]
+    if measured_load(experiments):
+        columns.append(LOAD)
+    found = []
+    for column in columns:
+        task.progress(f"the same without {column}")
+        effects = task.table
+        if column == LOAD:
+            effects = tuple(e for e in table if e in effects or e.measured_by == LOAD)
+        alone = replace(
+            task,
+            experiments=without_column(experiments, column),
+            table=effects,
+            keep=lambda _: None,
+        )
+        found.append(_decision(column, steps, search(alone), effects))
+    return tuple(found)
+
+
+def _decision(
+    column: str, steps: Sequence[Step], before: Sequence[Step], table: Sequence[Component]
+) -> Decision:
+    first, last = steps[0].view.of, steps[-1].view.of
+    now, then = _named(steps), _named(before)
+    k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
+    gained = further_gains(first.fit, last.fit, steps[-1].screening.colour).get(column, 0.0)
+    ruled_out = tuple(n for n in then if n not in now)
+    return Decision(
+        column=column,
+        role="input" if k is None else "output",
+        unit="N" if k is None else COLUMNS[column].unit,
+        noise=None if k is None else steps[-1].screening.colour.further[k].rms,
+        base_rms=None if k is None else first.held_further[k],
+        extended_rms=None if k is None else last.held_further[k],
+        named=now,
+        named_without=then,
+        ruled_out=ruled_out,
+        evidence=gained,
+        sentence=_sentence(column, now, then, gained, {e.name: e for e in table}),
+    )
+
+
+def _named(steps: Sequence[Step]) -> dict[str, float]:
+    """Return the named set of every cause, with the probability of each effect."""
+    found: dict[str, float] = {}
+    for step in steps:
+        if step.chosen is None:
+            continue
+        for name in (step.cause.name, *told_from(step)):
+            if step.probability.get(name, 0.0) >= _RIVAL:
+                found.setdefault(name, step.probability[name])
+    return found
+
+
+def _sentence(
+    column: str,
+    now: Mapping[str, float],
+    then: Mapping[str, float],
+    gained: float,
+    table: Mapping[str, Component],
+) -> str:
+    if not now and not then:
+        return f"{column} agrees with the model: with it as without it nothing is missing."
+    gone, new = [n for n in then if n not in now], [n for n in now if n not in then]
+    if not gone and not new:
+        return (
+            f"{column} changes no name; it adds {gained:.0f} to the ln of the Bayes factor of what"
+            " is named."
+        )
+    left = _joined(now) if now else "the base model, which leaves nothing"
+    if not gone:
+        return f"Only with {column} is there {_joined(new)}; without it {_joined(then)}."
+    places = {table[n].belongs_to for n in gone if n in table}
+    kept = {table[n].belongs_to for n in now if n in table}
+    ruled = " and ".join(PLACES[p] for p in PLACES if p in places - kept)
+    what = f"{ruled} is ruled out" if ruled else f"{_joined(gone)} is ruled out"
+    before = ", ".join(f"{n} {100 * then[n]:.0f} %" for n in then)
+    return f"With {column} {what}: what is left is {left} (without it: {before})."
+
+
+def _joined(names: Sequence[str] | Mapping[str, float]) -> str:
+    return " or ".join(names) or "nothing is named"
