@@ -10,7 +10,7 @@ from psa_casadi.diagnosis.screening.evidence import further_gains
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.identification.fitting.further import COLUMNS
-from psa_casadi.records.split import Experiment
+from psa_casadi.identification.search.measured_load import LOAD, is_measured, without_column
 
 #: What the places are called that effects belong to.
 PLACES = {
@@ -21,24 +21,6 @@ PLACES = {
 }
 #: Probability below which an effect is no rival.
 _RIVAL = 0.01
-LOAD = "load_force"
-
-
-def measured_load(experiments: Sequence[Experiment]) -> bool:
-    """Whether the load on the stack is measured in every record."""
-    return all(e.record.load_force is not None for e in experiments)
-
-
-def without_column(experiments: Sequence[Experiment], column: str) -> tuple[Experiment, ...]:
-    """Return the experiments as if a column had not been measured."""
-    return tuple(
-        replace(
-            e,
-            record=replace(e.record, **{column: None}),
-            further=tuple(q for q in e.further if q.column != column),
-        )
-        for e in experiments
-    )
 
 
 def decisions(
@@ -53,7 +35,7 @@ def decisions(
     """
     experiments = task.experiments
     columns = [q.column for q in experiments[0].further]
-    if measured_load(experiments):
+    if is_measured(experiments):
         columns.append(LOAD)
     found = []
     for column in columns:

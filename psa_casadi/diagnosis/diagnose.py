@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.columns import LOAD, decisions, measured_load
+from psa_casadi.diagnosis.columns import decisions
 from psa_casadi.diagnosis.driven import driven
 from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
@@ -15,6 +15,7 @@ from psa_casadi.diagnosis.thresholds import using
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished
+from psa_casadi.identification.search.measured_load import LOAD, is_measured, loads_as_curves
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress, relevelled
 from psa_casadi.identification.start.columns import columns_of, with_levels
@@ -112,8 +113,11 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
 def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     """Diagnose from where the base fit starts; the task's `keep` gets the best fit so far."""
     experiments, table, progress = task.experiments, task.table, task.progress
-    table = tuple(e for e in table if not (e.measured_by == LOAD and measured_load(experiments)))
-    every, task = task.table, replace(task, table=table)
+    every = table
+    if is_measured(experiments):
+        table = tuple(e for e in table if e.measured_by != LOAD)
+        experiments = loads_as_curves(start, experiments, progress)
+        task = replace(task, table=table, experiments=experiments)
     base, task = _base(start, task)
     experiments, stuck = without_stuck_readings(task.experiments, base)
     if stuck:
@@ -165,7 +169,8 @@ def _search(base: Fit, task: Task) -> list[Step]:
 
 
 def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:
-    """Whether a record has the columns that an effect follows (a temperature)."""
-    return all(
+    """Whether a record has the columns that an effect follows (a temperature) or needs."""
+    columns = [n for n in effect.needs_column if any(n == q.column for q in experiments[0].further)]
+    return bool(columns or not effect.needs_column) and all(
         any(getattr(e.record, i.name, None) is not None for e in experiments) for i in effect.inputs
     )

@@ -11,6 +11,7 @@ from psa_casadi.identification.certainty.combinations import Combination, free_c
 from psa_casadi.identification.certainty.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.search.measured_load import loads_as_curves
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
 from psa_casadi.identification.search.refitting import Progress, record_rms, refit, relevelled
 from psa_casadi.identification.start.columns import columns_of, with_levels
@@ -115,6 +116,7 @@ def identify(
     columns = columns_of(start, fitted)
     start = columns.model
     experiments = with_levels([whole(r) for r in fitted], columns.fitted)
+    experiments = loads_as_curves(start, experiments, progress)
     linear = None
     if model is None:
         progress("starting values from the records")

@@ -1,0 +1,102 @@
+"""Records with a column beside the displacement: monitor, charge, second sensor, load cell.
+
+The stack is the one of `make.py` with one hidden effect; every further column has a scale, a zero
+and white noise of its own. `amplifier` and `capacitance` are hidden here alone, as only such
+columns show them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from psa_casadi.records.record import Record
+from tests.plants.base import Run, simulate_base
+from tests.plants.excitations import ExcitationKind, draw_excitation
+from tests.plants.load_stiffness import balance
+from tests.plants.rerun import fine_command, follow
+from tests.plants.sensor_nonlinearity import bend as bent
+from tests.plants.stack import FloatArray, draw_stack
+from tests.plants.table import HIDDEN_EFFECTS
+
+#: Noise of the displacement over its range, and of a further column over its own.
+NOISE, FURTHER_NOISE = 1e-3, 2e-3
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What happens in truth at the samples (N,): displacement, its reading, voltage, load, charge.
+
+    SI units; `load` is the force on the tip, `charge` that on the electrodes.
+    """
+
+    run: Run
+    displacement: FloatArray
+    reading: FloatArray
+    voltage: FloatArray
+    load: FloatArray
+    charge: FloatArray
+
+    def record(self, seed: int, *columns: str, samples: int | None = None) -> Record:
+        """Return the record with noise, and with these further columns."""
+        rng = np.random.default_rng(seed)
+        given = {
+            "monitor_voltage": 0.01 * self.voltage + 0.003,
+            "charge": self.charge + 2e-6,
+            "current": np.gradient(self.charge, self.run.times),
+            "displacement_2": 0.83 * self.displacement - 3e-6,
+            "strain": 55.0 * self.displacement + 1e-5,
+            "load_force": self.load,
+        }
+        read = self.reading + NOISE * np.ptp(self.reading) * rng.standard_normal(self.reading.size)
+        noisy: Mapping[str, FloatArray] = {
+            n: x + FURTHER_NOISE * (np.ptp(x) or 1.0) * rng.standard_normal(x.size)
+            for n, x in given.items()
+        }
+        beside = {n: x for n, x in noisy.items() if n in columns}
+        whole = Record("stack", self.run.times, self.run.command, read, **beside)
+        return whole if samples is None else whole.slice(0, samples)
+
+
+def plain(seed: int, excitation: ExcitationKind = "rich") -> Truth:
+    """Return a stack without any effect, and with a straight load of a twentieth of its stiffness.
+
+    The base of all others.
+    """
+    rng = np.random.default_rng(seed)
+    stack = draw_stack(rng)
+    run = simulate_base(stack, *draw_excitation(rng, excitation, stack.u_rated))
+    x, u = run.displacement, run.path.voltage[:: run.sub_intervals]
+    load = -0.05 * x / stack.compliance
+    # reciprocity: a displacement frees the charge k_L x
+    return Truth(run, x, x, u, load, stack.c_p_el * u + stack.k_l * x)
+
+
+def bent_sensor(truth: Truth, gain: float) -> Truth:
+    """An S-shaped characteristic of the first displacement sensor."""
+    x, span = truth.displacement, float(np.ptp(truth.displacement))
+    centre = float(x.min()) + 0.4 * span
+    return replace(truth, reading=x + gain * span * bent(x, centre, span, 1.9))
+
+
+def stiffening_load(truth: Truth, gain: float) -> Truth:
+    """A spring that hardens, in the place of the straight one."""
+    x = balance(truth.displacement, 0.45 * float(np.ptp(truth.displacement)), gain)
+    load = -(truth.displacement - x) / truth.run.stack.compliance
+    return replace(truth, displacement=x, reading=x, load=load)
+
+
+def soft_amplifier(truth: Truth, gain: float) -> Truth:
+    """An amplifier whose gain falls: v -> (V/g) ln(1 + g v/V)."""
+    run, top = truth.run, float(truth.run.command.max())
+    moved = follow(run, top / gain * np.log1p(gain * fine_command(run) / top))
+    x, u = moved.displacement, moved.path.voltage[:: run.sub_intervals]
+    charge = run.stack.c_p_el * u + run.stack.k_l * x
+    return replace(truth, displacement=x, reading=x, voltage=u, charge=charge)
+
+
+def saturating_stack(truth: Truth, gain: float) -> Truth:
+    """Strain that saturates: `saturation_of_strain`, between the two of its sharpnesses."""
+    added = HIDDEN_EFFECTS["saturation_of_strain"].contribution(truth.run, {"p": 1.9}, gain)
+    x = truth.displacement + added
+    return replace(truth, displacement=x, reading=x)
