@@ -95,23 +95,35 @@ def _sentence(
     gained: float,
     table: Mapping[str, Component],
 ) -> str:
-    if not now and not then:
-        return f"{column} agrees with the model: with it as without it nothing is missing."
+    """Say in words what a column decided, from what is named with it and without it."""
+    before = ", ".join(f"{n} {100 * p:.0f} %" for n, p in then.items())
     gone, new = [n for n in then if n not in now], [n for n in now if n not in then]
+    if not now and not then:
+        return f"{column} agrees with the model: with it as without it nothing is named."
     if not gone and not new:
+        return f"{column} changes no name; it adds {gained:.0f} to the ln of the Bayes factor."
+    held = [n for n in gone if n in table and table[n].measured_by == column]
+    if held and not now:
         return (
-            f"{column} changes no name; it adds {gained:.0f} to the ln of the Bayes factor of what"
-            " is named."
+            f"{column} explains by itself what without it is named ({before}): {held[0]} is in the"
+            " column."
         )
-    left = _joined(now) if now else "the base model, which leaves nothing"
     if not gone:
         return f"Only with {column} is there {_joined(new)}; without it {_joined(then)}."
-    places = {table[n].belongs_to for n in gone if n in table}
+    if not now:
+        return f"With {column} nothing is named; without it {before}."
     kept = {table[n].belongs_to for n in now if n in table}
-    ruled = " and ".join(PLACES[p] for p in PLACES if p in places - kept)
-    what = f"{ruled} is ruled out" if ruled else f"{_joined(gone)} is ruled out"
-    before = ", ".join(f"{n} {100 * then[n]:.0f} %" for n in then)
-    return f"With {column} {what}: what is left is {left} (without it: {before})."
+    places = [p for p in PLACES if p not in kept and any(_of(table, n) == p for n in gone)]
+    ruled = [PLACES[p] for p in places] or gone
+    verb = "is" if len(ruled) == 1 else "are"
+    return (
+        f"With {column} {' and '.join(ruled)} {verb} ruled out: what is left is {_joined(now)}"
+        f" (without it: {before})."
+    )
+
+
+def _of(table: Mapping[str, Component], name: str) -> str:
+    return table[name].belongs_to if name in table else ""
 
 
 def _joined(names: Sequence[str] | Mapping[str, float]) -> str:

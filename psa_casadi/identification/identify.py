@@ -152,7 +152,11 @@ def identify(
         experiments=experiments,
         warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
-        sentences=(*(s for _, said in ready for s in said), *columns.left_out),
+        sentences=(
+            *(s for _, said in ready for s in said),
+            *columns.left_out,
+            *(f.sentence for f in best.further),
+        ),
         combinations=open_ones,
         advice=advised or (),
         interrupted=advised is None,
@@ -170,7 +174,8 @@ def with_provenance(
     """Return a fitted model that says from which records it comes and how sure its values are."""
     c_p = model.values.get("C_p", 0.0)
     current = capacitance_of(records)
-    told = {"C_p": current.interval} if current is not None and current.is_that_of(c_p) else {}
+    fits = current is not None and current.source == "current" and current.is_that_of(c_p)
+    told = {"C_p": current.interval} if current is not None and fits else {}
     provenance = Provenance(
         identified_from=tuple((r.name, r.sha256) for r in records),
         package_version=__version__,

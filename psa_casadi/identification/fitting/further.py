@@ -83,6 +83,17 @@ class Further:
         return STRAIGHT * self.spread
 
     @property
+    def sentence(self) -> str:
+        """What is left of the column, and what is odd about it, in words."""
+        unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
+        turned = " Its sign is turned." if self.factors[0] < 0.0 else ""
+        named = "" if unit == "1" else f" {unit}"
+        return (
+            f"{self.column}: fitted beside the displacement; {self.rms:.3g}{named} rms of it are"
+            f" missed, {share:.2g} % of its own rms.{turned}"
+        )
+
+    @property
     def rms(self) -> float:
         """Root mean square of the residuals."""
         return float(np.sqrt(np.mean(self.residuals**2)))
