@@ -103,9 +103,10 @@ class Component:
     means nothing. `trial_starts` are starts of its memory states at which it is looked for, where
     it does nothing at their ordinary start. `curve` names the quantity over which an effect bends
     a static curve, in a form of its own: effects with the same one differ, below the resonances,
-    by these forms only. `measured_by` names the input whose measured column holds what it adds: with
-    such a column it is no cause; `needs_column` names columns of which a record must have one for
-    the effect to be looked for, as it hardly shows otherwise. `more_of` names the effect of which this one is several, `count` of them.
+    by these forms only. `measured_by` names the input whose measured column holds what it adds:
+    with such a column it is no cause. `needs_column` names columns of which a record must have one
+    for the effect to be looked for, as it hardly shows otherwise. `more_of` names the effect of
+    which this one is several, `count` of them.
 
     `sampled` are states that change at sample instants only: at every time that is a multiple of
     the parameter `sample_period` [s], whoever declares it, each takes the value in

@@ -41,7 +41,9 @@ MONITOR = Component(
             "monitor_scale", 1.0, "1", (-1e6, 1e6), "monitor per volt at the stack, over the gain"
         ),
     ),
-    outputs=(Output("monitor_voltage", "V", "voltage that the amplifier's monitor shows", _monitored),),
+    outputs=(
+        Output("monitor_voltage", "V", "voltage that the amplifier's monitor shows", _monitored),
+    ),
 )
 
 SECOND_SENSOR = Component(
@@ -55,7 +57,9 @@ SECOND_SENSOR = Component(
         Parameter("sensor_2_scale", 1.0, "1", (-1e6, 1e6), "second reading over displacement"),
     ),
     outputs=(
-        Output("displacement_2", "m", "displacement as the second sensor shows it", stroke_scale, "um"),
+        Output(
+            "displacement_2", "m", "displacement as the second sensor shows it", stroke_scale, "um"
+        ),
     ),
 )
 

@@ -19,11 +19,12 @@ def _equations(s: Symbols) -> Equations:
 AMPLIFIER_NONLINEARITY = Component(
     name="amplifier_nonlinearity",
     description="the amplifier's gain changes with its output voltage",
-    source="output-dependent gain of high-voltage stages; Horowitz and Hill, The Art of Electronics",
+    source="output-dependent gain of amplifiers: Horowitz and Hill, The Art of Electronics",
     belongs_to="drive",
     gain="amplifier_gain",
     equation_text=(
-        "drive voltage gains amplifier_gain u_rated b(G v/u_rated),  " + BEND_TEXT.format("amplifier")
+        "drive voltage gains amplifier_gain u_rated b(G v/u_rated),  "
+        + BEND_TEXT.format("amplifier")
     ),
     parameters=(
         Parameter(

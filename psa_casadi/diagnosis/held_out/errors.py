@@ -64,9 +64,7 @@ def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     """
     found = []
     for f in fit.further:
-        shown = predicted_further(
-            fit.model, experiments, fit.unknowns, fit.theta, f, way=fit.way
-        )
+        shown = predicted_further(fit.model, experiments, fit.unknowns, fit.theta, f, way=fit.way)
         parts = [
             (getattr(experiments[k].record, f.column) - x)[experiments[k].held_out]
             for k, x in shown.items()

@@ -65,7 +65,6 @@ class Colour:
             first += length
         return white
 
-
     def whiten_all(self, signal: FloatArray, further: Sequence[FloatArray]) -> FloatArray:
         """Filter a signal of the displacement and those of the further columns, and stack them.
 

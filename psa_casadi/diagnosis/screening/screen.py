@@ -118,9 +118,7 @@ def whitened_jacobian(fit: Fit, colour: Colour) -> FloatArray:
 def further_columns(fit: Fit, trials: Sequence[Direction]) -> list[FloatArray]:
     """Return for every further column what the directions change in it (samples, directions)."""
     return [
-        np.hstack(
-            [np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)]
-        )
+        np.hstack([np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)])
         for k, f in enumerate(fit.further)
     ]
 

@@ -139,9 +139,7 @@ def _with_further(
             for name in ("voltage", "time")
         )
         noise = noise_rms(f.residuals, own)
-        found = omnibus(
-            f.residuals, voltage, time, own, noise, knowable=f.straight, even=even
-        )
+        found = omnibus(f.residuals, voltage, time, own, noise, knowable=f.straight, even=even)
         p = min(1.0, found.p_value * (1 + len(fit.further)))
         if found.alarm and p < thresholds().alarm:
             where = f"Of {f.column}: {found.where[:1].lower()}{found.where[1:]}"

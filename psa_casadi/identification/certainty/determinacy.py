@@ -95,10 +95,11 @@ def covariance_of(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray:
     """Return the covariance (size, size) of theta, for residuals that may be coloured.
 
     The sandwich H^-1 (sum_r J_r^T C_r J_r / w_r^4 + P) H^-1 with H = sum_r J_r^T J_r / w_r^2 + P:
-XX
-    of the residual's autocovariance in record r, which `autocovariance` estimates. White residuals
-    at the level w_r give H^-1. Source: White, Maximum likelihood estimation of misspecified models,
-    Econometrica 50 (1982), with the stationary colour of Newey and West (1987).
+    w_r is the level that weighted record r or a further column, P the precision of the priors, C_r
+    the Toeplitz matrix of the residual's autocovariance there, which `autocovariance` estimates.
+    White residuals at the level w_r give H^-1. Source: White, Maximum likelihood estimation of
+    misspecified models, Econometrica 50 (1982), with the stationary colour of Newey and West
+    (1987).
     """
     precision = np.diag(1.0 / fit.unknowns.prior**2)
     curvature, spread = precision.copy(), precision.copy()

@@ -45,8 +45,8 @@ class Fit:
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
-    each record was run and how accurately; it is empty after an interrupt. `further` are the fits of
-    the columns beside the displacement.
+    each record was run and how accurately; it is empty after an interrupt. `further` are the fits
+    of the columns beside the displacement.
     """
 
     model: Model

@@ -23,33 +23,32 @@ from psa_casadi.simulation.ways import Way
 FloatArray = npt.NDArray[np.float64]
 
 
-#: A further sensor is taken to be straight to this share of what it shows (rms): an error of the
-#: model that is smaller says nothing of a stack.
-STRAIGHT = 1e-3
-
-
 @dataclass(frozen=True)
 class Shown:
     """What a column of a record shows.
 
     `outputs` of the model, each with a factor; the first factor is that of `scale`, a parameter of
-    the `sensor` that a model gets for the column, where it has one. `unit` is the SI unit.
+    the `sensor` that a model gets for the column, where it has one. `unit` is the SI unit. The
+    model is taken to be right to the share `straight` of what is shown (rms): a smaller error says
+    nothing of a stack.
     """
 
     unit: str
     outputs: tuple[str, ...]
+    straight: float = 1e-3
     sensor: Component | None = None
     scale: str | None = None
 
 
 #: The columns that are fitted, by name. The charge on a stack is that of its capacitance and, by
-#: reciprocity, a share of the displacement; the current is its rate.
+#: reciprocity, a share of the displacement; the current is its rate, which lags faster than the
+#: sampling move most.
 COLUMNS: Mapping[str, Shown] = {
-    "monitor_voltage": Shown("V", ("monitor_voltage",), MONITOR, "monitor_scale"),
-    "charge": Shown("C", ("charge", "displacement")),
-    "current": Shown("A", ("current", "velocity")),
-    "displacement_2": Shown("m", ("displacement_2",), SECOND_SENSOR, "sensor_2_scale"),
-    "strain": Shown("1", ("strain",), STRAIN_GAUGE, "strain_scale"),
+    "monitor_voltage": Shown("V", ("monitor_voltage",), sensor=MONITOR, scale="monitor_scale"),
+    "charge": Shown("C", ("charge", "displacement"), straight=1e-2),
+    "current": Shown("A", ("current", "velocity"), straight=5e-2),
+    "displacement_2": Shown("m", ("displacement_2",), sensor=SECOND_SENSOR, scale="sensor_2_scale"),
+    "strain": Shown("1", ("strain",), sensor=STRAIN_GAUGE, scale="strain_scale"),
 }
 
 
@@ -80,7 +79,7 @@ class Further:
     @property
     def straight(self) -> float:
         """Rms error below which nothing is known of the column, in its unit."""
-        return STRAIGHT * self.spread
+        return COLUMNS[self.column].straight * self.spread
 
     @property
     def sentence(self) -> str:

@@ -161,9 +161,7 @@ def traced_by_theta(
     """
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
-    found = trace_record(
-        current, record, start, unknowns.names, stop=stop, way=way, output=output
-    )
+    found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
     count = len(unknowns.names)
     jacobian = found.sensitivity[:, count:] @ unknowns.place_slopes(theta, index)[0]
     jacobian[:, :count] += found.sensitivity[:, :count] @ slopes

@@ -101,9 +101,7 @@ def refit(
     )
 
 
-def relevelled(
-    best: Fit, experiments: Sequence[Experiment]
-) -> tuple[Fit, tuple[Experiment, ...]]:
+def relevelled(best: Fit, experiments: Sequence[Experiment]) -> tuple[Fit, tuple[Experiment, ...]]:
     """Fit again with what the fit leaves of every further column as that column's noise level.
 
     As it is without such columns, and where a fit was interrupted.

@@ -62,8 +62,8 @@ class Capacitance:
         low, high = 1e6 * self.interval.low, 1e6 * self.interval.high
         kept = "" if self.is_that_of(value) else f" The model keeps the {1e6 * value:.4g} uF given."
         return (
-            f"The measured {self.source} tells C_p = {1e6 * self.value:.4g} uF ({low:.4g} to {high:.4g};"
-            " times the amplifier's gain, if the voltage is its input): it explains"
+            f"The measured {self.source} tells C_p = {1e6 * self.value:.4g} uF ({low:.4g} to"
+            f" {high:.4g}; times the amplifier's gain, if the voltage is its input): it explains"
             f" {100 * self.explained:.1f} % of it.{kept}"
         )
 
