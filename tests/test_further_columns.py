@@ -58,8 +58,12 @@ def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path)
     truth = plants.plain(1)
     r = truth.record(1, *COLUMNS, samples=1500)
     path = tmp_path / "a.csv"
-    columns = [r.time, r.voltage, 1e6 * r.displacement, r.monitor_voltage, 1e6 * r.charge]
-    columns += [1e3 * r.current, 1e6 * r.displacement_2, 1e6 * r.strain]
+    names = ("time", "voltage", "displacement", "monitor_voltage", "charge", "current")
+    sizes = (1.0, 1.0, 1e6, 1.0, 1e6, 1e3, 1e6, 1e6)
+    columns = [
+        size * getattr(r, n)
+        for n, size in zip((*names, "displacement_2", "strain"), sizes, strict=True)
+    ]
     header = "t [s],u [V],x [um],V_mon [V],q [uC],i [mA],x2 [um],strain [ppm]"
     np.savetxt(
         path, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.9g"

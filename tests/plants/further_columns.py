@@ -8,6 +8,7 @@ columns show them.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class Truth:
             n: x + FURTHER_NOISE * (np.ptp(x) or 1.0) * rng.standard_normal(x.size)
             for n, x in given.items()
         }
-        beside = {n: x for n, x in noisy.items() if n in columns}
+        beside: dict[str, Any] = {n: x for n, x in noisy.items() if n in columns}
         whole = Record("stack", self.run.times, self.run.command, read, **beside)
         return whole if samples is None else whole.slice(0, samples)
 

@@ -11,6 +11,7 @@ curve over what the same model predicts that is fitted to the load itself.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,10 +37,11 @@ def is_measured(experiments: Sequence[Experiment]) -> bool:
 
 def without_column(experiments: Sequence[Experiment], column: str) -> tuple[Experiment, ...]:
     """Return the experiments as if a column had not been measured."""
+    gone: dict[str, Any] = {column: None}
     return tuple(
         replace(
             e,
-            record=replace(e.record, **{column: None}),
+            record=replace(e.record, **gone),
             further=tuple(q for q in e.further if q.column != column),
         )
         for e in experiments
@@ -55,7 +57,8 @@ def loads_as_curves(
     model's stiffness stands for them. Other loads stay as they were measured. Without a load that
     changes nothing is fitted.
     """
-    if not is_measured(experiments) or all(np.ptp(e.record.load_force) == 0.0 for e in experiments):
+    loads = [np.asarray(e.record.load_force, dtype=float) for e in experiments]
+    if not is_measured(experiments) or all(np.ptp(load) == 0.0 for load in loads):
         return tuple(experiments)
     progress("base fit without the measured load")
     unloaded = without_column(experiments, LOAD)
@@ -63,16 +66,12 @@ def loads_as_curves(
         fit_base(start, own, progress=progress).predicted(own)
         for own in (unloaded, tuple(map(_as_displacement, experiments)))
     ]
-    curves = [
-        _curve(np.asarray(e.record.load_force), own)
-        for e, *own in zip(experiments, *ways, strict=True)
-    ]
+    curves = [_curve(load, own) for load, *own in zip(loads, *ways, strict=True)]
     straight = all(c is not None and c[1] == 1 for c in curves)
     found = []
-    for e, own in zip(experiments, curves, strict=True):
-        load = e.record.load_force if own is None else own[0]
-        own_load = np.zeros(e.record.n) if straight else load
-        found.append(replace(e, record=replace(e.record, load_force=own_load)))
+    for e, load, own in zip(experiments, loads, curves, strict=True):
+        curve = np.zeros(e.record.n) if straight else load if own is None else own[0]
+        found.append(replace(e, record=replace(e.record, load_force=curve)))
     return tuple(found)
 
 

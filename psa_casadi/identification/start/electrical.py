@@ -94,8 +94,8 @@ def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
 
 def _by_charge(records: Sequence[Record]) -> Capacitance | None:
     """Return the charge per volt, every record about its mean; None without a charge."""
-    own = [r for r in records if r.charge is not None]
-    pairs = [(r.voltage - np.mean(r.voltage), r.charge - np.mean(r.charge)) for r in own]
+    given = [(r.voltage, np.asarray(r.charge)) for r in records if r.charge is not None]
+    pairs = [(v - np.mean(v), q - np.mean(q)) for v, q in given]
     power = sum(float(v @ v) for v, _ in pairs)
     total = sum(float(q @ q) for _, q in pairs)
     if power == 0.0 or total == 0.0:
