@@ -40,7 +40,7 @@ FIELD_DEPENDENT_CAPACITANCE = Component(
             "1",
             (0.0, 3.0),
             "growth of the capacitance at rated voltage",
-            scale=0.05,
+            scale=0.1,
         ),
     ),
     equations=_equations,
