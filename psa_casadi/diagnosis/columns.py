@@ -72,7 +72,7 @@ def _decision(
         named_without=then,
         ruled_out=ruled_out,
         evidence=gained,
-        sentence=_sentence(column, now, then, gained, {e.name: e for e in table}),
+        sentence=decision_sentence(column, now, then, gained, {e.name: e for e in table}),
     )
 
 
@@ -88,7 +88,7 @@ def _named(steps: Sequence[Step]) -> dict[str, float]:
     return found
 
 
-def _sentence(
+def decision_sentence(
     column: str,
     now: Mapping[str, float],
     then: Mapping[str, float],

@@ -139,7 +139,8 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     found = conclude(steps, experiments, table, scale_given)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0])
     found = replace(found, columns=decided)
-    notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []))
+    turned = [f.turned for f in steps[0].fit.further if f.turned]
+    notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
     return replace(found, notes=(*found.notes, *notes))
 
 

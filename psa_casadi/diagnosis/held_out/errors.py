@@ -11,6 +11,7 @@ from psa_casadi.diagnosis.noise.colour import rms
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import predicted_further
 from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -63,8 +64,9 @@ def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     In their SI units; those of the fitted samples where none is held out. Raises PsaError.
     """
     found = []
+    theta = shared_starts(fit.model, fit.unknowns, fit.theta, experiments)[0]
     for f in fit.further:
-        shown = predicted_further(fit.model, experiments, fit.unknowns, fit.theta, f, way=fit.way)
+        shown = predicted_further(fit.model, experiments, fit.unknowns, theta, f, way=fit.way)
         parts = [
             (getattr(experiments[k].record, f.column) - x)[experiments[k].held_out]
             for k, x in shown.items()

@@ -91,6 +91,18 @@ def determinacy(
     )
 
 
+def weighted_rows(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return Jacobian and residuals over their level, of every record and further column."""
+    parts = [fit.of_record(experiments, r) for r in range(len(fit.sigma))]
+    rows = [
+        (fit.jacobian[p] / s, fit.residuals[p] / s) for p, s in zip(parts, fit.sigma, strict=True)
+    ]
+    rows += [(f.jacobian / f.level, f.residuals / f.level) for f in fit.further]
+    return [row for row in rows if len(row[1])]
+
+
 def covariance_of(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray:
     """Return the covariance (size, size) of theta, for residuals that may be coloured.
 
@@ -103,15 +115,9 @@ def covariance_of(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray:
     """
     precision = np.diag(1.0 / fit.unknowns.prior**2)
     curvature, spread = precision.copy(), precision.copy()
-    parts = [fit.of_record(experiments, r) for r in range(len(fit.sigma))]
-    rows = [(fit.jacobian[p], fit.residuals[p], s) for p, s in zip(parts, fit.sigma, strict=True)]
-    rows += [(f.jacobian, f.residuals, f.level) for f in fit.further]
-    for jacobian, residuals, level in rows:
-        if not len(residuals):
-            continue
-        scaled = jacobian / level
+    for scaled, residuals in weighted_rows(fit, experiments):
         curvature += scaled.T @ scaled
-        lags = autocovariance(residuals / level)
+        lags = autocovariance(residuals)
         if lags[0] > 2.0 * np.sum(lags) - lags[0]:
             lags = lags[:1]  # colour never makes intervals shorter than white residuals do
         spread += scaled.T @ convolved(scaled, np.concatenate([lags[:0:-1], lags]))

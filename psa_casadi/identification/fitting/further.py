@@ -85,12 +85,18 @@ class Further:
     def sentence(self) -> str:
         """What is left of the column, and what is odd about it, in words."""
         unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
-        turned = " Its sign is turned." if self.factors[0] < 0.0 else ""
         named = "" if unit == "1" else f" {unit}"
         return (
             f"{self.column}: fitted beside the displacement; {self.rms:.3g}{named} rms of it are"
-            f" missed, {share:.2g} % of its own rms.{turned}"
+            f" missed, {share:.2g} % of its own rms.{' ' + self.turned if self.turned else ''}"
         )
+
+    @property
+    def turned(self) -> str:
+        """Say so where a column falls while what it shows rises, else ""."""
+        if COLUMNS[self.column].scale is not None or self.factors[0] >= 0.0:
+            return ""
+        return f"{self.column} falls where the model's rises: its sign is probably turned."
 
     @property
     def rms(self) -> float:
