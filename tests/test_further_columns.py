@@ -65,7 +65,7 @@ def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path)
         size * getattr(r, n)
         for n, size in zip((*names, "displacement_2", "strain"), sizes, strict=True)
     ]
-    header = "t [s],u [V],x [um],V_mon [V],q [uC],i [mA],x2 [um],strain [ppm]"
+    header = "t [s],u [V],x [um],V_mon [V],q [uC],i [mA],x2 [um],strain [um/m]"
     np.savetxt(
         path, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.9g"
     )

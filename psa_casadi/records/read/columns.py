@@ -218,7 +218,10 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
     except InputError as error:
         problems.add(f"{where}: {error}")
         return
-    if parsed.quantity not in column.quantities:
+    compound = not parsed.quantity and any(
+        parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in column.quantities
+    )
+    if parsed.quantity not in column.quantities and not compound:
         problems.add(
             f"{where}: the unit '{unit}' does not measure {column.quantities[0]}; correct it to "
             f"one of {accepted}."
