@@ -172,12 +172,20 @@ def test_a_turned_sign_is_told() -> None:
         (
             {"drive_lag": 1.0},
             {"ageing": 0.6, "sensor_lag": 0.4},
-            "the sensor and the stack are rul",
+            "the sensor and the stack with its load are rul",
         ),
     ],
 )
 def test_decisions_in_words(now: dict[str, float], then: dict[str, float], said: str) -> None:
-    assert said in decision_sentence("monitor_voltage", now, then, 7.2, EFFECTS)
+    assert said in decision_sentence("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now)
+
+
+def test_a_column_explains_nothing_where_something_is_left() -> None:
+    of = {"load_stiffness": 0.5, "sensor_nonlinearity": 0.5}
+    clear = decision_sentence("load_force", {}, of, 0.0, EFFECTS, clear=True)
+    assert "load_stiffness is in the column" in clear
+    assert "nothing is named" in decision_sentence("load_force", {}, of, 0.0, EFFECTS, clear=False)
+    assert "decides nothing" in decision_sentence("load_force", {}, {}, 0.0, EFFECTS, clear=False)
 
 
 def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> None:
@@ -212,7 +220,9 @@ def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(
     assert decided.base_rms is not None
     assert decided.noise == pytest.approx(decided.extended_rms, rel=0.1)
     assert decided.evidence > 20.0
-    place = {"sensor_nonlinearity": "the stack", "load_stiffness": "the sensor"}[right]
+    place = {"sensor_nonlinearity": "the stack with its load", "load_stiffness": "the sensor"}[
+        right
+    ]
     assert f"With displacement_2 {place} is ruled out" in psa.story(found).replace(
         "\n           ", " "
     )
@@ -244,7 +254,7 @@ def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
 @pytest.mark.parametrize(
     ("hide", "right", "place"),
     [
-        (plants.soft_amplifier, "amplifier_nonlinearity", "the stack"),
+        (plants.soft_amplifier, "amplifier_nonlinearity", "the stack with its load"),
         (plants.saturating_stack, "saturation_of_strain", "the amplifier"),
     ],
 )

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.judgement import told_from
-from psa_casadi.diagnosis.result import Decision
+from psa_casadi.diagnosis.result import Decision, Verdict
 from psa_casadi.diagnosis.screening.evidence import further_gains
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import Task
+from psa_casadi.diagnosis.verdict import NAMING
 from psa_casadi.identification.fitting.further import COLUMNS
 from psa_casadi.identification.search.measured_load import LOAD, is_measured, without_column
 
@@ -16,7 +17,7 @@ from psa_casadi.identification.search.measured_load import LOAD, is_measured, wi
 PLACES = {
     "drive": "the amplifier",
     "sensor": "the sensor",
-    "plant": "the stack",
+    "plant": "the stack with its load",
     "environment": "the surroundings",
 }
 #: Probability below which an effect is no rival.
@@ -28,10 +29,12 @@ def decisions(
     task: Task,
     table: Sequence[Component],
     search: Callable[[Task], Sequence[Step]],
+    verdict: Verdict,
 ) -> tuple[Decision, ...]:
     """Return what every fitted column, and a measured load, decided.
 
-    `table` are all effects, `search` finds the steps of a task. Each column costs a search.
+    `table` are all effects, `search` finds the steps of a task, `verdict` is that on `steps`. Each
+    column costs a search.
     """
     experiments = task.experiments
     columns = [q.column for q in experiments[0].further]
@@ -49,15 +52,20 @@ def decisions(
             table=effects,
             keep=lambda _: None,
         )
-        found.append(_decision(column, steps, search(alone), effects))
+        found.append(_decision(column, steps, search(alone), effects, verdict))
     return tuple(found)
 
 
 def _decision(
-    column: str, steps: Sequence[Step], before: Sequence[Step], table: Sequence[Component]
+    column: str,
+    steps: Sequence[Step],
+    before: Sequence[Step],
+    table: Sequence[Component],
+    verdict: Verdict,
 ) -> Decision:
     first, last = steps[0].view.of, steps[-1].view.of
-    now, then = _named(steps), _named(before)
+    now, then = _named(steps) if verdict in NAMING else {}, _named(before)
+    words = {e.name: e for e in table}
     k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
     gained = further_gains(first.fit, last.fit, steps[-1].screening.colour).get(column, 0.0)
     ruled_out = tuple(n for n in then if n not in now)
@@ -72,7 +80,7 @@ def _decision(
         named_without=then,
         ruled_out=ruled_out,
         evidence=gained,
-        sentence=decision_sentence(column, now, then, gained, {e.name: e for e in table}),
+        sentence=decision_sentence(column, now, then, gained, words, clear=verdict == "adequate"),
     )
 
 
@@ -94,16 +102,22 @@ def decision_sentence(
     then: Mapping[str, float],
     gained: float,
     table: Mapping[str, Component],
+    *,
+    clear: bool,
 ) -> str:
-    """Say in words what a column decided, from what is named with it and without it."""
+    """Say in words what a column decided, from what is named with it and without it.
+
+    `clear` says that nothing is left to name with the column.
+    """
     before = ", ".join(f"{n} {100 * p:.0f} %" for n, p in then.items())
     gone, new = [n for n in then if n not in now], [n for n in now if n not in then]
     if not now and not then:
-        return f"{column} agrees with the model: with it as without it nothing is named."
+        agrees = "agrees with the model" if clear else "decides nothing"
+        return f"{column} {agrees}: with it as without it nothing is named."
     if not gone and not new:
         return f"{column} changes no name; it adds {gained:.0f} to the ln of the Bayes factor."
     held = [n for n in gone if n in table and table[n].measured_by == column]
-    if held and not now:
+    if held and not now and clear:
         return (
             f"{column} explains by itself what without it is named ({before}): {held[0]} is in the"
             " column."

@@ -137,7 +137,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         experiments = task.experiments
     progress("judging")
     found = conclude(steps, experiments, table, scale_given)
-    decided = decisions(steps, task, every, lambda other: _searched(start, other)[0])
+    decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
     turned = [f.turned for f in steps[0].fit.further if f.turned]
     notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
