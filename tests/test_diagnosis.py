@@ -132,7 +132,9 @@ def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> 
         "holdout_max_m",
         "holdout_nrmse_percent",
     }
-    assert {c["effect"] for c in content["candidates"]} == set(psa.EFFECTS) - {"temperature"}
+    shown = {n for n, e in psa.EFFECTS.items() if not e.needs_column} - {"temperature"}
+    assert {c["effect"] for c in content["candidates"]} == shown
+    assert content["columns"] == []
     assert content["next_experiment"]["why"]
 
 

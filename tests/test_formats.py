@@ -171,7 +171,7 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
         ("voltage", "'voltage': is not understood; write NAME=ARRAY:UNIT"),
         ("voltage=", "'voltage=': is not understood"),
         ("voltag=u", "'voltag' is no column of a record; is 'voltage' meant?"),
-        ("strain=u", "'strain' is no column of a record; there are time, voltage"),
+        ("torque=u", "'torque' is no column of a record; there are time, voltage"),
         ("voltage=u,voltage=v", "'voltage=v': 'voltage' is given twice"),
         ("voltage=u:um", "the unit 'um' does not measure voltage"),
         ("voltage=u:volts", "the unit 'volts' is unknown"),

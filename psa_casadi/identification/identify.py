@@ -12,8 +12,10 @@ from psa_casadi.identification.certainty.determinacy import Determinacy, assumed
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.search.measured_load import loads_as_curves
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
-from psa_casadi.identification.search.refitting import Progress, record_rms, refit
+from psa_casadi.identification.search.refitting import Progress, record_rms, refit, relevelled
+from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.doubts import (
     doubtful_sign,
     doubtful_time,
@@ -117,8 +119,11 @@ def identify(
     fitted = [r for r, _ in ready]
     said = [*cut, *(s for _, own in ready for s in own)]
     refuse_few(given_records, fitted, said)
-    experiments = tuple(whole(r) for r in fitted)
     start, given = chosen_start(fitted, model, stiffness)
+    columns = columns_of(start, fitted)
+    start = columns.model
+    experiments = with_levels([whole(r) for r in fitted], columns.fitted)
+    experiments = loads_as_curves(start, experiments, progress)
     linear = None
     if model is None:
         progress("starting values from the records")
@@ -130,7 +135,8 @@ def identify(
         thorough=True,
         progress=progress,
     )
-    best = _with_own_levels(found.best, experiments, progress)
+    best, experiments = relevelled(found.best, experiments)
+    best = _with_own_levels(best, experiments, progress)
     if best.interrupted:
         current_work().wrap_up()
     determined = determinacy(
@@ -167,7 +173,7 @@ def identify(
         experiments=experiments,
         warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
-        sentences=tuple(said),
+        sentences=(*said, *columns.left_out, *(f.sentence for f in best.further)),
         combinations=open_ones,
         advice=advised or (),
         interrupted=advised is None,
@@ -186,7 +192,8 @@ def with_provenance(
     """Return a fitted model that says from which records it comes and how sure its values are."""
     c_p = model.values.get("C_p", 0.0)
     current = capacitance_of(records)
-    told = {"C_p": current.interval} if current is not None and current.is_that_of(c_p) else {}
+    fits = current is not None and current.source == "current" and current.is_that_of(c_p)
+    told = {"C_p": current.interval} if current is not None and fits else {}
     provenance = Provenance(
         identified_from=tuple((r.name, r.sha256) for r in records),
         package_version=__version__,

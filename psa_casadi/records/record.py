@@ -13,7 +13,13 @@ from psa_casadi.units import FloatArray
 #: Fewer samples than this describe no experiment, and judge none.
 FEWEST_SAMPLES = 16
 
-_OPTIONAL = ("displacement", "load_force", "current", "temperature")
+#: Columns beside time and voltage that a record may have.
+_OPTIONAL = (
+    "displacement", "load_force", "current", "temperature", "monitor_voltage", "charge",
+    "displacement_2", "strain",
+)  # fmt: skip
+#: Columns whose absence is hashed too: those of the first version, so that its hashes stay.
+_HASHED = ("time", "voltage", "displacement", "load_force", "current", "temperature")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -22,8 +28,9 @@ class Record:
 
     `time` [s] increases strictly and need not be uniform; between samples `voltage` [V] is linear.
     `displacement` is in metres, or in `displacement_unit` "counts" where the sensor's scale is
-    unknown; nan marks a missing sample. `load_force` [N], `current` [A] and `temperature` [K] are
-    None where they were not recorded. `sha256` is that of the file at `source`, or of the arrays
+    unknown; nan marks a missing sample. `load_force` [N], `current` [A], `temperature` [K],
+    `monitor_voltage` [V], `charge` [C], `displacement_2` [m] and `strain` [1] are None where they
+    were not recorded. `sha256` is that of the file at `source`, or of the arrays
     where there is no file.
 
     Raises:
@@ -40,6 +47,10 @@ class Record:
     sha256: str = ""
     source: str = ""
     displacement_unit: Literal["m", "counts"] = "m"
+    monitor_voltage: FloatArray | None = None
+    charge: FloatArray | None = None
+    displacement_2: FloatArray | None = None
+    strain: FloatArray | None = None
 
     def __post_init__(self) -> None:
         problems = []
@@ -128,7 +139,8 @@ class Record:
         digest = hashlib.sha256()
         for column in ("time", "voltage", *_OPTIONAL):
             array = getattr(self, column)
-            digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
+            if array is not None or column in _HASHED:
+                digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
         return digest.hexdigest()
 
 

@@ -44,6 +44,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     Real drive_voltage(unit="V") "open-circuit voltage of the amplifier";
     Real drive_current(unit="A") "current through the amplifier's output resistance";
     Real stack_current(unit="A") "current into the stack's capacitance";
+    Real stack_charge(unit="C") "charge on the stack's electrodes";
     Real voltage_rate(unit="V/s") "rate of the voltage at the stack's electrodes";
     Real hysteresis_rate(unit="N/s") "rate of the hysteresis force";
     Real free_force(unit="N") "force the wafers generate before the creep lag";
@@ -69,6 +70,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     drive_voltage = G*voltage; // drive
     drive_current = (drive_voltage - u)/R_s; // drive
     stack_current = drive_current; // drive
+    stack_charge = C_p*u; // drive
     voltage_rate = stack_current/C_p; // drive
     hysteresis_rate = A*voltage_rate - beta*voltage_speed*hysteresis_signed_bend -
       gamma*voltage_rate*hysteresis_bend + delta*u*voltage_direction;
@@ -92,7 +94,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     der(v_x) = (transmitted_force + tip_force - bonding_force)/m_B;
     // outputs
     current = stack_current;
-    charge = C_p*u;
+    charge = stack_charge;
     velocity = der(x);
     annotation(Documentation(info="<html>
   <p>co-fired PICMA stack of Physik Instrumente, 120 V, 18 um, 1.5 uF, overdamped; 5 x 5 x 18 mm (the paper's type name is lost; the figures are those of the P-885.51). The force scale is assumed: only quantities scaled to displacement are identified; forces, masses, damping and stiffness share one unknown factor. Named stack P-885.51: 14 of its 19 figures are assumed; `psa stacks P-885.51` shows which.</p>
@@ -162,6 +164,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     Real drive_voltage(unit="V") "open-circuit voltage of the amplifier";
     Real drive_current(unit="A") "current through the amplifier's output resistance";
     Real stack_current(unit="A") "current into the stack's capacitance";
+    Real stack_charge(unit="C") "charge on the stack's electrodes";
     Real voltage_rate(unit="V/s") "rate of the voltage at the stack's electrodes";
     Real hysteresis_rate(unit="N/s") "rate of the hysteresis force";
     Real free_force(unit="N") "force the wafers generate before the creep lag";
@@ -189,6 +192,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     drive_voltage = G*voltage; // drive
     drive_current = (drive_voltage - u)/R_s; // drive
     stack_current = drive_current; // drive
+    stack_charge = C_p*u; // drive
     voltage_rate = stack_current/C_p; // drive
     hysteresis_rate = A*voltage_rate - beta*voltage_speed*hysteresis_signed_bend -
       gamma*voltage_rate*hysteresis_bend + delta*u*voltage_direction;
@@ -221,7 +225,7 @@ package PiezoStack "model of a device, written by psa_casadi"
       reciprocal_gain*k_B)*y_r)/m_P;
     // outputs
     current = stack_current;
-    charge = C_p*u;
+    charge = stack_charge;
     velocity = der(x);
     // connectors
     pin_p.v - pin_n.v = G*voltage;

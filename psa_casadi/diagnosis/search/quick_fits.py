@@ -137,6 +137,10 @@ def continued(
 
 
 def cost_beside(other: Fit, of: Fit, experiments: Sequence[Experiment]) -> float:
-    """Return the sum of squares that another fit leaves, weighted by the noise levels of a fit."""
-    parts = zip(other.residuals_of(experiments), of.sigma, strict=True)
-    return sum(float(np.sum((part / sigma) ** 2)) for part, sigma in parts)
+    """Return the sum of squares that another fit leaves, weighted by the noise levels of a fit.
+
+    Of the displacement and of further columns.
+    """
+    parts = [*zip(other.residuals_of(experiments), of.sigma, strict=True)]
+    parts += [(f.residuals, g.level) for f, g in zip(other.further, of.further, strict=True)]
+    return sum(float(np.sum((part / level) ** 2)) for part, level in parts)

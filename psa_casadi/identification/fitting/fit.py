@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.further import Further, further_of, scaled
 from psa_casadi.identification.fitting.levenberg_marquardt import (
     FIRST_RADIUS,
     Evaluate,
@@ -50,7 +51,8 @@ class Fit:
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
     each record was run and how accurately; it is empty after an interrupt, and above the goal.
-    `radius` is that of the next step.
+    `radius` is that of the next step, `further` are the fits of the columns beside the
+    displacement.
     """
 
     model: Model
@@ -66,6 +68,7 @@ class Fit:
     way: Way
     simulated: tuple[Simulated, ...]
     radius: float = FIRST_RADIUS
+    further: tuple[Further, ...] = ()
 
     def __repr__(self) -> str:
         """Return what was fitted and what it leaves, in one line."""
@@ -149,6 +152,7 @@ def fit(
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
+    Of the displacement and of the experiments' `further` columns, each by its own level.
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
     those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
@@ -169,8 +173,10 @@ def fit(
     linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
     effort = _Effort(tolerance, evaluations, goal, linear, radius)
     minimum, way, told = _minimum(model, experiments, unknowns, weights, theta, sigma, rtol, effort)
+    further = further_of(model, experiments, unknowns, minimum.theta, way=way)
+    found, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
-        model=model.with_values(unknowns.values(minimum.theta)),
+        model=found,
         unknowns=unknowns,
         theta=minimum.theta,
         residuals=-minimum.residual[: len(weights)] * weights,
@@ -183,6 +189,7 @@ def fit(
         way=way,
         simulated=tuple(told),
         radius=minimum.radius,
+        further=further,
     )
 
 
@@ -263,7 +270,10 @@ def objective(
     weights: FloatArray,
     way: Way,
 ) -> Evaluate:
-    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian."""
+    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian.
+
+    Those of the displacement, then those of the further columns.
+    """
     target = np.concatenate([measured(e.record)[e.used] for e in experiments])
     used = [e.used[: e.stop] for e in experiments]
     prior, samples, share = 1.0 / unknowns.prior, len(target), 1.0 / weights
@@ -271,18 +281,22 @@ def objective(
     def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         try:
             parts = predict(model, experiments, unknowns, theta, way=way)
+            beside = further_of(model, experiments, unknowns, theta, way=way)
         except PsaError:
             return None
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
-        residual = np.concatenate([(y - target) * share, theta * prior])
-        jacobian = np.empty((samples + len(theta), len(theta)))
+        more = [b.jacobian / b.level for b in beside]
+        residual = np.concatenate(
+            [(y - target) * share, *(-b.residuals / b.level for b in beside), theta * prior]
+        )
+        jacobian = np.empty((len(residual), len(theta)))
         first = 0
         for part, u in zip(parts, used, strict=True):  # no copy but this one
             last = first + int(np.count_nonzero(u))
             np.compress(u, part.jacobian, axis=0, out=jacobian[first:last])
             first = last
         jacobian[:samples] *= share[:, None]
-        jacobian[samples:] = np.diag(prior)
+        jacobian[samples:] = np.vstack([*more, np.diag(prior)])
         with np.errstate(over="ignore", invalid="ignore"):
             finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
         return (residual, jacobian) if finite else None

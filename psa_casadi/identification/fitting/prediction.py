@@ -58,14 +58,16 @@ def predict_record(
     *,
     stop: int,
     rtol: float,
+    output: str = OUTPUT,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacement (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
+    """Return an output (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
 
     `start` holds deviations of the initial states from where the first inputs and their rates put
     them, in the states' units. Time counts from the record's first sample. `rtol` is the tolerance
     of a step.
     """
-    found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
+    way = Way(rtol, rtol)
+    found = trace_record(model, record, start, wanted, stop=stop, way=way, output=output)
     count = len(wanted)
     return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
 
@@ -90,8 +92,9 @@ def trace_record(
     stop: int,
     way: Way,
     by_start: bool = True,
+    output: str = OUTPUT,
 ) -> Traced:
-    """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m).
+    """Return one output (n,) and its derivatives by `wanted` and `start` (n, k + m).
 
     By `wanted` (n, k) alone if those `by_start` are not asked for.
     """
@@ -118,7 +121,7 @@ def trace_record(
         u,
         x0,
         way=way,
-        output=OUTPUT,
+        output=output,
         unknowns=unknowns,
         s0=s0,
         steps_limit=_STEPS,
@@ -157,6 +160,32 @@ def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
     }
 
 
+def traced_by_theta(
+    model: Model,
+    record: Record,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    index: int,
+    *,
+    stop: int,
+    way: Way,
+    slopes: FloatArray,
+    output: str = OUTPUT,
+) -> tuple[FloatArray, FloatArray, str]:
+    """Return an output (stop,) of one record, its derivative by theta, and the way it was run.
+
+    Without the sensor's offset. `slopes` are `unknowns.slopes(theta)`.
+    """
+    current = model.with_values(unknowns.values(theta))
+    start = unknowns.start(theta, index)
+    found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
+    count = len(unknowns.names)
+    start_slopes = unknowns.place_slopes(theta, index)[0]
+    by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
+    by_theta[:count, :count] = slopes
+    return found.output, found.sensitivity @ by_theta, found.way
+
+
 def predict(
     model: Model,
     experiments: Sequence[Experiment],
@@ -172,31 +201,23 @@ def predict(
     Records are simulated side by side; `differentiated` or not, in which case the Jacobian has no
     columns.
     """
-    current = model.with_values(unknowns.values(theta))
     slopes = unknowns.slopes(theta)
 
     def one(index: int) -> Prediction:
         experiment = experiments[index]
         stop = experiment.record.n if everything else experiment.stop
-        found = trace_record(
-            current,
-            experiment.record,
-            unknowns.start(theta, index),
-            unknowns.names if differentiated else (),
-            stop=stop,
-            way=way,
-            by_start=differentiated,
-        )
-        shown = found.output + unknowns.offset(theta, index)
         if not differentiated:
+            current, start = model.with_values(unknowns.values(theta)), unknowns.start(theta, index)
+            found = trace_record(
+                current, experiment.record, start, (), stop=stop, way=way, by_start=False
+            )
+            shown = found.output + unknowns.offset(theta, index)
             return Prediction(shown, found.sensitivity, found.way)
-        start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
-        count = len(unknowns.names)
-        by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
-        by_theta[:count, :count] = slopes
-        jacobian = found.sensitivity @ by_theta
-        jacobian += offset_slopes
-        return Prediction(shown, jacobian, found.way)
+        x, jacobian, way_taken = traced_by_theta(
+            model, experiment.record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
+        )
+        jacobian += unknowns.place_slopes(theta, index)[1]
+        return Prediction(x + unknowns.offset(theta, index), jacobian, way_taken)
 
     return side_by_side(one, range(len(experiments)))
 

@@ -29,6 +29,10 @@ COLUMNS: dict[str, Column] = {
         Column("load_force", ("force",), "load_force [N]"),
         Column("current", ("current",), "current [mA]"),
         Column("temperature", ("temperature",), "temperature [degC]"),
+        Column("monitor_voltage", ("voltage",), "monitor_voltage [V]"),
+        Column("charge", ("charge",), "charge [uC]"),
+        Column("displacement_2", ("length",), "displacement_2 [um]"),
+        Column("strain", ("ratio",), "strain [ppm]"),
     )
 }
 
@@ -53,7 +57,10 @@ class Source:
 ColumnMap = Mapping[str, Source]
 
 #: Where nobody names a unit, a column is taken to be in this one; a displacement never is.
-SI_UNITS = {"time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K"}
+SI_UNITS = {
+    "time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K",
+    "monitor_voltage": "V", "charge": "C", "strain": "1",
+}  # fmt: skip
 
 _HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 
@@ -220,7 +227,10 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
     except InputError as error:
         problems.add(f"{where}: {error}")
         return
-    if parsed.quantity not in column.quantities:
+    compound = not parsed.quantity and any(
+        parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in column.quantities
+    )
+    if parsed.quantity not in column.quantities and not compound:
         problems.add(
             f"{where}: the unit '{unit}' does not measure {column.quantities[0]}; correct it to "
             f"one of {accepted}."

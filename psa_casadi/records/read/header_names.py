@@ -23,6 +23,15 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "load_force": ("load_force", "load force", "force", "load", "f", "kraft"),
     "current": ("current", "i", "drive current", "strom"),
     "temperature": ("temperature", "temp", "temperatur"),
+    "monitor_voltage": (
+        "monitor_voltage", "monitor voltage", "voltage monitor", "monitor", "v_mon", "u_mon",
+        "vmon", "monitorspannung",
+    ),
+    "charge": ("charge", "q", "ladung"),
+    "displacement_2": (
+        "displacement_2", "displacement 2", "second displacement", "x2", "x_2", "y2",
+    ),
+    "strain": ("strain", "strain gauge", "dehnung"),
 }  # fmt: skip
 _COLUMN_OF = {alias: column for column, names in ALIASES.items() for alias in names}
 #: A name and its unit: in brackets of any form, after a slash, an underscore or a space.

@@ -29,6 +29,7 @@ from psa_casadi.report.words.series import Series, most_telling, series_of
 from psa_casadi.report.words.tables import (
     blind_table,
     candidate_table,
+    column_table,
     error_table,
     parameter_table,
     record_table,
@@ -52,6 +53,7 @@ def write_report(
     add_misfit(page, d)
     add_evidence(page, d)
     add_causes(page, d)
+    _columns(page, d)
     _gain(page, d)
     _rest(page, d)
     _details(page, d, series, origin)
@@ -95,6 +97,13 @@ def _tiles(d: Diagnosis) -> list[tuple[str, str, str]]:
         interval = f"95 % interval {low:.0f} to {high:.0f} %"
         tiles.append(("held-out error falls by", gain, interval))
     return tiles
+
+
+def _columns(page: Document, d: Diagnosis) -> None:
+    if d.columns:
+        page.section("What the further columns decided")
+        page.bullets(c.sentence for c in d.columns)
+        page.table(column_table(d))
 
 
 def _gain(page: Document, d: Diagnosis) -> None:

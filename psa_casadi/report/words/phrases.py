@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from psa_casadi.diagnosis.residual.misfit import Misfit
-from psa_casadi.diagnosis.result import Alternative, Candidate, Cause, Diagnosis
+from psa_casadi.diagnosis.result import Alternative, Candidate, Cause, Decision, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.units import convert
 
@@ -221,6 +221,15 @@ def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
         f" displacement differs by up to {apart} ({number(a.plant_differs_percent, 2)} % of range),"
         " which these data do not decide"
     )
+
+
+def column_sentence(d: Diagnosis, c: Decision) -> str:
+    """Say what a further column decided, and what the models miss of it in held-out samples."""
+    if c.base_rms is None or c.noise is None or c.extended_rms is None:
+        return c.sentence
+    after = f", extended {number(c.extended_rms)}" if added(d) else ""
+    errors = f"base {number(c.base_rms)}{after}, noise {number(c.noise)}"
+    return f"{c.sentence} Held-out rms: {with_unit(errors, c.unit)}."
 
 
 def cause_size(d: Diagnosis, cause: Cause) -> str:

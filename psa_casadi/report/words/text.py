@@ -18,6 +18,7 @@ from psa_casadi.report.words.phrases import (
     added,
     alternative_sentence,
     cause_size,
+    column_sentence,
     length_scale,
     listing,
     number,
@@ -58,6 +59,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
     for cause in d.causes:
         lines.append(("cause", _cause(d, cause)))
         lines.append(("rivals", _rivals(d, cause)))
+    lines.extend(("column", column_sentence(d, c)) for c in d.columns)
     lines.extend(("export", f"{alternative_sentence(d, a)}.") for a in d.alternatives)
     spent = budget_sentence(d, scale)
     if spent and d.verdict not in ("adequate", "not_driven"):
