@@ -14,6 +14,7 @@ from psa_casadi.cli.screen import (
     Origin,
     OriginOption,
     Quiet,
+    SampleTimeOption,
     show,
     show_table,
     tell_written,
@@ -30,7 +31,7 @@ def diagnose(
     records: Annotated[
         list[Path],
         typer.Argument(
-            help="Records of one device: CSV, MATLAB or Parquet files.", show_default=False
+            help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
         ),
     ],
     holdout: Annotated[
@@ -73,6 +74,7 @@ def diagnose(
         ),
     ] = False,
     columns: ColumnsOption = None,
+    sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
     effects: EffectsOption = None,
     quiet: Quiet = False,
@@ -104,7 +106,7 @@ def diagnose(
             given.stiffness(stiffness)
             given.outputs({**outputs, "--next": following}, [*records, *held, model])
             _keep_apart(given, output, model)
-            found = given.records(records, held_out=held, columns=columns)
+            found = given.records(records, held_out=held, columns=columns, sample_time=sample_time)
             start = given.model(model)
             given.check()
         count = len(records)

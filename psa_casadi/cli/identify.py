@@ -13,6 +13,7 @@ from psa_casadi.cli.screen import (
     Origin,
     OriginOption,
     Quiet,
+    SampleTimeOption,
     show,
     tell_written,
     width,
@@ -35,7 +36,7 @@ def identify(
     records: Annotated[
         list[Path],
         typer.Argument(
-            help="Records of one device: CSV, MATLAB or Parquet files.", show_default=False
+            help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="MODEL.json to write.")],
@@ -54,6 +55,7 @@ def identify(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
     columns: ColumnsOption = None,
+    sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
     effects: EffectsOption = None,
     quiet: Quiet = False,
@@ -72,7 +74,7 @@ def identify(
         given.add("--method paper starts from no model; leave --model or --method out.")
     given.stiffness(stiffness)
     given.outputs({"--output": output, "--report": report}, [*records, model])
-    measured = given.records(records, columns=columns)
+    measured = given.records(records, columns=columns, sample_time=sample_time)
     start = given.model(model)
     given.check()
     with working("identifying", quiet) as progress:

@@ -50,6 +50,11 @@ ColumnsOption = Annotated[
     ),
 ]
 
+SampleTimeOption = Annotated[
+    float | None,
+    typer.Option("--sample-time", help="Time from sample to sample [s], for files without a time."),
+]
+
 
 HistoryOption = Annotated[
     str | None,

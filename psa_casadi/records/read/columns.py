@@ -118,9 +118,8 @@ def _by_other_names(
     with the line to type.
     """
     known = [(index, text, understood(text)) for index, text in strangers]
-    open_ones = [n for n in COLUMNS if n not in fields and n not in wanted]
-    left = [(index, text) for index, text, name in known if name is None]
-    for column in open_ones:
+    undecided: dict[str, list[tuple[int, str]]] = {}
+    for column in [n for n in COLUMNS if n not in fields and n not in wanted]:
         cells = [(i, t, n.unit) for i, t, n in known if n is not None and n.column == column]
         with_unit = [c for c in cells if c[2] is not None]
         if len(with_unit) == 1:
@@ -128,15 +127,17 @@ def _by_other_names(
             check_unit(COLUMNS[column], unit, f"{where}, column '{text}'", problems)
             fields[column] = Field(index, unit or "")
         elif cells and column in required:
-            texts = {column: cells[0][1]}
-            texts |= {n.column: t for _, t, n in known if n is not None and n.column != column}
-            why = "has no unit" if len(cells) == 1 else "may be more than one column"
-            problems.add(
-                f"{where}: '{column}' {why} ({', '.join(t for _, t, _ in cells)}); say which, and "
-                f"in which unit: {ready_line(required, texts)}"
-            )
-            fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
-    return left
+            undecided[column] = [(i, t) for i, t, _ in cells]
+    asked = [r for r in required if r not in fields and r not in wanted]
+    texts = {column: cells[0][1] for column, cells in undecided.items()}
+    for column, cells in undecided.items():
+        why = "has no unit" if len(cells) == 1 else "may be more than one column"
+        problems.add(
+            f"{where}: '{column}' {why} ({', '.join(t for _, t in cells)}); say which, and "
+            f"in which unit: {ready_line(asked, texts)}"
+        )
+        fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
+    return [(index, text) for index, text, name in known if name is None]
 
 
 def ready_line(required: Sequence[str], texts: Mapping[str, str] | None = None) -> str:
@@ -231,6 +232,7 @@ def _report_missing(
         for name in strangers
         if (near := difflib.get_close_matches(_plain(name), absent, n=1, cutoff=0.8))
     }
+    missing = [name for name in absent if name in required and name not in meant]
     for name in absent:
         if name in meant:
             problems.add(
@@ -241,8 +243,17 @@ def _report_missing(
             found = ", ".join([*fields, *filter(None, strangers)]) or "nothing"
             problems.add(
                 f"{where}: the column '{name}' is missing (found: {found[:120]}); add it to the "
-                f"header as '{COLUMNS[name].example}'."
+                f"header as '{COLUMNS[name].example}'{_or_type(name, missing, strangers)}."
             )
+
+
+def _or_type(name: str, missing: Sequence[str], strangers: Sequence[str]) -> str:
+    """Return, behind the last missing column, the option that says which cells are meant."""
+    others = [s.strip() for s in strangers if s.strip() and not set(s) & set(",=:[]")]
+    if name != missing[-1] or len(others) < len(missing):
+        return " (or give --sample-time)" if name == "time" else ""
+    line = ready_line(missing, dict(zip(missing, others, strict=False))).removesuffix(".")
+    return f", or say which column it is: {line}"
 
 
 def _is_number(text: str) -> bool:
