@@ -14,15 +14,20 @@ Cell = float | str | None
 
 
 def xlsx(*sheets: Sequence[Sequence[Cell]]) -> bytes:
-    """Return a workbook with these sheets."""
+    """Return a workbook with these sheets, without dates."""
     book = Workbook()
     book.remove(book.worksheets[0])
     for rows in sheets:
         sheet = book.create_sheet()
         for row in rows:
             sheet.append(row)
-    stream = io.BytesIO()
-    book.save(stream)
+    stream, dated = io.BytesIO(), io.BytesIO()
+    book.save(dated)
+    with zipfile.ZipFile(dated) as parts, zipfile.ZipFile(stream, "w") as archive:
+        for name in parts.namelist():
+            if name == "docProps/core.xml":
+                continue
+            archive.writestr(zipfile.ZipInfo(name), parts.read(name), zipfile.ZIP_DEFLATED)
     return stream.getvalue()
 
 
@@ -55,6 +60,12 @@ def hdf5(
                 file[name].attrs["units"] = units[name]
         file.attrs.update(attributes or {})
     return stream.getvalue()
+
+
+def named(t: ArrayLike, u: ArrayLike, x: ArrayLike) -> NDArray[np.generic]:
+    """Return a record as an array with fields."""
+    rows = [tuple(row) for row in np.column_stack([t, u, x])]
+    return np.array(rows, dtype=[("time", "f8"), ("voltage", "f8"), ("displacement_um", "f8")])
 
 
 def npy(array: NDArray[np.generic]) -> bytes:

@@ -10,7 +10,7 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record, record_from
-from tests.laboratory_bytes import gcs, hdf5, lvm, npy, npz, tdms, xlsx
+from tests.laboratory_bytes import gcs, hdf5, lvm, named, npy, npz, tdms, xlsx
 
 N = 20
 T = np.arange(N) * 1e-3
@@ -40,7 +40,7 @@ WAVES = {
 H5_UNITS = {"run/t": "s", "run/drive voltage": "V", "run/sensor position": "um"}
 H5 = dict(zip(H5_UNITS, (T, V, X), strict=True))
 VX_ROWS = [row[1:] for row in ROWS]
-FIELDS = np.rec.fromarrays([T, V, X], names="time,voltage,displacement_um")
+FIELDS = named(T, V, X)
 
 #: Files that are read as they are, by what they are; the name says the ending.
 READ: dict[str, bytes] = {

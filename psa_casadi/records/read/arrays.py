@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ def collected(arrays: Iterable[tuple[str, Array]]) -> dict[str, Array]:
     return found
 
 
-def series(name: str, numbers: Numbers, unit: object = None) -> Iterator[tuple[str, Array]]:
+def series(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator[tuple[str, Array]]:
     """Yield the series in an array of numbers: itself, its fields, or its columns counted from 1.
 
     Series lie along the longer side of a matrix. What is neither is left out.

@@ -129,14 +129,14 @@ def _by_other_names(
         elif cells and column in required:
             undecided[column] = [(i, t) for i, t, _ in cells]
     asked = [r for r in required if r not in fields and r not in wanted]
-    texts = {column: cells[0][1] for column, cells in undecided.items()}
-    for column, cells in undecided.items():
-        why = "has no unit" if len(cells) == 1 else "may be more than one column"
+    texts = {column: found[0][1] for column, found in undecided.items()}
+    for column, found in undecided.items():
+        why = "has no unit" if len(found) == 1 else "may be more than one column"
         problems.add(
-            f"{where}: '{column}' {why} ({', '.join(t for _, t in cells)}); say which, and "
+            f"{where}: '{column}' {why} ({', '.join(t for _, t in found)}); say which, and "
             f"in which unit: {ready_line(asked, texts)}"
         )
-        fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
+        fields[column] = Field(found[0][0], SI_UNITS.get(column, "um"))
     return [(index, text) for index, text, name in known if name is None]
 
 

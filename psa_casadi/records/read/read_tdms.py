@@ -1,6 +1,7 @@
 """The channels of TDMS files, which LabVIEW writes, with units and time as they are stated."""
 
 import io
+import logging
 from collections.abc import Iterator
 from typing import Any
 
@@ -23,11 +24,13 @@ def tdms_arrays(path: str, data: bytes) -> dict[str, Array]:
     try:
         # an optional dependency, needed for these files only
         import nptdms  # noqa: PLC0415
+        from nptdms.log import log_manager  # noqa: PLC0415
     except ImportError:
         raise InputError(
             f"{path}: reading TDMS needs npTDMS, which is not installed; run "
             f"`pip install 'psa-casadi[tdms]'`, or export the record as CSV."
         ) from None
+    log_manager.set_level(logging.CRITICAL)  # it tells of damage on the terminal
     try:
         with nptdms.TdmsFile.open(io.BytesIO(data)) as file:
             channels = [c for group in file.groups() for c in group.channels()]

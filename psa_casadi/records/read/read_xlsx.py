@@ -90,6 +90,7 @@ def _sheet(path: str, book: Any) -> list[str]:
 
 
 def _lines(path: str, sheet: Any) -> Iterator[str]:
+    sheet.reset_dimensions()  # what a sheet states of its size is often wrong
     cells = 0
     for number, row in enumerate(sheet.iter_rows(values_only=True)):
         cells += len(row) + 1
