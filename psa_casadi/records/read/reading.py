@@ -15,7 +15,7 @@ import numpy as np
 
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.checks import (
+from psa_casadi.records.checks import (
     Located,
     check_complete,
     check_displacement,
