@@ -2,6 +2,7 @@ import hashlib
 import math
 import time as clock
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -217,7 +218,7 @@ def test_writing_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
     ],
 )
 def test_arrays_are_checked_as_files_are(column: str, values: FloatArray, sentence: str) -> None:
-    sound = {"time": T, "voltage": T, "displacement": 1e-6 * T}
+    sound: dict[str, Any] = {"time": T, "voltage": T, "displacement": 1e-6 * T}
     assert Record(name="r", **sound).n == 24
     with pytest.raises(InputError, match=sentence):
         Record(name="r", **{**sound, column: values})
@@ -225,4 +226,4 @@ def test_arrays_are_checked_as_files_are(column: str, values: FloatArray, senten
 
 def test_a_record_is_made_by_keywords() -> None:
     with pytest.raises(TypeError, match="positional"):
-        Record("r", T, T)  # type: ignore[misc]
+        Record("r", T, T)  # type: ignore[call-arg]

@@ -15,6 +15,7 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     SampleTimeOption,
+    SmallOption,
     show,
     show_table,
     tell_written,
@@ -73,6 +74,7 @@ def diagnose(
             "--timings", help="Print what each stage took: time, processor time, simulations."
         ),
     ] = False,
+    small: SmallOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -123,7 +125,7 @@ def diagnose(
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = following or _beside(json or report)
-            d, unpatched = _finish(d, place, outputs, origin.value, progress)
+            d, unpatched = _finish(d, place, outputs, (origin.value, small), progress)
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
@@ -143,20 +145,24 @@ def _finish(
     d: "Diagnosis",
     following: Path | None,
     outputs: Mapping[str, Path | None],
-    origin: str,
+    page: tuple[str, bool],
     progress: Callable[[str], None],
 ) -> "tuple[Diagnosis, str]":
-    """Design what follows and write all files; return the diagnosis and why a patch is missing."""
+    """Design what follows and write all files; return the diagnosis and why a patch is missing.
+
+    `page` says what the page calls the records, and whether it is small.
+    """
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
 
     written: list[Path] = []
+    origin, small = page
     try:
         with stage("next experiment"):
             d = _with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
-            files.write(d, {**outputs, "--patch": None}, origin, written)
+            files.write(d, {**outputs, "--patch": None}, origin, written, small=small)
         with stage("unnamed correction"):
             return d, _write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:

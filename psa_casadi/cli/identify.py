@@ -14,6 +14,7 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     SampleTimeOption,
+    SmallOption,
     show,
     tell_written,
     width,
@@ -57,6 +58,7 @@ def identify(
         Path | None, typer.Option(help="JSON file of parameters and records to write.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
+    small: SmallOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -85,7 +87,9 @@ def identify(
             found = by_paper(measured, stiffness=stiffness, progress=progress)
         else:
             found = run(measured, model=start, stiffness=stiffness, progress=progress)
-        profiles = _finish(found, output, (json, report), profile or (), origin.value, progress)
+        profiles = _finish(
+            found, output, (json, report, small), profile or (), origin.value, progress
+        )
     show(identification_text(found, origin=origin.value, width=width()), quiet)
     for found_profile in profiles:
         show("\n" + "\n".join(profile_sentences(found_profile)), quiet)
@@ -102,14 +106,14 @@ def identify(
 def _finish(
     found: "Identification",
     output: Path,
-    more: tuple[Path | None, Path | None],
+    more: tuple[Path | None, Path | None, bool],
     wanted: Sequence[str],
     origin: str,
     progress: Callable[[str], None],
 ) -> "list[Profile]":
     """Write the files and return the profiles; at an interrupt the model is kept, which it says.
 
-    `more` are the JSON file and the page.
+    `more` are the JSON file, the page, and whether that is small.
     """
     from psa_casadi.cli.interrupts import kept
     from psa_casadi.files import atomic_write
@@ -119,7 +123,7 @@ def _finish(
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.strict_json import json_text
 
-    json, report = more
+    json, report, small = more
     try:
         save_model(found.model, output)
         names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
@@ -128,7 +132,7 @@ def _finish(
             atomic_write(json, json_text(identification_file(found, profiles)))
         if report is not None and not found.interrupted:
             progress("writing the report")
-            write_fit_report(found, report, origin=origin, profiles=profiles)
+            write_fit_report(found, report, origin=origin, profiles=profiles, small=small)
         ended = found.interrupted
     except KeyboardInterrupt:
         save_model(found.model, output)

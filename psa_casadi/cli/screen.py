@@ -50,6 +50,11 @@ ColumnsOption = Annotated[
     ),
 ]
 
+SmallOption = Annotated[
+    bool,
+    typer.Option("--small", help="Page below 1 MB, for mail: one picture in place of the plots."),
+]
+
 SampleTimeOption = Annotated[
     float | None,
     typer.Option("--sample-time", help="Time from sample to sample [s], for files without a time."),
