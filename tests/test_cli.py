@@ -92,7 +92,7 @@ def test_the_version_is_one() -> None:
 def test_every_public_name_is_there() -> None:
     for name in psa_casadi.__all__:
         assert getattr(psa_casadi, name) is not None
-    assert set(psa_casadi.__all__) <= set(dir(psa_casadi))
+    assert set(dir(psa_casadi)) <= set(psa_casadi.__all__)
     with pytest.raises(AttributeError, match="no attribute 'identfy'"):
         psa_casadi.__getattr__("identfy")
 

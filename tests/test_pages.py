@@ -33,8 +33,8 @@ def test_every_page_tells_date_version_command_and_the_records_hashes(
         text = Page(path.read_text(encoding="utf-8")).text
         assert f"Written 2026-09-21 14:13 UTC by psa_casadi {psa.__version__}." in text
         assert "Command: psa diagnose 'my record.csv'" in text
-    for path, result in zip(paths, (d, found), strict=False):
-        for e in result.experiments:
+    for path, experiments in zip(paths, (d.experiments, found.experiments), strict=False):
+        for e in experiments:
             assert e.record.sha256 in path.read_text(encoding="utf-8")
 
 

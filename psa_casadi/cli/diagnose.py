@@ -22,6 +22,7 @@ from psa_casadi.cli.screen import (
     width,
     working,
 )
+from psa_casadi.cli.steps import DIAGNOSE
 
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
@@ -112,7 +113,7 @@ def diagnose(
             start = given.model(model)
             given.check()
         count = len(records)
-        with working("diagnosing", quiet) as progress:
+        with working("diagnosing", quiet, DIAGNOSE) as progress:
             try:
                 d = run(
                     found[:count],

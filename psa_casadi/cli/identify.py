@@ -20,6 +20,7 @@ from psa_casadi.cli.screen import (
     width,
     working,
 )
+from psa_casadi.cli.steps import IDENTIFY
 
 if TYPE_CHECKING:
     from psa_casadi.identification.certainty.profile import Profile
@@ -82,7 +83,7 @@ def identify(
     measured = given.records(records, columns=columns, sample_time=sample_time)
     start = given.model(model)
     given.check()
-    with working("identifying", quiet) as progress:
+    with working("identifying", quiet, IDENTIFY) as progress:
         if method is Method.PAPER:
             found = by_paper(measured, stiffness=stiffness, progress=progress)
         else:

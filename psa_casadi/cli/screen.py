@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from psa_casadi.cli.steps import PLAIN, Course, Told
+
 if TYPE_CHECKING:
     from psa_casadi.report.words.tables import Table
 
@@ -129,17 +131,25 @@ def width() -> int:
 
 
 @contextmanager
-def working(what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal."""
+def working(what: str, quiet: bool, course: Course = PLAIN) -> Iterator[Callable[[str], None]]:
+    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal.
+
+    Both tell the time so far, and the step of how many where the `course` of the work is known.
+    """
+    told = Told(what, course)
     if quiet:
         yield lambda step: None
     elif sys.stderr.isatty():
-        console = Console(stderr=True)
-        with console.status(what) as status:
-            yield lambda step: status.update(Text(f"{what}: {step}"))
+        with Console(stderr=True).status(told):
+            yield told.tell
     else:
         typer.echo(f"{what} ...", err=True)
-        yield lambda step: typer.echo(f"  {step}", err=True)
+
+        def tell(step: str) -> None:
+            told.tell(step)
+            typer.echo(f"  {told.line()}", err=True)
+
+        yield tell
 
 
 def show(text: str, quiet: bool = False) -> None:
