@@ -32,19 +32,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
     told = Told("diagnosing", DIAGNOSE)
-    assert told.line() == "diagnosing, 0 s of up to 40 s"
+    assert told.line() == "diagnosing, 0 s (most take up to 40 s)"
     clock.now = 7.4
     told.tell("screening effects")
-    expected = (
-        "diagnosing, step 3 of 6 (screening the effects), 7 s of up to 40 s: screening effects"
-    )
-    assert told.line() == expected
+    step = "diagnosing, step 3 of 6 (screening the effects)"
+    assert told.line() == f"{step}, 7 s (most take up to 40 s): screening effects"
     clock.now = 130.0
     told.tell("base fit from zero")  # parts of the work come again; the step does not go back
-    assert told.line() == (
-        "diagnosing, step 3 of 6 (screening the effects), 2 min (longer than most, which take up to"
-        " 40 s): base fit from zero"
-    )
+    assert told.line() == f"{step}, 2 min (longer than most: 40 s): base fit from zero"
     console = Console(width=200)
     with console.capture() as shown:
         console.print(told)

@@ -66,11 +66,9 @@ class Told:
         parts.append(_duration(elapsed))
         line = ", ".join(parts)
         if self._course.usual_s:
-            late = elapsed > self._course.usual_s
             usual = _duration(self._course.usual_s)
-            line += (
-                f" (longer than most, which take up to {usual})" if late else f" of up to {usual}"
-            )
+            late = elapsed > self._course.usual_s
+            line += f" (longer than most: {usual})" if late else f" (most take up to {usual})"
         return f"{line}: {self._said}" if self._said else line
 
     def __rich__(self) -> Text:
