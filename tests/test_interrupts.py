@@ -180,7 +180,7 @@ def test_a_command_says_what_it_kept(
 ) -> None:
     for home in ("diagnose", "identify"):
         module = sys.modules[f"psa_casadi.cli.{home}"]
-        monkeypatch.setattr(module, "working", lambda what, quiet: nullcontext(at(word)))
+        monkeypatch.setattr(module, "working", lambda *given: nullcontext(at(word)))
     if word == "writing":
         finished = diagnosis("cause_named")
         module = sys.modules["psa_casadi.diagnosis.diagnose"]

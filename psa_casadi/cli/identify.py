@@ -125,12 +125,14 @@ def _finish(
     from psa_casadi.strict_json import json_text
 
     json, report, small = more
+    done = [output]
     try:
         save_model(found.model, output)
         names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
         profiles = [profile(found.fit, found.experiments, n, progress=progress) for n in names]
         if json is not None:
             atomic_write(json, json_text(identification_file(found, profiles)))
+            done.append(json)
         if report is not None and not found.interrupted:
             progress("writing the report")
             write_fit_report(found, report, origin=origin, profiles=profiles, small=small)
@@ -143,4 +145,4 @@ def _finish(
     cut = found.fit.interrupted
     what = "the search was cut off" if cut else "the fit was finished before"
     mark = " (marked as interrupted)" if cut else ""
-    raise KeyboardInterrupt(kept(what, [output], [report], mark))
+    raise KeyboardInterrupt(kept(what, done, [p for p in (json, report) if p not in done], mark))
