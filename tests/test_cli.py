@@ -20,6 +20,7 @@ from psa_casadi.report.words.text import identification_text
 from psa_casadi.simulation.simulate import simulate_record
 from tests.html_page import Page, figures
 from tests.test_report import png_size
+from tests.test_schemas import valid
 
 #: The demo takes half a minute: with pytest-xdist's loadgroup it runs once, else once per process.
 pytestmark = pytest.mark.xdist_group("demo")
@@ -96,7 +97,7 @@ def test_the_version_is_one() -> None:
 def test_every_public_name_is_there() -> None:
     for name in psa_casadi.__all__:
         assert getattr(psa_casadi, name) is not None
-    assert set(psa_casadi.__all__) <= set(dir(psa_casadi))
+    assert set(dir(psa_casadi)) <= set(psa_casadi.__all__)
     with pytest.raises(AttributeError, match="no attribute 'identfy'"):
         psa_casadi.__getattr__("identfy")
 
@@ -162,11 +163,13 @@ def test_identify_starts_from_a_model_and_writes_its_page(demo: Demo, tmp_path: 
     record = demo.directory / "synthetic_record.csv"
     result = done(
         "identify", record, "--model", demo.directory / "model.json", "--stiffness", "5e7",
-        "-o", model, "--report", page, "--origin", "synthetic",
+        "-o", model, "--report", page, "--origin", "synthetic", "--json", tmp_path / "fit.json",
     )  # fmt: skip
     for part in ("k_L", "95 % interval", "N/V", "written:", "(synthetic:"):
         assert part in result.stdout
+    content = valid("identification", (tmp_path / "fit.json").read_text(encoding="utf-8"))
     found = load_model(model)
+    assert {n: p["value"] for n, p in content["parameters"].items()} == found.values
     assert found.provenance.identified_from[0][1] == read_record(record).sha256
     assert set(found.provenance.free) <= set(found.provenance.intervals)
     shown = Page(page.read_text(encoding="utf-8"))

@@ -41,7 +41,9 @@ def record_of(model: Model, seed: int, samples: int = 400) -> Record:
     voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
     x = simulate(model, time, voltage).displacement
     white = np.random.default_rng(seed).standard_normal(samples)
-    return Record(f"r{seed}", time, voltage, x + 1e-6 * seed + SIGMA * white)
+    return Record(
+        name=f"r{seed}", time=time, voltage=voltage, displacement=x + 1e-6 * seed + SIGMA * white
+    )
 
 
 def moved(unknowns: Unknowns, seed: int) -> FloatArray:
@@ -184,7 +186,10 @@ def _after_a_history(model: Model, peak: float, seed: int) -> Record:
     x = simulate(model, time, voltage).displacement
     noise = SIGMA * np.random.default_rng(seed).standard_normal(time.size)
     return Record(
-        f"h{seed}", time[~before] - time[~before][0], voltage[~before], (x + noise)[~before]
+        name=f"h{seed}",
+        time=time[~before] - time[~before][0],
+        voltage=voltage[~before],
+        displacement=(x + noise)[~before],
     )
 
 

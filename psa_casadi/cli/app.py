@@ -1,5 +1,6 @@
 """The table of subcommands."""
 
+import shlex
 import sys
 from typing import Annotated
 
@@ -23,6 +24,7 @@ from psa_casadi.cli.identify import identify
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
 from psa_casadi.cli.surroundings import prepare
+from psa_casadi.command_line import typed
 from psa_casadi.version import __version__
 
 app = typer.Typer(
@@ -98,6 +100,7 @@ app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(
 def main() -> None:
     """Run the command line."""
     prepare()
+    typed.set(shlex.join(["psa", *sys.argv[1:]]))
     try:
         guarded(app)(prog_name="psa")
     except typer.Exit as end:  # of what fails outside the commands, such as writing the help

@@ -11,6 +11,7 @@ from psa_casadi.cli.screen import (
     Quiet,
     show,
     show_table,
+    tell_written,
     working,
 )
 
@@ -34,6 +35,7 @@ def check(
         ),
     ] = None,
     columns: ColumnsOption = None,
+    json: Annotated[Path | None, typer.Option(help="JSON file of all checks to write.")] = None,
     effects: EffectsOption = None,
     timeout: Annotated[
         float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
@@ -55,11 +57,15 @@ def check(
     """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.check.check import check_fmu
+    from psa_casadi.files import atomic_write
     from psa_casadi.model.model_file import load_model
+    from psa_casadi.report.documents.check_file import check_file
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
+    from psa_casadi.strict_json import json_text
 
     given = Given(effects)
+    given.outputs({"--json": json}, [fmu, model])
     if not fmu.is_file():
         what = "is a directory" if fmu.is_dir() else "there is no such file"
         given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
@@ -78,5 +84,8 @@ def check(
         )
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)
+    if json is not None:
+        atomic_write(json, json_text(check_file(report)))
+        tell_written(json, quiet=quiet)
     if not report.passed:
         raise typer.Exit(1)

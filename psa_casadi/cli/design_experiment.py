@@ -10,6 +10,7 @@ from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
     Quiet,
+    SampleTimeOption,
     StackOption,
     show,
     show_table,
@@ -96,6 +97,7 @@ def experiment(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     columns: ColumnsOption = None,
+    sample_time: SampleTimeOption = None,
     own: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -111,7 +113,7 @@ def experiment(
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
     effects = design_given.effects(given, [*(separate or []), *(more or [])], parameter or [])
     chosen = given.model_or_stack(model, stack)
-    records = given.records(record, columns=columns) if record else []
+    records = given.records(record, columns=columns, sample_time=sample_time) if record else []
     design_given.check_noise(given, noise, correlation, starts)
     wanted = {
         "low": low, "high": high, "duration": duration, "samples": samples,

@@ -56,11 +56,13 @@ class Given:
         *,
         held_out: Sequence[Path] = (),
         columns: str | None = None,
+        sample_time: float | None = None,
     ) -> list[Record]:
         """Read records to fit, then those held out; no record may be given twice.
 
         A record to fit must have a voltage that changes, all must have a displacement. `columns` is
-        what --columns says. Nothing is read where that is not understood.
+        what --columns says. Nothing is read where that is not understood. `sample_time` [s] gives
+        the time of files without one.
         """
         wanted = self.columns(columns)
         if wanted is None:
@@ -71,7 +73,7 @@ class Given:
             # the loop's values are bound as defaults, whose types a lambda cannot state
             record = self.attempt(
                 lambda p=path, f=fitted: read_record(  # type: ignore[misc]
-                    p, need_excitation=f, columns=wanted
+                    p, need_excitation=f, columns=wanted, sample_time=sample_time
                 )
             )
             if record is None:
@@ -85,12 +87,18 @@ class Given:
             found.append(record)
         return found
 
-    def voltage(self, path: Path, *, columns: str | None = None) -> Record | None:
+    def voltage(
+        self, path: Path, *, columns: str | None = None, sample_time: float | None = None
+    ) -> Record | None:
         """Read a record whose voltage is to be applied; it need not have a displacement."""
         wanted = self.columns(columns)
         if wanted is None:
             return None
-        return self.attempt(lambda: read_record(path, need_displacement=False, columns=wanted))
+        return self.attempt(
+            lambda: read_record(
+                path, need_displacement=False, columns=wanted, sample_time=sample_time
+            )
+        )
 
     def columns(self, text: str | None) -> ColumnMap | None:
         """Return what --columns says, nothing where it is left out; None where it is wrong."""

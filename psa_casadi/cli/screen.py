@@ -12,6 +12,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from psa_casadi.characters import visible
+from psa_casadi.cli.steps import PLAIN, Course, Told
 
 if TYPE_CHECKING:
     from psa_casadi.report.words.tables import Table
@@ -50,6 +51,16 @@ ColumnsOption = Annotated[
         help="Which array of the file is which column, if the names differ:"
         " time=t:ms,voltage=log.u,displacement=m.2:um",
     ),
+]
+
+SmallOption = Annotated[
+    bool,
+    typer.Option("--small", help="Page below 1 MB, for mail: one picture in place of the plots."),
+]
+
+SampleTimeOption = Annotated[
+    float | None,
+    typer.Option("--sample-time", help="Time from sample to sample [s], for files without a time."),
 ]
 
 
@@ -122,17 +133,25 @@ def width() -> int:
 
 
 @contextmanager
-def working(what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal."""
+def working(what: str, quiet: bool, course: Course = PLAIN) -> Iterator[Callable[[str], None]]:
+    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal.
+
+    Both tell the time so far, and the step of how many where the `course` of the work is known.
+    """
+    told = Told(what, course)
     if quiet:
         yield lambda step: None
     elif sys.stderr.isatty():
-        console = Console(stderr=True)
-        with console.status(what) as status:
-            yield lambda step: status.update(Text(visible(f"{what}: {step}")))
+        with Console(stderr=True).status(told):
+            yield told.tell
     else:
         tell(f"{what} ...")
-        yield lambda step: tell(f"  {step}")
+
+        def next_step(step: str) -> None:
+            told.tell(step)
+            tell(f"  {told.line()}")
+
+        yield next_step
 
 
 def show(text: str, quiet: bool = False) -> None:

@@ -50,7 +50,9 @@ def measured(record: Record, seed: int) -> Record:
     model = stack_model("P-885.51").with_effect(EFFECTS[EFFECT], {"field_gain": GROWTH})
     x = simulate(model, record.time, record.voltage).outputs["displacement"]
     noise = NOISE * np.random.default_rng(seed).standard_normal(record.n)
-    return Record(record.name, record.time, record.voltage, x + noise)
+    return Record(
+        name=record.name, time=record.time, voltage=record.voltage, displacement=x + noise
+    )
 
 
 def said(d: Diagnosis) -> str:

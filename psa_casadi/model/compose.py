@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import Component
+from psa_casadi.component import Component, Expression
 from psa_casadi.errors import InputError
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.structure import Structure, structure_of
@@ -84,6 +84,27 @@ class Model:
             if parameter.name == name:
                 return parameter
         raise InputError([f"The model has no parameter '{name}'; it has {self.parameter_names}."])
+
+    def casadi(self) -> dict[str, Expression]:
+        """Return the equations as CasADi names them: t, x, u, p, ode and y, columns of SX symbols.
+
+        Rows are in the order of `state_names`, `input_names`, `parameter_names` and `output_names`,
+        in SI units; `parameter_vector()` holds the values of p.
+
+            dae = model.casadi()
+            f = casadi.Function("f", [dae[k] for k in "xup"], [dae["ode"], dae["y"]])
+
+        Raises:
+            InputError: the model has states that change at sample instants only, which no such
+                equations hold.
+        """
+        s = self.structure
+        if s.sampled:
+            raise InputError(
+                f"The model '{self.name}' has states that change at sample instants only"
+                f" ({', '.join(self.sampled_names)}); leave its sampled components out."
+            )
+        return {"t": s.time, "x": s.x, "u": s.u, "p": s.p, "ode": s.xdot, "y": s.y}
 
     def parameter_vector(self) -> npt.NDArray[np.float64]:
         """Return the values as a vector, shape (np,)."""

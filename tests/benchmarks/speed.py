@@ -58,7 +58,9 @@ def _record(samples: int) -> Record:
     voltage[:4] = 0.0  # at rest at first, which both take for granted
     x = simulate(_stack(), time_points, voltage).displacement
     noise = _NOISE * np.ptp(x) * np.random.default_rng(1).standard_normal(samples)
-    return Record(f"{samples} samples", time_points, voltage, x + noise)
+    return Record(
+        name=f"{samples} samples", time=time_points, voltage=voltage, displacement=x + noise
+    )
 
 
 def _wrong() -> dict[str, float]:

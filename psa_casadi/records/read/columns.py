@@ -250,6 +250,7 @@ def _report_missing(
         for name in strangers
         if (near := difflib.get_close_matches(_plain(name), absent, n=1, cutoff=0.8))
     }
+    missing = [name for name in absent if name in required and name not in meant]
     for name in absent:
         if name in meant:
             problems.add(
@@ -260,8 +261,17 @@ def _report_missing(
             found = ", ".join([*fields, *filter(None, strangers)]) or "nothing"
             problems.add(
                 f"{where}: the column '{name}' is missing (found: {found[:120]}); add it to the "
-                f"header as '{COLUMNS[name].example}'."
+                f"header as '{COLUMNS[name].example}'{_or_type(name, missing, strangers)}."
             )
+
+
+def _or_type(name: str, missing: Sequence[str], strangers: Sequence[str]) -> str:
+    """Return, behind the last missing column, the option that says which cells are meant."""
+    others = [s.strip() for s in strangers if s.strip() and not set(s) & set(",=:[]")]
+    if name != missing[-1] or len(others) < len(missing):
+        return " (or give --sample-time)" if name == "time" else ""
+    line = ready_line(dict(zip(missing, others, strict=False))).removesuffix(".")
+    return f", or say which column it is: {line}"
 
 
 def _is_number(text: str) -> bool:

@@ -2,7 +2,9 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 from psa_casadi.diagnosis.residual.misfit import Misfit
@@ -37,7 +39,28 @@ class Scale:
         return f"{number(self.factor * metres, digits)} {self.unit}"
 
 
+_PAGE: ContextVar[Scale | None] = ContextVar("unit of a page", default=None)
+
+
+@contextmanager
+def one_unit(scale: Scale) -> Iterator[None]:
+    """Show all errors in one unit meanwhile, so that those of one page can be compared."""
+    before = _PAGE.set(scale)
+    try:
+        yield
+    finally:
+        _PAGE.reset(before)
+
+
 def length_scale(largest: float, *, counts: bool = False) -> Scale:
+    """Return the unit of a page's errors, else that in which `largest` [m] is a handy number."""
+    page = _PAGE.get()
+    if counts or page is None or page.unit == "counts":
+        return handy_scale(largest, counts=counts)
+    return page
+
+
+def handy_scale(largest: float, *, counts: bool = False) -> Scale:
     """Return the unit in which a length of size `largest` [m] is a handy number."""
     if counts:
         return Scale("counts", 1.0)

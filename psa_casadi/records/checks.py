@@ -91,12 +91,12 @@ def check_complete(column: Located, problems: Problems) -> None:
         "found no value, expected a number; fill the cell or remove the {place}.",
         problems,
     )
-    _check_finite(column, problems)
+    check_finite(column, problems)
 
 
 def check_displacement(column: Located, problems: Problems) -> None:
     """Demand finite numbers, of which enough are there; missing ones are allowed."""
-    _check_finite(column, problems)
+    check_finite(column, problems)
     valid = int(np.isfinite(column.values).sum())
     if column.values.size >= FEWEST_SAMPLES > valid:
         problems.add(
@@ -116,7 +116,8 @@ def check_excitation(column: Located, problems: Problems) -> None:
         )
 
 
-def _check_finite(column: Located, problems: Problems) -> None:
+def check_finite(column: Located, problems: Problems) -> None:
+    """Demand measured numbers where there are any."""
     column.complain(
         np.isinf(column.values),
         "found {value}, expected a finite number; correct the cell or remove the {place}.",
