@@ -29,7 +29,7 @@ def noisy_record() -> Record:
     voltage = 40.0 * (1.0 - np.cos(25.0 * time)) * (1.0 - 0.5 * time)
     found = simulate(stack_model("demo"), time, voltage).displacement
     noise = NOISE * np.random.default_rng(3).standard_normal(len(time))
-    return Record("short", time, voltage, found + noise + OFFSET)
+    return Record(name="short", time=time, voltage=voltage, displacement=found + noise + OFFSET)
 
 
 @cache

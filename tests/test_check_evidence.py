@@ -55,7 +55,7 @@ def test_a_record_that_was_averaged_is_averaged_again() -> None:
     voltage = 50.0 - 50.0 * np.cos(8.0 * time)
     noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
     clean = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
-    record = Record("fast", time, voltage, clean + noise)
+    record = Record(name="fast", time=time, voltage=voltage, displacement=clean + noise)
     shorter, _ = prepared(record)
     assert shorter.n < record.n
     found = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])

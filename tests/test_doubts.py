@@ -206,7 +206,9 @@ def test_a_sensor_that_wraps_round_is_named(
 ) -> None:
     time, voltage, y = given
     period = 0.6 * np.ptp(y)
-    wrapped = Record("r", time, voltage, (y - y.min() + 0.1 * period) % period)
+    wrapped = Record(
+        name="r", time=time, voltage=voltage, displacement=(y - y.min() + 0.1 * period) % period
+    )
     with pytest.raises(
         InputError, match=r"jumps \d+ times by 1[67].\d+ um, up or down, and follows"
     ):
@@ -218,9 +220,14 @@ def test_what_jumps_otherwise_is_not_wrapped(
 ) -> None:
     time, voltage, y = given
     switched = np.where(time % 1.0 < 0.5, 0.0, voltage)
-    refuse_wrapped([scaled(given), Record("steps", time, switched, 4e-7 * switched)])
+    refuse_wrapped(
+        [
+            scaled(given),
+            Record(name="steps", time=time, voltage=switched, displacement=4e-7 * switched),
+        ]
+    )
     stray = np.where(np.isin(np.arange(600), (200, 400)), y - np.ptp(y), y)
-    refuse_wrapped([Record("stray", time, voltage, stray)])
+    refuse_wrapped([Record(name="stray", time=time, voltage=voltage, displacement=stray)])
 
 
 def test_a_rate_an_integral_and_a_rectified_displacement_are_doubted(
@@ -228,18 +235,24 @@ def test_a_rate_an_integral_and_a_rectified_displacement_are_doubted(
 ) -> None:
     time, voltage, y = given
     assert not doubtful_quantity([scaled(given)])
-    integral = Record("r", time, voltage, np.cumsum(y - y.mean()) * 5e-3)
+    integral = Record(
+        name="r", time=time, voltage=voltage, displacement=np.cumsum(y - y.mean()) * 5e-3
+    )
     assert "the rate of the displacement follows the voltage" in doubtful_quantity([integral])
-    rectified = Record("r", time, voltage, np.abs(y - y.min() - 0.5 * np.ptp(y)))
+    rectified = Record(
+        name="r", time=time, voltage=voltage, displacement=np.abs(y - y.min() - 0.5 * np.ptp(y))
+    )
     assert "V the displacement follows the voltage" in doubtful_quantity([rectified])
-    rate = Record("r", time, voltage, np.gradient(y, time))
+    rate = Record(name="r", time=time, voltage=voltage, displacement=np.gradient(y, time))
     assert "the integral of the displacement follows" in doubtful_quantity([rate])
 
 
 def test_a_voltage_in_counts_is_doubted(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
     time, voltage, y = given
     assert not doubtful_voltage([scaled(given)])
-    counts = Record("r", time, np.round(32768.0 + 200.0 * voltage), y)
+    counts = Record(
+        name="r", time=time, voltage=np.round(32768.0 + 200.0 * voltage), displacement=y
+    )
     found = diagnose([counts], effects=[])
     assert "no stack bears such a voltage, and what depends on its level" in found.doubt
     assert any("no stack bears more than 2000 V" in note for note in found.notes)
@@ -250,7 +263,10 @@ def test_hardly_a_reading_that_differs_is_refused(
 ) -> None:
     time, voltage, y = given
     ordered = np.sort(y)
-    hardly, enough = (Record("r", time, voltage, np.maximum(y, ordered[-k])) for k in (16, 17))
+    hardly, enough = (
+        Record(name="r", time=time, voltage=voltage, displacement=np.maximum(y, ordered[-k]))
+        for k in (16, 17)
+    )
     with pytest.raises(InputError, match=r"Only 15 readings of the displacement differ from"):
         refuse_few([hardly], [hardly], [])
     refuse_few([enough], [enough], [])
@@ -277,7 +293,9 @@ def test_an_odd_record_of_a_sound_stack_is_adequate(
 ) -> None:
     """A record that starts late, noise with heavy tails, runs of missing readings."""
     time, voltage, y = given
-    found = diagnose([Record("r", time + late, voltage, change(y))], effects=TABLE)
+    found = diagnose(
+        [Record(name="r", time=time + late, voltage=voltage, displacement=change(y))], effects=TABLE
+    )
     assert found.verdict == "adequate"
     assert not found.doubt
 
@@ -287,7 +305,7 @@ def test_a_voltage_with_the_other_sign_is_told(
     given: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
     time, voltage, y = given
-    found = diagnose([Record("r", time, -voltage, y)], effects=TABLE)
+    found = diagnose([Record(name="r", time=time, voltage=-voltage, displacement=y)], effects=TABLE)
     assert found.verdict == "not_driven"
     assert any("connected the other way round" in note for note in found.notes)
     assert found.next_experiment.why.startswith("Correct the record")

@@ -76,7 +76,7 @@ def test_the_reference_run_tells_the_voltage_in_few_samples() -> None:
     """A record of 6000 samples, whose voltage moves for a moment only: every eighth tells it."""
     time = np.asarray(np.arange(6000) * 1e-3, dtype=np.float64)
     voltage = 50.0 - 50.0 * np.cos(6.0 * time)
-    record = Record("long", time, voltage, 1e-7 * voltage)
+    record = Record(name="long", time=time, voltage=voltage, displacement=1e-7 * voltage)
     model = psa.stack_model("demo")
     experiments = (whole(record),)
     found = fit(model, experiments, ["k_L"], sigma=[1e-8])
@@ -98,7 +98,7 @@ def test_averaged_records_are_said_to_be() -> None:
     time = np.asarray(np.arange(8000) * 1e-4, dtype=np.float64)
     voltage = 50.0 - 50.0 * np.cos(8.0 * time)
     noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
-    record = Record("fast", time, voltage, 1e-7 * voltage + noise)
+    record = Record(name="fast", time=time, voltage=voltage, displacement=1e-7 * voltage + noise)
     shorter, factor = decimated(record, 1e-7, 1e-7)
     assert factor > 1
     experiments = (whole(shorter),)

@@ -120,7 +120,14 @@ def test_the_derivatives_of_further_columns_are_those_of_their_residuals() -> No
 
 def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_out() -> None:
     time = np.linspace(0.0, 1.0, 50)
-    r = Record("r", time, 10 * time, 1e-6 * time, monitor_voltage=time, strain=0.0 * time)
+    r = Record(
+        name="r",
+        time=time,
+        voltage=10 * time,
+        displacement=1e-6 * time,
+        monitor_voltage=time,
+        strain=0.0 * time,
+    )
     with pytest.raises(InputError, match="'monitor_voltage', but the model 'psa' does not give it"):
         columns_of(compose([FLEXURE]), [r])
     found = columns_of(starting_model([r]), [r])
@@ -136,12 +143,14 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
 
 
 def test_a_monitor_goes_along_into_plant_and_file(tmp_path: Path) -> None:
-    model = starting_model([Record("r", *_line())])
+    time, voltage, displacement = _line()
+    r = Record(name="r", time=time, voltage=voltage, displacement=displacement)
+    model = starting_model([r])
     model = model.with_components((*model.components, MONITOR))
     psa.save_model(model, tmp_path / "m.json")
     again = psa.load_model(tmp_path / "m.json").plant()
     assert "monitor_voltage" in again.output_names
-    run = simulate(again.with_values({"monitor_scale": 0.1}), *_line()[:2])
+    run = simulate(again.with_values({"monitor_scale": 0.1}), time, voltage)
     np.testing.assert_allclose(run.outputs["monitor_voltage"], 0.1 * run.states["u"])
 
 

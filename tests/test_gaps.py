@@ -23,7 +23,12 @@ def whole() -> Record:
     stack = draw_stack(rng)
     voltage = np.round(0.95 * stack.u_rated * np.concatenate([np.zeros(10), loops(rng, 890)]), 3)
     y = simulate_base(stack, T, voltage).displacement
-    return Record("r", T, voltage, y + 2e-4 * np.ptp(y) * rng.standard_normal(y.size))
+    return Record(
+        name="r",
+        time=T,
+        voltage=voltage,
+        displacement=y + 2e-4 * np.ptp(y) * rng.standard_normal(y.size),
+    )
 
 
 def without(record: Record, *ranges: tuple[int, int]) -> Record:
@@ -31,7 +36,12 @@ def without(record: Record, *ranges: tuple[int, int]) -> Record:
     for a, b in ranges:
         kept[a:b] = False
     assert record.displacement is not None
-    return Record("r", record.time[kept], record.voltage[kept], record.displacement[kept])
+    return Record(
+        name="r",
+        time=record.time[kept],
+        voltage=record.voltage[kept],
+        displacement=record.displacement[kept],
+    )
 
 
 def test_what_happened_in_a_gap_is_no_cause(whole: Record) -> None:
@@ -52,7 +62,7 @@ def test_parts_are_identified_together(whole: Record) -> None:
 
 
 def record(time: FloatArray, voltage: FloatArray) -> Record:
-    return Record("r", time, voltage, 1e-6 * voltage)
+    return Record(name="r", time=time, voltage=voltage, displacement=1e-6 * voltage)
 
 
 SINE = 50.0 * np.sin(2.0 * np.pi * T)

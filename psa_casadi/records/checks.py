@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import Problems
-from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import FloatArray
 
+#: Fewer samples than this describe no experiment, and judge none.
+FEWEST_SAMPLES = 16
 #: Larger numbers are no measured ones, in whatever unit; their squares would soon be infinite.
 LARGEST = 1e100
 

@@ -11,8 +11,6 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.checks import Located, check_complete, check_finite, check_time
 from psa_casadi.units import FloatArray
 
-#: Fewer samples than this describe no experiment, and judge none.
-FEWEST_SAMPLES = 16
 
 #: Columns beside time and voltage that a record may have.
 _OPTIONAL = (

@@ -67,7 +67,9 @@ class Truth:
             for n, x in given.items()
         }
         beside: dict[str, Any] = {n: x for n, x in noisy.items() if n in columns}
-        whole = Record("stack", self.run.times, self.run.command, read, **beside)
+        whole = Record(
+            name="stack", time=self.run.times, voltage=self.run.command, displacement=read, **beside
+        )
         return whole if samples is None else whole.slice(0, samples)
 
 
