@@ -11,7 +11,6 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.checks import Located, check_complete, check_finite, check_time
 from psa_casadi.units import FloatArray
 
-
 #: Columns beside time and voltage that a record may have.
 _OPTIONAL = (
     "displacement", "load_force", "current", "temperature", "monitor_voltage", "charge",
