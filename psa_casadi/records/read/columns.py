@@ -86,7 +86,8 @@ def parse_header(
         match = _HEADER.fullmatch(text.strip())
         own = match["name"].strip() if match else text
         name = _column_of(own, text, wanted)
-        if match is None or name not in COLUMNS:
+        open_unit = match is not None and match["unit"] is None and name not in wanted
+        if match is None or name not in COLUMNS or (open_unit and name in required):
             strangers.append((index, text.strip()))
         elif name in fields:
             problems.add(
@@ -128,16 +129,22 @@ def _by_other_names(
             fields[column] = Field(index, unit or "")
         elif cells and column in required:
             undecided[column] = [(i, t) for i, t, _ in cells]
-    asked = [r for r in required if r not in fields and r not in wanted]
+    left = [(index, text) for index, text, name in known if name is None]
     texts = {column: found[0][1] for column, found in undecided.items()}
+    others = (text for _, text in left if text)
+    for column in required:
+        if column not in (*fields, *wanted, *texts):
+            texts[column] = next(others, "")
+    asked = [column for column in required if texts.get(column)]
     for column, found in undecided.items():
         why = "has no unit" if len(found) == 1 else "may be more than one column"
         problems.add(
-            f"{where}: '{column}' {why} ({', '.join(t for _, t in found)}); say which, and "
-            f"in which unit: {ready_line(asked, texts)}"
+            f"{where}: '{column}' {why} ({', '.join(t for _, t in found)}); write "
+            f"'{COLUMNS[column].example}' in the header, or say which column it is, and in which "
+            f"unit: {ready_line(asked, texts)}"
         )
         fields[column] = Field(found[0][0], SI_UNITS.get(column, "um"))
-    return [(index, text) for index, text, name in known if name is None]
+    return left
 
 
 def ready_line(required: Sequence[str], texts: Mapping[str, str] | None = None) -> str:
