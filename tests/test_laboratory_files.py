@@ -133,6 +133,10 @@ OPEN: dict[str, bytes] = {
     "names without units": text("Elapsed time,Drive voltage,Position"),
     "no header": text(),
     "no header, spaces": text(delimiter=" "),
+    "an oscilloscope, settings above": text(
+        "Record Length,20,Points", "Sample Interval,0.001,s", "TIME,CH1,CH2"
+    ),
+    "an oscilloscope, names below settings": text("Model,X,1", "x-axis,1,2"),
     "LabVIEW, untitled.lvm": lvm(["Untitled", "Untitled 1"], ROWS),
     "data recorder.dat": gcs(
         ["Voltage of output channel 1", "Current Position of axis 1"], VX_ROWS
@@ -242,3 +246,11 @@ def test_a_mistake_in_a_workbook_is_told_with_its_row(tmp_path: Path) -> None:
     path = kept(tmp_path, "a.xlsx", xlsx([["t [s]", "V [V]", "x [um]"], *rows]))
     with pytest.raises(InputError, match="line 6, column 'voltage': found 'off'"):
         read_record(path)
+
+
+def test_units_below_names_that_are_none_are_kept(tmp_path: Path) -> None:
+    path = kept(tmp_path, "a", text("x-axis,1,2", "second,Volt,Volt"))
+    with pytest.raises(InputError, match="gives the unit 'V', --columns gives 'um'"):
+        read_record(path, columns="time=x-axis,voltage=1,displacement=2:um")
+    path.write_bytes(text("x-axis,1,2", "second,Volt,um"))
+    assert_read(path, "time=x-axis,voltage=1,displacement=2")

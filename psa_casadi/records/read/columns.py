@@ -94,7 +94,8 @@ def parse_header(
         match = _HEADER.fullmatch(text.strip())
         own = match["name"].strip() if match else text
         name = _column_of(own, text, wanted)
-        if match is None or name not in COLUMNS:
+        open_unit = match is not None and match["unit"] is None and name not in wanted
+        if match is None or name not in COLUMNS or (open_unit and name in required):
             strangers.append((index, text.strip()))
         elif name in fields:
             problems.add(
@@ -138,15 +139,23 @@ def _by_other_names(
         elif cells and column in required:
             unclear[column] = [text for _, text, _ in cells]
             fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
+    left = [(index, text) for index, text, name in known if name is None]
     if unclear:
         told = (
             f"'{name}' {'has no unit' if len(own) == 1 else 'may be more than one column'}"
             f" ({', '.join(own)})"
             for name, own in unclear.items()
         )
-        line = ready_line({name: own[0] for name, own in unclear.items()}, wanted)
-        problems.add(f"{where}: {', '.join(told)}; say which, and in which unit: {line}")
-    return [(index, text) for index, text, name in known if name is None]
+        texts = {name: own[0] for name, own in unclear.items()}
+        others = (text for _, text in left if text)
+        texts |= {name: next(others, "") for name in required if name not in (*fields, *wanted)}
+        line = ready_line({name: texts[name] for name in required if texts.get(name)}, wanted)
+        examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
+        problems.add(
+            f"{where}: {', '.join(told)}; write {examples} in the header, or say which, and in"
+            f" which unit: {line}"
+        )
+    return left
 
 
 def ready_line(cells: Mapping[str, str], wanted: ColumnMap | None = None) -> str:
