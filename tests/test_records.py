@@ -210,8 +210,8 @@ def test_writing_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("column", "values", "sentence"),
     [
-        ("time", T[::-1], "sample 1, column 'time': time goes back"),
-        ("time", np.zeros(24), "sample 1, column 'time': time stands still"),
+        ("time", T[::-1], "sample 1 the first of them: the samples are not in the order of time"),
+        ("time", np.zeros(24), "sample 1 the first of them: their time stands still"),
         ("voltage", np.where(T < 1.0, np.nan, T), "sample 0, column 'voltage': found no value"),
         ("current", np.full(24, np.inf), "column 'current': found inf, expected a finite number"),
         ("displacement", np.full(24, 1e200), "expected a measured number, below 1e[+]100"),
