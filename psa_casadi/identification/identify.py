@@ -153,7 +153,7 @@ def identify(
                 experiments,
                 best.predicted(experiments),
                 by="psa identify",
-                sampled=given_records,
+                sampled=parts,
             )
             progress("what further records would tell")
             advised = advice(best, experiments, determined, force_scale_given=given)

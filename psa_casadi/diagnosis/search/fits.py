@@ -52,19 +52,17 @@ def with_cause(
 def with_causes(
     before: Hypothesis, experiments: Sequence[Experiment], start: Together, goal: float = np.inf
 ) -> Hypothesis | None:
-    """Fit quickly with several more causes at once, but those it has; None if that fails."""
-    new = [
-        (d, gain)
+    """Fit quickly with several more causes at once; None if that fails."""
+    added = [
+        (d.effect, d.values, d.unit_gain if d.finite else gain)
         for d, gain in zip(start.directions, start.gains, strict=True)
-        if d.effect not in before.causes
     ]
-    added = [(d.effect, d.values, d.unit_gain if d.finite else gain) for d, gain in new]
     memory = tuple(
-        {k: v for d, _ in new for k, v in d.memory[r].items()} | own
+        {k: v for d in start.directions for k, v in d.memory[r].items()} | own
         for r, own in enumerate(before.fit.starts())
     )
     quick = fit_with_all(before.fit, experiments, added, memory, {}, _AFRESH, goal)
-    causes = (*before.causes, *(d.effect for d, _ in new))
+    causes = (*before.causes, *(d.effect for d in start.directions))
     return hypothesis(causes, quick, experiments)
 
 

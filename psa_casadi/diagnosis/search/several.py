@@ -1,8 +1,7 @@
 """Several causes at once: from the base to the sets of effects that promise most together."""
 
-from psa_casadi.diagnosis.screening.sets import Together, best_sets
+from psa_casadi.diagnosis.screening.sets import best_sets
 from psa_casadi.diagnosis.search.fits import with_causes
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.task import Task
@@ -18,8 +17,7 @@ _SETS = 4
 def fit_sets(known: Known, task: Task) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
-    The cause that explains most alone may stand for several, and hold the search there. A set that
-    holds it begins where its fit ended.
+    The cause that explains most alone may stand for several, and hold the search there.
     """
     root, price = known.root, known.scale.price
     view, alike = known.view(root), task.alike(root.fit)
@@ -32,12 +30,6 @@ def fit_sets(known: Known, task: Task) -> None:
     starts = [s for s in ranked if s.names not in known.found][:_SETS]
     said = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes at once: fitting {said}")
-    best = known.best()
-
-    def fitted(start: Together) -> Hypothesis | None:
-        before = best if best.names <= start.names else root
-        goal = cost_beside(best.fit, before.fit, task.experiments)
-        return with_causes(before, task.experiments, start, goal)
-
-    for found in side_by_side(fitted, starts):
+    goal = cost_beside(known.best().fit, root.fit, task.experiments)
+    for found in side_by_side(lambda s: with_causes(root, task.experiments, s, goal), starts):
         known.note(found)
