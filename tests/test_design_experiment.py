@@ -203,7 +203,7 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
     assert told.factor("sine") > 1.0
     assert told.factor("triangle") > 1.0
     assert "plays" not in " ".join(sentences(told, None))
-    assert "3 plays, each from rest" in " ".join(sentences(replace(told, plays=3), None))
+    assert "3 runs, each from rest" in " ".join(sentences(replace(told, plays=3), None))
     assert "look alike" in " ".join(sentences(replace(told, plays=None), None))
     rival = rival_of_model("base", stack_model(STACK), FREE)
     sharp = informative_experiment(rival, NOISE, limits, optimality="A", kinds=kinds, effort=BRIEF)

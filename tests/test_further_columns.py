@@ -137,9 +137,8 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
     turned = replace(r, current=-np.gradient(time), monitor_voltage=None, strain=None)
     (said,) = columns_of(starting_model([turned]), [turned]).left_out
     assert "does not follow the voltage as a capacitance's does" in said
-    gap = replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
-    with pytest.raises(InputError, match="missing samples"):
-        columns_of(starting_model([gap]), [gap])
+    with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
+        replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
 
 
 def test_a_monitor_goes_along_into_plant_and_file(tmp_path: Path) -> None:

@@ -32,9 +32,9 @@ def event_indicators(fmu: Fmu) -> Iterator[str]:
     """As many as announced, equal to their variables, alive, and turned round by an event.
 
     One that follows an input at rest has both signs as the inputs go either way, from a tenth to
-    many times their nominals. One that follows states, held values, parameters or time need not have both
-    within reach; it must move with one of them. After an event none is negative, for an importer
-    then waits for the next change of sign.
+    many times their nominals. One that follows states, held values, parameters or time need not
+    have both within reach; it must move with one of them. After an event none is negative, for an
+    importer then waits for the next change of sign.
     """
     names, count = fmu.indicators(), fmu.indicator_count()
     if count != len(names):

@@ -45,10 +45,6 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
                 f"The records have the column '{column}', but the model '{model.name}' does not"
                 f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
             )
-        elif not all(np.isfinite(getattr(r, column)).all() for r in given):
-            problems.append(
-                f"The column '{column}' has missing samples; fill them, or leave the column out."
-            )
         elif why := _says_nothing(column, given):
             said.append(f"{column} is left out: {why}.")
         else:
