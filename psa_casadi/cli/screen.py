@@ -60,7 +60,9 @@ SmallOption = Annotated[
 
 SampleTimeOption = Annotated[
     float | None,
-    typer.Option("--sample-time", help="Time from sample to sample \\[s], for files without a time."),
+    typer.Option(
+        "--sample-time", help="Time from sample to sample \\[s], for files without a time."
+    ),
 ]
 
 
