@@ -104,7 +104,7 @@ def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
 
 #: Badges lead to pages of the repository's host.
 LINK = re.compile(r"\]\((?!https?:|\.\./\.\./actions/)([^)#]*)(#[^)]*)?\)")
-#: Pages in the menu, of which the build makes some (tutorials, recipes) and checks the links to all.
+#: Pages in the menu: the build makes some of them (tutorials, recipes), and checks links to all.
 MENU = {
     ROOT / "docs" / p for p in re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8"))
 }

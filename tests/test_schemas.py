@@ -24,6 +24,7 @@ from psa_casadi.report.documents.schema import json_schema
 from psa_casadi.report.documents.schemas import FILES, schema_texts
 from psa_casadi.strict_json import json_text
 from psa_casadi.variables import Publication
+from tests.evidence_models import evident_model
 from tests.report_cases import diagnosis, identification, with_periodic
 
 
@@ -54,6 +55,10 @@ def test_model_files_are_as_their_schema_says(name: str) -> None:
     valid("model", dumps(model))
     published = replace(model, publication=Publication(author="A", version="1"))
     valid("model", dumps(published.with_starts({"z_c1": 1e-7})))
+
+
+def test_the_evidence_of_a_model_is_as_its_schema_says() -> None:
+    assert "evidence" in valid("model", dumps(evident_model()))
 
 
 @pytest.mark.parametrize("verdict", ["adequate", "cause_named", "ambiguous", "unexplained"])

@@ -35,7 +35,10 @@ DIAGNOSE = Course(
         _BASE,
         _FIT,
         ("screening the effects", ("the displacement with", "screening")),
-        ("trying causes", ("cause ", "several causes", "without ", "all causes", "fitting the r")),
+        (
+            "trying causes",
+            ("cause ", "several causes", "without ", "all causes", "fitting the r", "the same"),
+        ),
         ("judging", ("judging",)),
         ("files", ("comparing", "improving", "writing", "fitting the unnamed")),
     ),

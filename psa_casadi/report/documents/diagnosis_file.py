@@ -10,6 +10,7 @@ from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
     Cause,
+    Decision,
     NextExperiment,
     Remaining,
     Verdict,
@@ -82,6 +83,7 @@ class DiagnosisFile:
 
     format: Literal["psa_casadi.diagnosis/1"]
     verdict: Verdict
+    doubt: str
     causes: tuple[Cause, ...]
     candidates: tuple[Candidate, ...]
     errors: BothErrors
@@ -89,6 +91,7 @@ class DiagnosisFile:
     budget: Budget | None
     patch: UnnamedCorrection | None
     alternatives: tuple[OtherModel, ...]
+    columns: tuple[Decision, ...]
     blind_to: tuple[BlindSpot, ...]
     remaining: Remaining
     next_experiment: NextExperiment

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from psa_casadi.model.evidence import Evidence
 from psa_casadi.variables import Publication
 
 
@@ -51,3 +52,4 @@ class ModelFile:
     notes: tuple[str, ...] = ()
     identified_from: tuple[IdentifiedFrom, ...] = ()
     package_version: str = ""
+    evidence: Evidence | None = None

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from psa_casadi.variables import Interval
+
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _SIMPLE = {str: "string", float: "number", int: "integer", bool: "boolean", type(None): "null"}
 
@@ -33,6 +35,8 @@ def _schema(kind: Any, defined: dict[str, Any]) -> dict[str, Any]:
     """Return the schema of one type; records go to `defined`."""
     if kind in _SIMPLE:
         return {"type": _SIMPLE[kind]}
+    if kind is Interval:
+        return _container(tuple[float, float], defined)
     if is_dataclass(kind) and isinstance(kind, type):
         if kind.__name__ not in defined:
             defined[kind.__name__] = {}
