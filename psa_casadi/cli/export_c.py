@@ -21,6 +21,7 @@ from psa_casadi.cli.screen import (
     StartVoltageOption,
     SweepOption,
     show,
+    show_inside,
     show_table,
     tell_written,
     working,
@@ -97,11 +98,7 @@ def c(
             chosen, output, step=seconds, precision=precision.value, name=name,
             include_sensor=include_sensor, hold=hold.value, substeps=substeps,
         )  # fmt: skip
-    kept = chosen if include_sensor else chosen.plant()
-    show(f"inside: {', '.join(q.name for q in kept.components)}", quiet)
-    left_out = [q.name for q in chosen.components if q not in kept.components]
-    if left_out:
-        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
     show(step_words(seconds, found.substeps, precision.value), quiet)
     show_table(error_table({e.voltage: e.error for e in found.errors}), quiet)
     tell_written(found.header, found.source, quiet=quiet)

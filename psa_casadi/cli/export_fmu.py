@@ -22,6 +22,7 @@ from psa_casadi.cli.screen import (
     StartVoltageOption,
     SweepOption,
     show,
+    show_inside,
     show_table,
     tell_written,
     working,
@@ -133,17 +134,13 @@ def fmu(
             validity_output=validity_output,
             step=seconds,
         )
-    kept = chosen if include_sensor else chosen.plant()
+    kept = show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
     sets = write_sets(kept, parameter_sets, sets_to)
-    inside = ", ".join(c.name for c in kept.components)
-    left_out = [c.name for c in chosen.components if c not in kept.components]
-    show(f"inside: {inside}", quiet)
-    if left_out:
-        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
     show(f"start: {start_words(kept)}", quiet)
-    show(f"evidence: {evidence_words(kept, sets)}", quiet)
-    if seconds is not None:
+    if seconds is None:
+        show(f"evidence: {evidence_words(kept, sets)}", quiet)
+    else:
         with zipfile.ZipFile(output) as archive:
             fixed = json.loads(archive.read(FIXED_ENTRY))
         show(step_words(seconds, fixed["substeps"], "double"), quiet)

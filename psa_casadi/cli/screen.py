@@ -15,6 +15,7 @@ from psa_casadi.characters import visible
 from psa_casadi.cli.steps import PLAIN, Course, Told
 
 if TYPE_CHECKING:
+    from psa_casadi.model.compose import Model
     from psa_casadi.report.words.tables import Table
 
 Quiet = Annotated[
@@ -160,6 +161,16 @@ def show(text: str, quiet: bool = False) -> None:
     """Print a result, with what a terminal would obey spelled out."""
     if not quiet:
         typer.echo(visible(text))
+
+
+def show_inside(model: "Model", *, include_sensor: bool, quiet: bool) -> "Model":
+    """Print which components an export holds, and which it leaves out; return what it holds."""
+    kept = model if include_sensor else model.plant()
+    show(f"inside: {', '.join(c.name for c in kept.components)}", quiet)
+    left_out = [c.name for c in model.components if c not in kept.components]
+    if left_out:
+        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    return kept
 
 
 def tell(text: str) -> None:
