@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from psa_casadi.components import BASE
-from psa_casadi.identification.fitting import fit as fitting
+from psa_casadi.identification.fitting import minimum as fitting
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
