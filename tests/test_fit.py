@@ -237,7 +237,7 @@ def test_a_trial_whose_numbers_overflow_has_failed(monkeypatch: pytest.MonkeyPat
         one = Prediction(np.full(len(weights), 1.0), np.full((len(weights), size), 1e160), "exact")
         return [one]
 
-    monkeypatch.setattr("psa_casadi.identification.fitting.fit.predict", huge)
+    monkeypatch.setattr("psa_casadi.identification.fitting.minimum.predict", huge)
     assert evaluate(found.theta) is None
 
 
