@@ -1,13 +1,28 @@
-"""Hook of mkdocs: the page of effects is made from the table of effects."""
+"""Hook of mkdocs: the gallery of effects is made from the table of effects."""
 
+import tempfile
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+from mkdocs.structure.files import File, Files
+
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.residual.signature import signature
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES
+from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
 from psa_casadi.report.words.tables import Table, effect_parameter_table
 
-PAGE = "effects.md"
+PAGE, PICTURES = "effects.md", "pictures/effects"
+
+
+def on_files(files: Files, *, config: Any, **_: Any) -> Files:
+    """Add the picture of every effect's signature to the files of the site."""
+    for name in EFFECTS:
+        content, _caption = picture(name)
+        files.append(File.generated(config, f"{PICTURES}/{name}.png", content=content))
+    return files
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
@@ -21,21 +36,52 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
         )
         for place in places
     ]
-    return "\n\n".join([markdown, *sections, "## Several modes", section(MODAL_SERIES[FEWEST])])
+    return "\n\n".join(
+        [
+            markdown,
+            markdown_table(overview()),
+            *sections,
+            "## Several modes",
+            section(MODAL_SERIES[FEWEST]),
+        ]
+    )
+
+
+@cache
+def picture(name: str) -> tuple[bytes, str]:
+    """Return the picture of an effect's signature as PNG, and on what it is simulated."""
+    effect = EFFECTS[name]
+    seen = signature(effect)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "signature.png"
+        save_signature(effect, seen, path)
+        return path.read_bytes(), size_sentence(seen)
+
+
+def overview() -> Table:
+    """Return what every effect looks like, in a line each."""
+    rows = tuple(
+        (f"[`{e.name}`](#{e.name})", e.belongs_to, _sentence(e.looks_like))
+        for e in EFFECTS.values()
+    )
+    return Table(("effect", "in the", "what it looks like"), rows)
 
 
 def section(effect: Component) -> str:
     """Return one effect in Markdown: what it is, equation, signature, source, parameters."""
-    return "\n\n".join(
-        (
-            f"### `{effect.name}`",
-            f"{_sentence(effect.description)}",
-            "```text\n" + effect.equation_text.replace(",  ", "\n") + "\n```",
-            f"*What it looks like*: {_sentence(effect.looks_like)}",
-            f"*Source*: {_sentence(effect.source)}",
-            markdown_table(effect_parameter_table(effect)),
-        )
-    )
+    parts = [
+        f"### `{effect.name}`",
+        f"{_sentence(effect.description)}",
+        "```text\n" + effect.equation_text.replace(",  ", "\n") + "\n```",
+        f"*What it looks like*: {_sentence(effect.looks_like)}",
+        f"*Source*: {_sentence(effect.source)}",
+        markdown_table(effect_parameter_table(effect)),
+    ]
+    if effect.name in EFFECTS:
+        path, words = f"{PICTURES}/{effect.name}.png", picture(effect.name)[1]
+        shown = f"![Signature of {effect.name}. {words}]({path}){{ loading=lazy }}"
+        parts.insert(4, f"[{shown}]({path})")
+    return "\n\n".join(parts)
 
 
 def markdown_table(table: Table) -> str:

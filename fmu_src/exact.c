@@ -21,6 +21,7 @@ static void try_step(psa_state *state, const psa_level *level, long sample, real
     trial->level = level;
     for (int i = 0; i < ROWS; ++i) trial->l[i] = i < NL ? state->x[ex_linear[i]] : REAL(0.0);
     trial->dt = length * h;
+    trial->over_dt = 1.0 / trial->dt;
     trial->error = REAL(0.0);
     for (int g = 0; g < EX_NG; ++g) trial->stages[g].legs = 1;
     for (int j = 0; j < EX_NU; ++j) {
@@ -140,6 +141,18 @@ static const psa_level *gather(psa_state *state, int step, const int *level) {
 }
 #endif
 
+/* The end of the step that was tried is where the lanes are that accepted it */
+static void keep(psa_state *state, bits accepted) {
+    const psa_trial *const trial = &state->trial;
+    if (!any(~accepted)) {
+        memcpy(state->x, trial->x[WHOLE], sizeof state->x);
+        memcpy(state->port, trial->port[WHOLE], sizeof(real) * EX_NPORT);
+        return;
+    }
+    for (int i = 0; i < EX_NX; ++i) state->x[i] = choose(accepted, trial->x[WHOLE][i], state->x[i]);
+    for (int j = 0; j < EX_NPORT; ++j) state->port[j] = choose(accepted, trial->port[WHOLE][j], state->port[j]);
+}
+
 /* Steps over one interval between samples. Positions are counted in the finest lengths; a step begins at a
    multiple of its own length. Every lane goes at its own pace, as it would by itself. */
 static int next_sample(psa_state *state, long sample, psa_pace *pace) {
@@ -176,7 +189,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
             const int spent = ++pace->tried[lane] > run->steps_limit;
             if (spent && PSA_LANES == 1) return 3;
             if (error > 1.0 && level[lane] < finest && !spent) {
-                pace->level[lane]++;
+                pace->level[lane] += error > FAR && level[lane] + 1 < finest ? 2 : 1;
                 run->rejected++;
                 continue;
             }
@@ -199,9 +212,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
 #if PSA_LANES == 1
         if (run->count > 0) step_columns(state, slopes_of(state, step * (finest + 1) + level[0]));
 #endif
-        for (int i = 0; i < EX_NX; ++i) state->x[i] = choose(accepted, trial->x[WHOLE][i], state->x[i]);
-        for (int j = 0; j < EX_NPORT; ++j)
-            state->port[j] = choose(accepted, trial->port[WHOLE][j], state->port[j]);
+        keep(state, accepted);
     }
     state->t = run->t[sample + 1] + REAL(0.0);
     return 0;
@@ -238,12 +249,11 @@ APART static int set_up_columns(psa_state *state, int *theta) {
         const int none = constant ? !EX_CONSTANT : at >= 0 && at < 2 * EX_NU && zero[at % SOME(EX_NU)];
         if (!none || (k + 1 == TAIL && state->tails == 0)) state->tail[state->tails++] = k;
     }
-    for (int r = 0; r < NL + EX_NEED; ++r)
-        state->slopes_size += ex_row_size[r < NL ? r : ex_need[r - NL]] + state->tails;
+    state->slopes_size = EX_NOWN + (NL + EX_NEED) * state->tails;
     const size_t nb = (size_t)(state->blocks = (run->count + COLUMNS - 1) / COLUMNS);
     const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
     const size_t own = levels * (size_t)((state->thetas + COLUMNS - 1) / COLUMNS * state->slopes_size);
-    column *const memory = calloc(nb * (EX_NX + EX_NPORT + 1 + EX_NP) + own, sizeof(column));
+    column *const memory = lined((nb * (EX_NX + EX_NPORT + 1 + EX_NP) + own) * sizeof(column));
     if (!memory) return 2;
     state->s = memory;
     state->sport = state->s + nb * EX_NX;
@@ -270,8 +280,9 @@ APART static int set_up(psa_state *state) {
         }
         for (int i = 0; i < NL; ++i) state->scale[lane][i] = run->nominal[ex_linear[i] * run->sets + set];
     }
-    for (int i = 0; i < NL; ++i) state->inverse_nominal[i] = 1.0 / state->nominal[ex_linear[i]];
+    for (int i = 0; i < EX_NX; ++i) state->over_nominal[i] = 1.0 / state->nominal[i];
     state->tolerance = run->tolerance + REAL(0.0);
+    state->over_tolerance = 1.0 / state->tolerance;
     state->brief = v_sqrt(state->tolerance);
     psa_prepare(state->p, state->k);
     int theta[EX_NTHETA + 1];
@@ -280,11 +291,11 @@ APART static int set_up(psa_state *state) {
 #endif
     state->ladders = calloc((size_t)(run->lengths * PSA_LANES), sizeof(psa_ladder));
     const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
-    state->levels = calloc(levels, sizeof(psa_level));
+    state->levels = lined(levels * sizeof(psa_level));
     state->ready = calloc(levels, 1);
-    state->mixed = calloc(1, sizeof(psa_level));
-    real *const plain = malloc((size_t)one * sizeof(real));
-    real *const slopes = malloc((size_t)(one * (EX_NTHETA + 1)) * sizeof(real));
+    state->mixed = lined(sizeof(psa_level));
+    real *const plain = lined((size_t)one * sizeof(real));
+    real *const slopes = lined((size_t)(one * (EX_NTHETA + 1)) * sizeof(real));
     double *const lin = malloc((size_t)(one * (state->thetas + 1)) * sizeof(double));
     int status = !state->mixed || !state->ladders || !state->levels || !state->ready || !plain || !slopes || !lin ? 2 : 0;
     if (status == 0) {
@@ -301,8 +312,8 @@ APART static int set_up(psa_state *state) {
             status = build_ladder(state->ladders + step * PSA_LANES + lane, state->thetas, lin, state->scale[lane],
                                   run->length[step], run->finest + 2);
     }
-    free(plain);
-    free(slopes);
+    free_lined(plain);
+    free_lined(slopes);
     free(lin);
     return status;
 }
@@ -311,14 +322,14 @@ APART static void tear_down(psa_state *state) {
     if (state->ladders)
         for (int i = 0; i < state->run->lengths * PSA_LANES; ++i) free(state->ladders[i].blocks);
     free(state->ladders);
-    free(state->levels);
+    free_lined(state->levels);
     free(state->ready);
-    free(state->mixed);
-    free(state->s);
+    free_lined(state->mixed);
+    free_lined(state->s);
 }
 
 int psa_run_exact(psa_exact *run) {
-    psa_state *const state = calloc(1, sizeof *state);
+    psa_state *const state = lined(sizeof *state);
     if (!state) return 2;
     state->run = run;
     run->steps = run->rejected = run->forced = 0;
@@ -338,6 +349,6 @@ int psa_run_exact(psa_exact *run) {
     }
     run->t_failed = LANE(state->t, 0);
     tear_down(state);
-    free(state);
+    free_lined(state);
     return status;
 }

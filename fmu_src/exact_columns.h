@@ -44,53 +44,54 @@ static void tail_of(const psa_state *state, double *tail) {
     for (int k = 0; k < state->tails; ++k) tail[k] = every[state->tail[k]];
 }
 
-/* The same of the matrices of a level: one parameter's derivatives, in that order, row by row */
+/* The same of a row of a level's matrices, of which one parameter's derivatives are given: of the whole step, of its
+   half behind */
+static void row_of_tail(const psa_level *d, int r, double *z) {
+    const int i = r < NL ? r : ex_need[r - NL];
+    const psa_row *const row = r < NL ? NULL : &d->inner[HALF - 1][r - NL];
+    for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a1[q] : d->whole.a1[q][i];
+    for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a2[q] : d->whole.a2[q][i];
+    *z++ = row ? row->c : d->whole.c[i];
+    for (int j = 0; j < EX_NPORT; ++j)
+        for (int q = 0; q < 3; ++q) *z++ = row ? row->w[j][q] : d->whole.w[j][q][i];
+    for (int c = 0; c < EX_NCH; ++c) {
+        *z++ = row ? 0.0 : d->chord_c[c][i];
+        for (int k = 0; k < EX_NDRIVE; ++k) *z++ = row ? 0.0 : d->chord_f[c][k][i];
+        for (int q = 0; q < EX_NU; ++q) *z++ = row ? 0.0 : d->chord_a1[c][q][i];
+        for (int q = 0; q < EX_NU; ++q) *z++ = row ? 0.0 : d->chord_a2[c][q][i];
+        for (int k = 0; k < EX_NFEED; ++k)
+            for (int q = 0; q < 3; ++q) *z++ = row ? 0.0 : d->chord_w[c][k][q][i];
+    }
+}
+
+/* Write one parameter's derivatives of a level's matrices in the order of ex_own_columns */
 APART static void pack_slopes(const psa_state *state, const psa_level *d, int m, column *out) {
-    for (int r = 0; r < NL + EX_NEED; ++r) {
-        const int i = r < NL ? r : ex_need[r - NL];
-        const psa_row *const row = r < NL ? NULL : &d->inner[HALF - 1][r - NL];
-        double every[TAIL], *z = every;
-        for (int e = 0; e < ex_row_size[i]; ++e) {
-            const int j = ex_row[i][e];
-            ((double *)out++)[m] = row ? row->f[j] : d->whole.f[j][i];
-        }
-        for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a1[q] : d->whole.a1[q][i];
-        for (int q = 0; q < EX_NU; ++q) *z++ = row ? row->a2[q] : d->whole.a2[q][i];
-        *z++ = row ? row->c : d->whole.c[i];
-        for (int j = 0; j < EX_NPORT; ++j)
-            for (int q = 0; q < 3; ++q) *z++ = row ? row->w[j][q] : d->whole.w[j][q][i];
-        for (int c = 0; c < EX_NCH; ++c) {
-            *z++ = row ? 0.0 : d->chord_c[c][i];
-            for (int k = 0; k < EX_NDRIVE; ++k) *z++ = row ? 0.0 : d->chord_f[c][k][i];
-            for (int q = 0; q < EX_NU; ++q) *z++ = row ? 0.0 : d->chord_a1[c][q][i];
-            for (int q = 0; q < EX_NU; ++q) *z++ = row ? 0.0 : d->chord_a2[c][q][i];
-            for (int k = 0; k < EX_NFEED; ++k)
-                for (int q = 0; q < 3; ++q) *z++ = row ? 0.0 : d->chord_w[c][k][q][i];
-        }
-        for (int k = 0; k < state->tails; ++k) ((double *)out++)[m] = every[state->tail[k]];
+    double every[NL + EX_NEED][TAIL];
+    for (int r = 0; r < NL + EX_NEED; ++r) row_of_tail(d, r, every[r]);
+    for (int first = 0; first < NL + EX_NEED; first += EX_CHUNK) {
+        const int last = first + EX_CHUNK < NL + EX_NEED ? first + EX_CHUNK : NL + EX_NEED;
+        for (int k = 0; k < state->tails; ++k)
+            for (int r = first; r < last; ++r) ((double *)out++)[m] = every[r][state->tail[k]];
+        for (int j = 0; j < NL; ++j)
+            for (int r = first; r < last; ++r) {
+                const int i = r < NL ? r : ex_need[r - NL];
+                if (!ex_reach[i][j]) continue;
+                ((double *)out++)[m] = r < NL ? d->whole.f[j][i] : d->inner[HALF - 1][r - NL].f[j];
+            }
     }
 }
 
 /* Columns of L at the end and the half, without ports; `slopes` are the matrices' own, NULL where this block has
    none */
 static void linear_columns(const psa_state *state, psa_columns *to, const column *slopes, const double *tail) {
-    const psa_trial *const trial = &state->trial;
-    for (int r = 0; r < NL + EX_NEED; ++r) {
-        const int i = r < NL ? r : ex_need[r - NL], reads = ex_row_size[i];
-        const int *const row = ex_row[i];
-        const real *const f = r < NL ? &trial->level->whole.f[0][i] : trial->level->inner[HALF - 1][r - NL].f;
-        const int stride = r < NL ? ROWS : 1;
-        column sum = to->s[ex_linear[i]];
-        for (int e = 0; e < reads; ++e) sum += f[row[e] * stride] * to->s[ex_linear[row[e]]];
-        if (slopes) {
-            column own = tail[0] * slopes[reads];
-            for (int e = 0; e < reads; ++e) own += trial->l[row[e]] * slopes[e];
-            for (int k = 1; k < state->tails; ++k) own += tail[k] * slopes[reads + k];
-            sum += own;
-            slopes += reads + state->tails;
-        }
-        to->x[r < NL ? WHOLE : HALF][ex_linear[i]] = sum;
-    }
+    const psa_level *const level = state->trial.level;
+    const real *half[SOME(EX_NEED)];
+    column sum[NL + EX_NEED];
+    for (int r = 0; r < EX_NEED; ++r) half[r] = level->inner[HALF - 1][r].f;
+    ex_linear_columns(level->whole.f[0], half, to->s, sum);
+    if (slopes) ex_own_columns(state->trial.l, tail, state->tails, slopes, sum);
+    for (int i = 0; i < NL; ++i) to->x[WHOLE][ex_linear[i]] = sum[i];
+    for (int r = 0; r < EX_NEED; ++r) to->x[HALF][ex_linear[ex_need[r]]] = sum[NL + r];
 }
 
 static void add_port_columns(const psa_state *state, psa_columns *to, int n, int j) {

@@ -61,7 +61,7 @@ static real find_turn(psa_state *state, psa_trial *trial, psa_stages *stages, in
 static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int slopes) {
     static const double SHARE[4] = {0.0, 0.5, 0.5, 1.0};
     const int first = ex_group_first[g], size = ex_group_size[g];
-    const real finish = leg->begin + leg->dt / trial->dt;
+    const real finish = leg->begin + leg->dt * trial->over_dt;
     /* the midpoint rule errs by a 24th of the cube of the way: nothing beside the tolerance, where the way is
        its root */
     const bits brief = MASK(v_fabs(leg->way) < state->brief * state->nominal[ex_linear[ex_group_driver[g]]]);
@@ -92,23 +92,23 @@ static void do_leg(psa_state *state, psa_trial *trial, int g, psa_leg *leg, int 
         if (leg->stages == 4) {
             const real k3 = leg->out[2][i], k4 = leg->out[3][i];
             /* the two slopes at the middle differ in third order, the step errs in fifth: between the two */
-            const real apart = leg->dt * v_fabs(k3 - k2) / state->nominal[q];
-            mean = choose(brief, mean, (k1 + 2.0 * (k2 + k3) + k4) / 6.0);
+            const real apart = leg->dt * v_fabs(k3 - k2) * state->over_nominal[q];
+            mean = choose(brief, mean, (k1 + 2.0 * (k2 + k3) + k4) * (1.0 / 6.0));
             last = choose(brief, last, k4);
             e = choose(brief, e, apart * v_sqrt(apart));
-            bent = choose(brief, bent, leg->dt / 6.0 * v_fabs(k1 - k2 - k3 + k4) / state->nominal[q]);
+            bent = choose(brief, bent, leg->dt * (1.0 / 6.0) * v_fabs(k1 - k2 - k3 + k4) * state->over_nominal[q]);
         }
         leg->to[q] = leg->from[q] + leg->dt * mean;
         /* powers of a state have a kink at its zero, where the orders do not hold: there the difference of the
            trapezoidal and the midpoint rule tells */
         e = choose(MASK(leg->from[q] * leg->to[q] < 0.0), v_fmax(e, 0.3 * bent), e);
         leg->last[i] = last;
-        set_error(trial, e / state->tolerance);
+        set_error(trial, e * state->over_tolerance);
     }
 }
 
 /* The states at a node, by Hermite's cubic over the way of the leg on which it lies */
-static void group_node(psa_state *state, psa_trial *trial, int g, int n, double theta) {
+static void group_node(psa_trial *trial, int g, int n, double theta) {
     psa_stages *const stages = trial->stages + g;
     const int u = ex_linear[ex_group_driver[g]];
     real basis[2][4];
@@ -116,10 +116,9 @@ static void group_node(psa_state *state, psa_trial *trial, int g, int n, double 
     stages->on[n] = 0;
     for (int k = 0; k < stages->legs; ++k) {
         const psa_leg *const leg = stages->leg + k;
-        const bits moves = MASK(v_fabs(leg->way) > STILL * state->nominal[u]);
-        const real in_time = (theta - leg->begin) * trial->dt / choose(MASK(leg->dt > 0.0), leg->dt, REAL(1.0));
-        const real on_way = (trial->x[n][u] - leg->from[u]) / choose(moves, leg->way, REAL(1.0));
-        const real s = v_fmin(v_fmax(choose(moves, on_way, in_time), REAL(0.0)), REAL(1.0));
+        const real in_time = (theta - leg->begin) * trial->dt * leg->over_dt;
+        const real on_way = (trial->x[n][u] - leg->from[u]) * leg->over_way;
+        const real s = v_fmin(v_fmax(choose(MASK(leg->over_way != 0.0), on_way, in_time), REAL(0.0)), REAL(1.0));
         hermite(s, basis[k]);
         if (k == 0) stages->share[n] = s;
         else {
@@ -152,7 +151,7 @@ static void group_at(psa_state *state, int g, real t, const real *x, const real 
 static void check_rest(psa_state *state, psa_trial *trial, int g, const real *w, real most, bits slows) {
     static const double WEIGHT[4] = {-1.0, 1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0};
     const int u = ex_linear[ex_group_driver[g]];
-    const real mean = (trial->x[WHOLE][u] - state->x[u]) / trial->dt;
+    const real mean = (trial->x[WHOLE][u] - state->x[u]) * trial->over_dt;
     const real rates[4] = {mean, w[NODES], w[HALF], w[WHOLE]};
     const real *const at[4] = {NULL, state->x, trial->x[HALF], trial->x[WHOLE]};
     const real *const v[4] = {trial->v[HALF], trial->v0, trial->v[HALF], trial->v[WHOLE]};
@@ -169,14 +168,15 @@ static void check_rest(psa_state *state, psa_trial *trial, int g, const real *w,
         for (int i = 0; i < ex_group_size[g]; ++i) {
             const real in_time = out[i] - fast[i] * (v_fabs(rates[k]) / (FAST * v_fabs(most)));
             missed[i] = WEIGHT[k] * in_time + (k ? missed[i] : REAL(0.0));
-            const real largest = v_fabs(in_time) * trial->dt / state->nominal[ex_group_states[ex_group_first[g] + i]];
+            const int q = ex_group_states[ex_group_first[g] + i];
+            const real largest = v_fabs(in_time) * trial->dt * state->over_nominal[q];
             counts |= MASK(largest > 0.3 * state->tolerance);
         }
         if (k == 0 && !any(counts & slows)) return; /* at no rate is it more */
     }
     for (int i = 0; i < ex_group_size[g]; ++i) {
-        const real e = trial->dt * v_fabs(missed[i]) / state->nominal[ex_group_states[ex_group_first[g] + i]];
-        set_error(trial, choose(slows, e / state->tolerance, REAL(0.0)));
+        const real e = trial->dt * v_fabs(missed[i]) * state->over_nominal[ex_group_states[ex_group_first[g] + i]];
+        set_error(trial, choose(slows, e * state->over_tolerance, REAL(0.0)));
     }
 }
 
@@ -232,8 +232,10 @@ static void find_legs(psa_state *state, psa_trial *trial, int g, int slopes) {
     for (int k = 0; k < stages->legs; ++k) {
         psa_leg *const leg = stages->leg + k;
         leg->way = leg->to[u] - leg->from[u];
-        const bits lasts = MASK(leg->dt > 0.0);
-        leg->rate = choose(lasts, leg->way / choose(lasts, leg->dt, REAL(1.0)), REAL(0.0));
+        const bits lasts = MASK(leg->dt > 0.0), moves = MASK(v_fabs(leg->way) > STILL * state->nominal[u]);
+        leg->over_dt = choose(lasts, 1.0 / choose(lasts, leg->dt, REAL(1.0)), REAL(0.0));
+        leg->over_way = choose(moves, 1.0 / choose(moves, leg->way, REAL(1.0)), REAL(0.0));
+        leg->rate = leg->way * leg->over_dt;
     }
 }
 
@@ -243,9 +245,8 @@ static void find_drift(psa_state *state, psa_trial *trial, int g, int slopes) {
     psa_stages *const stages = trial->stages + g;
     const psa_leg *const leg = stages->leg;
     const int u = ex_linear[ex_group_driver[g]];
-    const bits moves = MASK(v_fabs(leg->way) > STILL * state->nominal[u]);
-    const real share = (trial->x[HALF][u] - leg->from[u]) / choose(moves, leg->way, REAL(1.0));
-    const bits uneven = moves & MASK(v_fabs(share - 0.5) > UNEVEN) & MASK(stages->turn >= 1.0);
+    const real share = (trial->x[HALF][u] - leg->from[u]) * leg->over_way;
+    const bits uneven = MASK(leg->over_way != 0.0) & MASK(v_fabs(share - 0.5) > UNEVEN) & MASK(stages->turn >= 1.0);
     stages->drifts = any(uneven);
     if (!stages->drifts) return;
     const real rate = FAST * leg->rate;
@@ -253,7 +254,7 @@ static void find_drift(psa_state *state, psa_trial *trial, int g, int slopes) {
     if (slopes) ex_group_slopes(g, state->t, leg->at[0], trial->v0, rate, state->k, stages->fast);
     else ex_group(g, state->t, leg->at[0], trial->v0, rate, state->k, stages->fast);
     for (int i = 0; i < ex_group_size[g]; ++i)
-        stages->drift[i] = choose(uneven, leg->out[0][i] - stages->fast[i] / FAST, REAL(0.0));
+        stages->drift[i] = choose(uneven, leg->out[0][i] - stages->fast[i] * (1.0 / FAST), REAL(0.0));
 }
 
 /* On a leg to or from a turn the rate goes from 0 to that at its far end: what the states do in time must be the
@@ -269,8 +270,8 @@ static void check_turn(psa_state *state, psa_trial *trial, int g, int k) {
     group_at(state, g, t, leg->at[0], trial->v[HALF], far, out);
     for (int i = 0; i < ex_group_size[g]; ++i) {
         const real apart = (out[i] - leg->out[0][i]) - fast[i] / FAST * (far - mean) / mean;
-        const real e = leg->dt * v_fabs(apart) / state->nominal[ex_group_states[ex_group_first[g] + i]];
-        set_error(trial, choose(turned, e / state->tolerance, REAL(0.0)));
+        const real e = leg->dt * v_fabs(apart) * state->over_nominal[ex_group_states[ex_group_first[g] + i]];
+        set_error(trial, choose(turned, e * state->over_tolerance, REAL(0.0)));
     }
 }
 
@@ -301,12 +302,12 @@ static void do_group(psa_state *state, psa_trial *trial, int g, int slopes) {
                 const real own = k ? leg->out[0][i] : leg->last[i];
                 slope = choose(moves, own / choose(moves, leg->rate, REAL(1.0)), REAL(0.0)) - slope;
             }
-            set_error(trial, v_fabs(slope) * stages->missed / state->nominal[q] / state->tolerance);
+            set_error(trial, v_fabs(slope) * stages->missed * state->over_nominal[q] * state->over_tolerance);
         }
     }
     find_drift(state, trial, g, slopes);
-    group_node(state, trial, g, HALF, 0.5);
-    group_node(state, trial, g, QUARTER, 0.25);
+    group_node(trial, g, HALF, 0.5);
+    group_node(trial, g, QUARTER, 0.25);
 }
 
 #endif

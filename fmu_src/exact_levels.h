@@ -25,21 +25,31 @@
 #include "exact_math.h"
 
 #define NL EX_NL
+#define LINE 64 /* bytes of a cache line: a vector that lies across two is dearer */
 #define NV (2 * EX_NU + 1 + 3 * EX_NPORT) /* vectors beside F: a_1, a_2, c_1, q_1, q_2, q_3 */
 #define TAYLOR 12                         /* terms; enough to 1e-17 where |M d| <= 1/4 */
 #define SMALL 0.25
 #define DEEPEST 60 /* halvings to where M is small */
 
-/* F and the vectors of one direction (or of none) at one length; row-major */
+/* F and the vectors of one direction (or of none) at one length: [F | a_1 a_2 c_1 q_1 q_2 q_3], a row padded with 0 to
+   whole quads */
+typedef double quad __attribute__((vector_size(32), aligned(8)));
+#define QUADS ((NL + NV + 3) / 4)
+#define VEC(k) (NL + (k)) /* the column of a vector */
+
 typedef struct {
-    double f[NL * NL];
-    double v[NV][NL];
+    double m[NL][4 * QUADS];
 } psa_block;
 
 /* Rows of L by blocks of one vector, the last ones 0; with lanes a row is a vector already */
 #define BLOCKS ((NL + COLUMNS - 1) / COLUMNS)
-#define ROWS (BLOCKS * COLUMNS)
-#define ROWS_OF(array, b) (((column *)(array))[b])
+#define ROWS EX_ROWS
+#if PSA_LANES == 1
+typedef double rows __attribute__((vector_size(32), aligned(8)));
+#else
+typedef real rows;
+#endif
+#define ROWS_OF(array, b) (((rows *)(array))[b])
 
 /* What a step of one length needs. Of its whole: F, a_1, a_2, c_1, and each port's weights of its values at the
    start, the half and the end, by columns. Of its half and its quarter: the same (a_2 over the step's whole
@@ -66,20 +76,16 @@ typedef struct {
 /* Directions: [chord or 0][parameter or 0]; the algebra in which parameters and chords square to zero */
 #define BLOCK(blocks, count, chord, theta) ((blocks) + (chord) * ((count) + 1) + (theta))
 
-static void multiply_add(const double *a, const double *b, double *out) {
-    for (int i = 0; i < NL; ++i)
-        for (int k = 0; k < NL; ++k) {
-            const double factor = a[i * NL + k];
-            if (factor != 0.0)
-                for (int j = 0; j < NL; ++j) out[i * NL + j] += factor * b[k * NL + j];
-        }
-}
-
-static void apply_add(const double *a, const double *x, double factor, double *out) {
+/* out += a b, of a the first NL columns; out is another block */
+static void multiply_add(const psa_block *a, const psa_block *b, psa_block *out) {
     for (int i = 0; i < NL; ++i) {
-        double sum = 0.0;
-        for (int k = 0; k < NL; ++k) sum += a[i * NL + k] * x[k];
-        out[i] += factor * sum;
+        quad *const sum = (quad *)out->m[i];
+        for (int k = 0; k < NL; ++k) {
+            const double factor = a->m[i][k];
+            const quad *const row = (const quad *)b->m[k];
+            if (factor != 0.0)
+                for (int q = 0; q < QUADS; ++q) sum[q] += factor * row[q];
+        }
     }
 }
 
@@ -95,117 +101,88 @@ static int pairs_of(int chord, int theta, int pair[4][4]) {
     return n;
 }
 
-/* One more Taylor term: next = Z previous / divisor in every direction; z are M d and its derivatives */
-static void next_term(int count, const double *z, const double *previous, double divisor, int columns,
-                      double *next) {
-    int pair[4][4];
-    for (int c = 0; c <= EX_NCH; ++c)
-        for (int t = 0; t <= count; ++t) {
-            double *out = next + (c * (count + 1) + t) * NL * columns;
-            memset(out, 0, sizeof(double) * NL * (size_t)columns);
-            for (int n = pairs_of(c, t, pair) - 1; n >= 0; --n) {
-                const double *a = z + (pair[n][0] * (count + 1) + pair[n][1]) * NL * NL;
-                const double *b = previous + (pair[n][2] * (count + 1) + pair[n][3]) * NL * columns;
-                for (int i = 0; i < NL; ++i)
-                    for (int k = 0; k < NL; ++k) {
-                        const double factor = a[i * NL + k] / divisor;
-                        if (factor != 0.0)
-                            for (int j = 0; j < columns; ++j)
-                                out[i * columns + j] += factor * b[k * columns + j];
-                    }
-            }
-        }
-}
-
-/* One channel's vectors of a length: their place in a block, how many, and b in all directions */
-APART static void start_channel(int count, const double *z, double d, const double *b, int first, int orders,
-                          int stride, psa_block *blocks) {
-    const size_t size = (size_t)(EX_NCH + 1) * (size_t)(count + 1) * NL;
-    double *const term = malloc(2 * size * sizeof(double)), *const other = term + size;
-    for (int m = 1; m <= orders; ++m) {
-        memset(term, 0, size * sizeof(double));
-        for (int t = 0; t <= count; ++t)
-            for (int i = 0; i < NL; ++i) term[t * NL + i] = b[t * NL + i] * d / m;
-        /* (m-1)! / m! = 1/m; the following terms divide by k + m */
-        for (int k = 0; k <= TAYLOR; ++k) {
-            for (int c = 0; c <= EX_NCH; ++c)
-                for (int t = 0; t <= count; ++t) {
-                    double *const v = BLOCK(blocks, count, c, t)->v[first + (m - 1) * stride];
-                    for (int i = 0; i < NL; ++i) v[i] += term[(c * (count + 1) + t) * NL + i];
-                }
-            next_term(count, z, term, k + 1 + m, 1, other);
-            memcpy(term, other, size * sizeof(double));
-        }
-    }
-    free(term);
-}
-
 #define A1(j) (j)
 #define A2(j) (EX_NU + (j))
 #define C1 (2 * EX_NU)
 #define Q(order, i) (2 * EX_NU + 1 + (order) * EX_NPORT + (i))
 
-/* F and all vectors of the length d, where M d is small. `lin` are M, B, c and their derivatives by the
-   parameters, each (NL * (NL + EX_NU + 1)) numbers, row-major one after the other. */
-APART static void start_blocks(int count, const double *lin, double d, psa_block *blocks) {
-    const size_t matrices = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
-    double *const z = calloc(3 * matrices * NL * NL, sizeof(double));
-    double *term = z + matrices * NL * NL, *other = term + matrices * NL * NL;
+/* M of a direction and what the vectors begin with, all times d: b_m has b d / m as its first term */
+static void first_term(const double *lin, double d, int chord, int theta, psa_block *z) {
+    memset(z, 0, sizeof *z);
+    if (chord > 0 && theta == 0) z->m[ex_chord_row[chord - 1]][ex_chord_driver[chord - 1]] = d;
+    if (chord > 0) return;
+    for (int i = 0; i < NL; ++i) {
+        for (int j = 0; j < NL; ++j) z->m[i][j] = lin[i * NL + j] * d;
+        for (int j = 0; j < EX_NU; ++j) {
+            z->m[i][VEC(A1(j))] = lin[NL * NL + i * EX_NU + j] * d;
+            z->m[i][VEC(A2(j))] = lin[NL * NL + i * EX_NU + j] * d / 2.0;
+        }
+        z->m[i][VEC(C1)] = lin[NL * (NL + EX_NU) + i] * d;
+    }
+    if (theta > 0) return;
+    for (int j = 0; j < EX_NPORT; ++j)
+        for (int m = 0; m < 3; ++m) z->m[ex_port_row[j]][VEC(Q(m, j))] = d / (m + 1);
+}
+
+/* F and all vectors of the length d, where M d is small, by their Taylor series: a term is M d times the one before,
+   over its number and m. `lin` are M, B, c and their derivatives by the parameters, each (NL * (NL + EX_NU + 1))
+   numbers, row-major one after the other. 0, or 1 where memory is out. */
+APART static int start_blocks(int count, const double *lin, double d, psa_block *blocks) {
+    const size_t all = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
     const int one = NL * (NL + EX_NU + 1);
-    double b[(EX_NTHETA + 1) * NL];
-    memset(blocks, 0, matrices * sizeof *blocks);
-    for (int t = 0; t <= count; ++t)
-        for (int i = 0; i < NL * NL; ++i) z[t * NL * NL + i] = lin[t * one + i] * d;
-    for (int c = 0; c < EX_NCH; ++c)
-        z[(c + 1) * (count + 1) * NL * NL + ex_chord_row[c] * NL + ex_chord_driver[c]] = d;
-    memcpy(term, z, matrices * NL * NL * sizeof(double));
-    for (int k = 1; k <= TAYLOR + 1; ++k) {
+    psa_block *const z = malloc(3 * all * sizeof *z), *term = z + all, *next = term + all;
+    double order[4 * QUADS]; /* m */
+    if (!z) return 1;
+    for (int k = 0; k < 4 * QUADS; ++k) order[k] = 1.0;
+    for (int j = 0; j < EX_NU; ++j) order[VEC(A2(j))] = 2.0;
+    for (int j = 0; j < EX_NPORT; ++j) order[VEC(Q(1, j))] = 2.0, order[VEC(Q(2, j))] = 3.0;
+    for (int c = 0; c <= EX_NCH; ++c)
+        for (int t = 0; t <= count; ++t) first_term(lin + t * one, d, c, t, BLOCK(z, count, c, t));
+    memcpy(term, z, all * sizeof *z);
+    memcpy(blocks, z, all * sizeof *z);
+    for (int k = 1; k <= TAYLOR; ++k) {
+        double over[4 * QUADS];
+        for (int q = 0; q < 4 * QUADS; ++q) over[q] = 1.0 / (k + order[q]);
+        memset(next, 0, all * sizeof *next);
         for (int c = 0; c <= EX_NCH; ++c)
-            for (int t = 0; t <= count; ++t)
-                for (int i = 0; i < NL * NL; ++i)
-                    BLOCK(blocks, count, c, t)->f[i] += term[(c * (count + 1) + t) * NL * NL + i];
-        next_term(count, z, term, k + 1, NL, other);
-        double *const swap = term;
-        term = other;
-        other = swap;
-    }
-    for (int j = 0; j < EX_NU; ++j) {
-        for (int t = 0; t <= count; ++t)
-            for (int i = 0; i < NL; ++i) b[t * NL + i] = lin[t * one + NL * NL + i * EX_NU + j];
-        start_channel(count, z, d, b, A1(j), 2, EX_NU, blocks);
-    }
-    for (int t = 0; t <= count; ++t)
-        for (int i = 0; i < NL; ++i) b[t * NL + i] = lin[t * one + NL * (NL + EX_NU) + i];
-    start_channel(count, z, d, b, C1, 1, 0, blocks);
-    for (int j = 0; j < EX_NPORT; ++j) {
-        memset(b, 0, sizeof b);
-        b[ex_port_row[j]] = 1.0;
-        start_channel(count, z, d, b, Q(0, j), 3, EX_NPORT, blocks);
+            for (int t = 0; t <= count; ++t) {
+                psa_block *const own = BLOCK(next, count, c, t), *const sum = BLOCK(blocks, count, c, t);
+                int pair[4][4];
+                for (int n = pairs_of(c, t, pair) - 1; n >= 0; --n)
+                    multiply_add(BLOCK(z, count, pair[n][0], pair[n][1]), BLOCK(term, count, pair[n][2], pair[n][3]),
+                                 own);
+                for (int i = 0; i < NL; ++i)
+                    for (int q = 0; q < QUADS; ++q) {
+                        ((quad *)own->m[i])[q] *= ((const quad *)over)[q];
+                        ((quad *)sum->m[i])[q] += ((const quad *)own->m[i])[q];
+                    }
+            }
+        psa_block *const swap = term;
+        term = next;
+        next = swap;
     }
     free(z);
+    return 0;
 }
 
 /* Twice the length, in one direction */
 static void double_direction(int count, const psa_block *from, int c, int t, psa_block *to) {
     int pair[4][4];
     const psa_block *const own = BLOCK(from, count, c, t);
-    for (int i = 0; i < NL * NL; ++i) to->f[i] = 2.0 * own->f[i];
-    for (int k = 0; k < NV; ++k)
-        for (int i = 0; i < NL; ++i) to->v[k][i] = 2.0 * own->v[k][i];
-    for (int n = pairs_of(c, t, pair) - 1; n >= 0; --n) {
-        const psa_block *const a = BLOCK(from, count, pair[n][0], pair[n][1]);
-        const psa_block *const b = BLOCK(from, count, pair[n][2], pair[n][3]);
-        multiply_add(a->f, b->f, to->f);
-        for (int k = 0; k < NV; ++k) apply_add(a->f, b->v[k], 1.0, to->v[k]);
-    }
-    for (int j = 0; j < EX_NU; ++j)
-        for (int i = 0; i < NL; ++i) to->v[A2(j)][i] = 0.5 * (to->v[A2(j)][i] + own->v[A1(j)][i]);
-    for (int j = 0; j < EX_NPORT; ++j)
-        for (int i = 0; i < NL; ++i) {
-            const double q1 = own->v[Q(0, j)][i], q2 = own->v[Q(1, j)][i];
-            to->v[Q(2, j)][i] = 0.25 * (to->v[Q(2, j)][i] + q1 + 2.0 * q2);
-            to->v[Q(1, j)][i] = 0.5 * (to->v[Q(1, j)][i] + q1);
+    for (int i = 0; i < NL; ++i)
+        for (int q = 0; q < QUADS; ++q) ((quad *)to->m[i])[q] = 2.0 * ((const quad *)own->m[i])[q];
+    for (int n = pairs_of(c, t, pair) - 1; n >= 0; --n)
+        multiply_add(BLOCK(from, count, pair[n][0], pair[n][1]), BLOCK(from, count, pair[n][2], pair[n][3]), to);
+    for (int i = 0; i < NL; ++i) {
+        const double *const one = own->m[i];
+        double *const two = to->m[i];
+        for (int j = 0; j < EX_NU; ++j) two[VEC(A2(j))] = 0.5 * (two[VEC(A2(j))] + one[VEC(A1(j))]);
+        for (int j = 0; j < EX_NPORT; ++j) {
+            const double q1 = one[VEC(Q(0, j))], q2 = one[VEC(Q(1, j))];
+            two[VEC(Q(2, j))] = 0.25 * (two[VEC(Q(2, j))] + q1 + 2.0 * q2);
+            two[VEC(Q(1, j))] = 0.5 * (two[VEC(Q(1, j))] + q1);
         }
+    }
 }
 
 /* A step length h, its halves, and what has been asked of them */
@@ -214,6 +191,21 @@ typedef struct {
     int depth;          /* levels below h that are there */
     psa_block *blocks;  /* [depth + 1][EX_NCH + 1][count + 1] */
 } psa_ladder;
+
+/* Zeroed memory that begins with a cache line, NULL where there is none; what is before it says what to free */
+static void *lined(size_t size) {
+    char *const memory = calloc(1, size + 2 * LINE);
+    if (!memory) return NULL;
+    char *const begin = memory + LINE + (LINE - (uintptr_t)memory % LINE) % LINE;
+    memcpy(begin - sizeof memory, &memory, sizeof memory);
+    return begin;
+}
+
+static void free_lined(void *begin) {
+    char *memory = NULL;
+    if (begin) memcpy(&memory, (char *)begin - sizeof memory, sizeof memory);
+    free(memory);
+}
 
 static const psa_block *rung(const psa_ladder *ladder, int level) {
     const size_t each = (size_t)(EX_NCH + 1) * (size_t)(ladder->count + 1);
@@ -250,22 +242,22 @@ APART static int build_ladder(psa_ladder *ladder, int count, const double *lin, 
                 balanced[at] = lin[at] / scale[i];
             }
         }
-    start_blocks(count, balanced, ldexp(h, -depth), (psa_block *)rung(ladder, depth));
-    for (int level = depth - 1; level >= 0; --level)
+    const int status = start_blocks(count, balanced, ldexp(h, -depth), (psa_block *)rung(ladder, depth));
+    for (int level = depth - 1; level >= 0 && status == 0; --level)
         for (int c = 0; c <= EX_NCH; ++c)
             for (int t = 0; t <= count; ++t)
                 double_direction(count, rung(ladder, level + 1), c, t,
                                  (psa_block *)BLOCK(rung(ladder, level), count, c, t));
     free(balanced);
-    return 0;
+    return status;
 }
 
 /* Weights of a port's values at start, half and end in the response at the node theta of the step, from the
    vectors of the node's own length */
 APART static void port_weights(const psa_block *b, int j, double theta, double out[3][NL]) {
     for (int i = 0; i < NL; ++i) {
-        const double q1 = b->v[Q(0, j)][i], q2 = theta * b->v[Q(1, j)][i];
-        const double q3 = theta * theta * b->v[Q(2, j)][i];
+        const double q1 = b->m[i][VEC(Q(0, j))], q2 = theta * b->m[i][VEC(Q(1, j))];
+        const double q3 = theta * theta * b->m[i][VEC(Q(2, j))];
         out[0][i] = q1 - 3.0 * q2 + 2.0 * q3;
         out[1][i] = 4.0 * (q2 - q3);
         out[2][i] = 2.0 * q3 - q2;
@@ -286,12 +278,12 @@ APART static void fill_level(const psa_ladder *ladder, int level, int t, const d
             const int i = n == 0 ? r : ex_need[r];
             psa_row *const row = n == 0 ? NULL : &out->inner[n - 1][r];
             for (int j = 0; j < NL; ++j) {
-                const double value = b->f[i * NL + j] * scale[i] / scale[j];
+                const double value = b->m[i][j] * scale[i] / scale[j];
                 if (row) SET_LANE(row->f[j], lane, value);
                 else SET_LANE(whole->f[j][i], lane, value);
             }
             for (int j = 0; j < EX_NU; ++j) {
-                const double one = b->v[A1(j)][i] * scale[i], two = THETA[n] * b->v[A2(j)][i] * scale[i];
+                const double one = b->m[i][VEC(A1(j))] * scale[i], two = THETA[n] * b->m[i][VEC(A2(j))] * scale[i];
                 if (row) {
                     SET_LANE(row->a1[j], lane, one);
                     SET_LANE(row->a2[j], lane, two);
@@ -300,8 +292,8 @@ APART static void fill_level(const psa_ladder *ladder, int level, int t, const d
                     SET_LANE(whole->a2[j][i], lane, two);
                 }
             }
-            if (row) SET_LANE(row->c, lane, b->v[C1][i] * scale[i]);
-            else SET_LANE(whole->c[i], lane, b->v[C1][i] * scale[i]);
+            if (row) SET_LANE(row->c, lane, b->m[i][VEC(C1)] * scale[i]);
+            else SET_LANE(whole->c[i], lane, b->m[i][VEC(C1)] * scale[i]);
         }
         for (int j = 0; j < EX_NPORT; ++j) {
             /* a port adds to its row in physical units: 1 is 1/scale in the balanced ones */
@@ -331,24 +323,24 @@ APART static void fill_level(const psa_ladder *ladder, int level, int t, const d
         for (int i = 0; i < NL; ++i) {
             for (int j = 0; j < NL; ++j) {
                 double seen = j == u ? dw[0][i] + dw[1][i] + dw[2][i] : 0.0;
-                seen += dw[1][i] * base[1]->f[u * NL + j] + dw[2][i] * base[0]->f[u * NL + j];
-                if (t > 0) seen += w[1][i] * node[1]->f[u * NL + j] + w[2][i] * node[0]->f[u * NL + j];
+                seen += dw[1][i] * base[1]->m[u][j] + dw[2][i] * base[0]->m[u][j];
+                if (t > 0) seen += w[1][i] * node[1]->m[u][j] + w[2][i] * node[0]->m[u][j];
                 if (j < ex_reads[u])
-                    SET_LANE(out->chord_f[c][j][i], lane, (s->f[i * NL + j] - seen) * unit * scale[i] / scale[j]);
+                    SET_LANE(out->chord_f[c][j][i], lane, (s->m[i][j] - seen) * unit * scale[i] / scale[j]);
             }
             for (int j = 0; j < EX_NU; ++j) {
-                double one = dw[1][i] * base[1]->v[A1(j)][u] + dw[2][i] * base[0]->v[A1(j)][u];
-                double two = dw[1][i] * 0.5 * base[1]->v[A2(j)][u] + dw[2][i] * base[0]->v[A2(j)][u];
+                double one = dw[1][i] * base[1]->m[u][VEC(A1(j))] + dw[2][i] * base[0]->m[u][VEC(A1(j))];
+                double two = dw[1][i] * 0.5 * base[1]->m[u][VEC(A2(j))] + dw[2][i] * base[0]->m[u][VEC(A2(j))];
                 if (t > 0) {
-                    one += w[1][i] * node[1]->v[A1(j)][u] + w[2][i] * node[0]->v[A1(j)][u];
-                    two += w[1][i] * 0.5 * node[1]->v[A2(j)][u] + w[2][i] * node[0]->v[A2(j)][u];
+                    one += w[1][i] * node[1]->m[u][VEC(A1(j))] + w[2][i] * node[0]->m[u][VEC(A1(j))];
+                    two += w[1][i] * 0.5 * node[1]->m[u][VEC(A2(j))] + w[2][i] * node[0]->m[u][VEC(A2(j))];
                 }
-                SET_LANE(out->chord_a1[c][j][i], lane, (s->v[A1(j)][i] - one) * unit * scale[i]);
-                SET_LANE(out->chord_a2[c][j][i], lane, (s->v[A2(j)][i] - two) * unit * scale[i]);
+                SET_LANE(out->chord_a1[c][j][i], lane, (s->m[i][VEC(A1(j))] - one) * unit * scale[i]);
+                SET_LANE(out->chord_a2[c][j][i], lane, (s->m[i][VEC(A2(j))] - two) * unit * scale[i]);
             }
-            double rest = dw[1][i] * base[1]->v[C1][u] + dw[2][i] * base[0]->v[C1][u];
-            if (t > 0) rest += w[1][i] * node[1]->v[C1][u] + w[2][i] * node[0]->v[C1][u];
-            SET_LANE(out->chord_c[c][i], lane, (s->v[C1][i] - rest) * unit * scale[i]);
+            double rest = dw[1][i] * base[1]->m[u][VEC(C1)] + dw[2][i] * base[0]->m[u][VEC(C1)];
+            if (t > 0) rest += w[1][i] * node[1]->m[u][VEC(C1)] + w[2][i] * node[0]->m[u][VEC(C1)];
+            SET_LANE(out->chord_c[c][i], lane, (s->m[i][VEC(C1)] - rest) * unit * scale[i]);
         }
         for (int k = 0; k < EX_NFEED; ++k) {
             const int j = ex_feed[c][k];

@@ -73,8 +73,8 @@ static void do_loop(psa_state *state, psa_trial *trial, const int *ports, int co
                 real response = REAL(0.0);
                 for (int r = 0; r < EX_NEED; ++r) {
                     const int q = ex_need[r];
-                    response = v_fmax(response, v_fabs(trial->level->whole.w[ports[j]][n + 1][q]) /
-                                                    state->nominal[ex_linear[q]]);
+                    response = v_fmax(response, v_fabs(trial->level->whole.w[ports[j]][n + 1][q]) *
+                                                    state->over_nominal[ex_linear[q]]);
                 }
                 moved = v_fmax(moved, v_fabs(b[n * count + j]) * response);
             }
@@ -82,7 +82,7 @@ static void do_loop(psa_state *state, psa_trial *trial, const int *ports, int co
         settled |= MASK(change <= 1e-3 * state->tolerance);
         if (!any(~settled)) break;
     }
-    set_error(trial, change / state->tolerance);
+    set_error(trial, change * state->over_tolerance);
     for (int n = 0; n < 2; ++n) {
         memcpy(trial->x[AT[n]], without[n], sizeof without[n]);
         for (int j = 0; j < count; ++j) add_port(state, trial, AT[n], ports[j]);

@@ -28,7 +28,11 @@ typedef uint64_t ubits;
 #define SET_LANE(r, i, value) ((void)(i), (r) = (value))
 #define REAL(c) (c)
 /* Columns of sensitivities, four at a time; with lanes there are none */
+#if defined(_WIN32) && !defined(__clang__) /* gcc there does not align its stack for vectors (its bug 54412) */
 typedef double column __attribute__((vector_size(32), aligned(8)));
+#else
+typedef double column __attribute__((vector_size(32)));
+#endif
 #define COLUMNS 4
 #else
 typedef double real __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
@@ -111,7 +115,7 @@ static inline real look_up(const double *table, int stride, bits at) {
    |r| <= ln(2)/256, 2^(n/128) from a table (Tang, ACM Trans. Math. Softw. 15 (1989) 144). */
 static inline real v_exp(real x) {
     const double shift = 6755399441055744.0; /* 1.5 * 2^52: what is added to it is rounded to integers */
-    const real y = choose(MASK(x < -708.0), REAL(-708.0), choose(MASK(x > 709.0), REAL(709.0), x));
+    const real y = v_fmin(v_fmax(x, REAL(-708.0)), REAL(709.0));
     const real shifted = y * 0x1.71547652b82fep7 + shift;
     const real n = shifted - shift;
     const real r = (y - n * 0x1.62e42fee00000p-8) - n * 0x1.a39ef35793c76p-40;

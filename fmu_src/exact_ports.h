@@ -4,11 +4,11 @@
 
 #include "exact_state.h"
 
-/* sum += the response of L to its start, the input and a constant; the whole of it. A block of rows at a time: its
+/* sum = L at the end from its start, the input and a constant, all of its rows. A block of rows at a time: its
    sum stays in a register. */
 static inline void respond(const psa_whole *whole, const real *l, const real *v0, const real *dv, real *sum) {
     for (int b = 0; b < BLOCKS; ++b) {
-        column s = ROWS_OF(sum, b) + ROWS_OF(whole->c, b);
+        column s = ROWS_OF(l, b) + ROWS_OF(whole->c, b);
         for (int j = 0; j < NL; ++j) s += ROWS_OF(whole->f[j], b) * l[j];
         for (int j = 0; j < EX_NU; ++j) s += ROWS_OF(whole->a1[j], b) * v0[j] + ROWS_OF(whole->a2[j], b) * dv[j];
         ROWS_OF(sum, b) = s;
@@ -33,7 +33,6 @@ static inline real respond_inside(const psa_row *row, int reads, const real *l, 
 static inline void linear_node(psa_trial *trial, int n) {
     if (n == WHOLE) {
         real sum[ROWS];
-        for (int i = 0; i < ROWS; ++i) sum[i] = trial->l[i];
         respond(&trial->level->whole, trial->l, trial->v0, trial->dv, sum);
         for (int i = 0; i < NL; ++i) trial->x[n][ex_linear[i]] = sum[i];
         return;
@@ -79,8 +78,8 @@ static void evaluate_port(psa_state *state, psa_trial *trial, int n, int j, int 
 static void set_bump(psa_state *state, psa_trial *trial, int j, real off) {
     real response = REAL(0.0);
     for (int i = ex_port_reaches[j]; i < NL; ++i)
-        response = v_fmax(response, v_fabs(trial->level->whole.w[j][1][i]) * state->inverse_nominal[i]);
-    set_error(trial, v_fabs(off) * response / state->tolerance);
+        response = v_fmax(response, v_fabs(trial->level->whole.w[j][1][i]) * state->over_nominal[ex_linear[i]]);
+    set_error(trial, v_fabs(off) * response * state->over_tolerance);
 }
 
 /* The parabola through the values a, b and c at 0, 1/2 and 1 */

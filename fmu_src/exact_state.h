@@ -9,6 +9,7 @@
 #define SLOWS 0.8        /* a driver whose rate falls to less than this share of it may come to rest */
 #define FAST 1e3         /* over the driver's rate: there what a state does in time is nothing */
 #define GROWS 0.03       /* of the tolerance: the next step may be twice as long */
+#define FAR 10.0         /* times the tolerance: more than one halving mends; the next step is a quarter */
 #define TURNS 8          /* iterations for the instant at which a driver turns */
 #define LOST 1e6         /* times the tolerance: an error of the finest step from which nothing can be told */
 #define BENDS 0.05       /* of its way: a driver's course that bends by more is not a smooth one */
@@ -30,6 +31,7 @@ typedef struct {
     real out[4][EX_GROUP_OUT];            /* slopes and their partial derivatives */
     real last[EX_NX];                     /* slopes at the end */
     real rate, way;                       /* mean rate of the driver, its way */
+    real over_dt, over_way;               /* one over both, 0 where it does not last or does not move */
     int stages;                           /* 4, or 2 where the way is short */
 } psa_leg;
 
@@ -55,7 +57,7 @@ typedef struct {
 /* Everything of one step under trial */
 typedef struct {
     const psa_level *level;
-    real dt, t[NODES];
+    real dt, over_dt, t[NODES];
     real v0[EX_NU + 1], v[NODES][EX_NU + 1], dv[EX_NU + 1];
     real l[ROWS], x[NODES][EX_NX];
     real port[NODES][EX_NPORT + 1];       /* values */
@@ -76,7 +78,7 @@ typedef struct {
     psa_exact *run;
     real t, x[EX_NX], port[EX_NPORT + 1], start_slopes[EX_NPORT + 1][EX_PORT_OUT];
     real p[EX_NP + 1], k[EX_NK + EX_NRATED + 1];
-    real nominal[EX_NX], inverse_nominal[NL], tolerance, brief;
+    real nominal[EX_NX], over_nominal[EX_NX], tolerance, over_tolerance, brief;
     psa_ladder *ladders;                  /* [lengths][lanes] */
     psa_level *levels;                    /* [lengths][finest + 1] */
     psa_level *mixed;                     /* of lanes whose levels differ; of one parameter's derivatives */
@@ -100,7 +102,7 @@ static int any(bits mask) {
 }
 
 static void set_error(psa_trial *trial, real error) {
-    /* a number that is not finite counts as an infinite error */
+    /* over the tolerance; a number that is not finite counts as an infinite error */
     const bits fine = MASK(error <= 1e300);
     trial->error = v_fmax(trial->error, choose(fine, error, REAL(1e300)));
 }

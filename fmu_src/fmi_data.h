@@ -41,6 +41,19 @@ extern const double psa_state_nominals[PSA_NX + 1];
 /* What the states' nominal values move each switch by: the size of its noise at a tolerance of 1. */
 extern const double psa_switch_scales[PSA_NZ + 1];
 
+/* What the records behind the model have shown; infinite where nothing is known. */
+typedef struct {
+    double low, high, rate;
+} psa_range;
+extern const psa_range psa_seen[PSA_NU + 1]; /* of each input */
+extern const double psa_seen_duration;
+
+#ifdef PSA_FIXED_STEP
+/* One step of PSA_FIXED_STEP [s] from time t: the states after it. The inputs u change by `change` over it;
+   the parameters are those at export. */
+void psa_fixed_step(double t, double *x, const double *u, const double *change);
+#endif
+
 /* Derivative of (x', y, z) along a direction (dt, dx, du, dp) at the point (t, x, u, p): exact, by
    automatic differentiation. A result that is NULL is left out. */
 int psa_model_directional(double t, const double *x, const double *u, const double *p, double dt,

@@ -104,6 +104,8 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
     state->phase = PSA_INSTANTIATED;
     state->interface = interface;
+    instance->start_time = 0.0;
+    instance->outside_told = 0;
     psa_schedule(instance);
     instance->fresh = 0;
 }
@@ -125,6 +127,7 @@ psa_result psa_setup(psa_instance *instance, int tolerance_defined, double toler
         state->event_margin = EVENT_MARGIN * fmin(tolerance, LOOSEST_TOLERANCE);
     }
     psa_solver_move(&state->solver, start);
+    instance->start_time = start;
     state->input.begin = 0.0;
     state->stop_defined = stop_defined;
     state->stop_time = stop_defined ? stop : 0.0;
@@ -210,6 +213,19 @@ static void remember_inputs(psa_state *state, double begin) {
     memset(state->rate_given, 0, sizeof state->rate_given);
 }
 
+/* Whether the coming step is inside what the records have shown: of inputs that are held the rate is
+   that from step to step. */
+static void watch_step(psa_instance *instance) {
+    const psa_state *const state = &instance->state;
+    double rate[PSA_NU + 1] = {0.0};
+    for (int i = 0; i < PSA_NU; ++i) {
+        if (state->rate_given[i]) rate[i] = state->input.rate[i];
+        else if (state->stride > 0.0)
+            rate[i] = (state->input.value[i] - state->earlier[i]) / state->stride;
+    }
+    psa_watch_range(instance, state->input.value, rate);
+}
+
 /* Keep what the coming communication step starts from, for its sensitivities. */
 static void remember(psa_state *state, psa_end end) {
     psa_last_step *const last = &state->last;
@@ -220,11 +236,42 @@ static void remember(psa_state *state, psa_end end) {
     last->kind = PSA_STEP_KNOWN;
 }
 
+#ifdef PSA_FIXED_STEP
+/* Steps of fixed length to the goal of the communication step, which is a multiple of them. */
+static psa_status run_fixed(psa_instance *instance) {
+    psa_state *const state = &instance->state;
+    psa_solver *const solver = &state->solver;
+    const double count = round(instance->goal.since / PSA_FIXED_STEP);
+    double u[PSA_NU + 1], change[PSA_NU + 1];
+    for (int i = 0; i < PSA_NU; ++i) change[i] = state->input.rate[i] * PSA_FIXED_STEP;
+    for (double k = 0.0; k < count; k += 1.0) {
+        psa_input_at(&state->input, k * PSA_FIXED_STEP, u);
+        psa_fixed_step(solver->origin + k * PSA_FIXED_STEP, solver->x, u, change);
+        solver->steps++;
+    }
+    solver->since = instance->goal.since;
+    solver->t = instance->goal.t;
+    psa_solver_invalidate(solver);
+    carry_input(state);
+    instance->fresh = 0;
+    state->last.kind = PSA_STEP_VARIED; /* no sensitivities */
+    for (int i = 0; i < PSA_NX; ++i)
+        if (!isfinite(solver->x[i])) {
+            solver->culprit = i;
+            return PSA_NOT_FINITE;
+        }
+    return PSA_OK;
+}
+#endif
+
 /* Run the solver to the goal of the communication step, with stops at the sample instants before it. */
 static psa_status run_solver(psa_instance *instance) {
     psa_state *const state = &instance->state;
     psa_solver *const solver = &state->solver;
     const psa_watch watch = {look, instance};
+#ifdef PSA_FIXED_STEP
+    if (state->interface == PSA_CO_SIMULATION) return run_fixed(instance);
+#endif
     for (;;) {
         const double period = state->p[PSA_PERIOD], next = state->next_instant;
         const psa_end instant = {next - solver->origin, next};
@@ -247,6 +294,7 @@ static psa_result advance(psa_instance *instance, psa_end end) {
     const int sampled = PSA_NS > 0 && state->at_instant;
     const int64_t steps = solver->steps, rejected = solver->rejected;
     restart_clock(state);
+    watch_step(instance);
     aim_inputs(state, end.since);
     if (psa_leave_instant(instance) != PSA_FINE) return PSA_DISCARD;
     remember(state, end);
@@ -255,8 +303,12 @@ static psa_result advance(psa_instance *instance, psa_end end) {
     const psa_status status = run_solver(instance);
     remember_inputs(state, begin);
     psa_arrive(instance);
+#ifdef PSA_FIXED_STEP
+    (void)steps, (void)rejected; /* the sentence would take as long as the step */
+#else
     psa_whisper(instance, "Step from %.9g s to %.9g s: %ld solver steps, %ld rejected.", begin, solver->t,
             (long)(solver->steps - steps), (long)(solver->rejected - rejected));
+#endif
     if (status == PSA_OK) return PSA_FINE;
     state->phase = PSA_STEP_FAILED;
     state->last.kind = PSA_STEP_BROKEN;
@@ -291,6 +343,14 @@ psa_result psa_do_step(psa_instance *instance, double point, double size, psa_up
         return psa_say(instance, PSA_ERROR, "The step to %.17g s goes beyond the stop time %.17g s.",
                        end.t, state->stop_time);
     if (!(size > 0.0 && end.since > 0.0 && end.t > now)) return PSA_FINE;
+#ifdef PSA_FIXED_STEP
+    const double steps = end.since / PSA_FIXED_STEP;
+    if (!(round(steps) >= 1.0) || fabs(steps - round(steps)) > 1e-3)
+        return psa_say(instance, PSA_ERROR,
+                       "The step of %.9g s is no multiple of %.9g s, the fixed step of this FMU; choose a"
+                       " communication step that is.",
+                       end.since, PSA_FIXED_STEP);
+#endif
     instance->update = update;
     const psa_result result = advance(instance, end);
     instance->update = NULL;

@@ -117,6 +117,8 @@ typedef struct {
     int fresh;
     psa_update *update; /* during a communication step; may be NULL */
     psa_end goal;       /* end of that step */
+    double start_time;
+    int outside_told;     /* that the instance has left what the records have shown */
     psa_reporter *report; /* may be NULL */
     void *owner;
     void *(*allocate)(size_t count, size_t size);
@@ -188,6 +190,10 @@ psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_
                                const int *order, const double *rate);
 psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size_t count,
                                 const int *order, double *rate);
+
+/* validity.c: say, once, that inputs u, their rates (may be NULL) or the time since the start are outside
+   of what the records behind the model have shown */
+void psa_watch_range(psa_instance *instance, const double *u, const double *rate);
 
 /* derivatives.c: products of a matrix of derivatives with a seed. What is unknown decides which matrix:
 

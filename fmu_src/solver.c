@@ -9,7 +9,9 @@
 #define NEWTON_LIMIT 8
 #define NEWTON_TOLERANCE 0.02 /* share of the step's error tolerance */
 #define SAFETY 0.9
-#define SMALLEST 1e-25 /* s; no step is shorter, nor than what the solver's clock can tell */
+#define SMALLEST 1e-25   /* s; no step is shorter, nor than what the solver's clock can tell */
+#define BUSY 10000       /* tried steps of a call from which on states must be of a size that makes sense */
+#define ABSURD 1e9       /* size of a state over its usual one that makes none */
 #define KINK_ITERATIONS 12
 #define KINK_RESOLUTION 1e-3 /* of the step in which a kink is located */
 #define KINK_RESTART 0.05    /* first step after a kink over the one that ended there */
@@ -359,10 +361,21 @@ static psa_status one_step(psa_solver *solver, psa_work *work, psa_bounds *bound
     }
 }
 
+/* Whether a state is so far beyond its usual size that no step towards the end is worth its time. */
+static int beyond_all_size(psa_solver *solver) {
+    for (int i = 0; i < PSA_NX; ++i)
+        if (!(fabs(solver->x[i]) <= ABSURD * solver->nominal[i])) {
+            solver->culprit = i;
+            return 1;
+        }
+    return 0;
+}
+
 psa_status psa_solver_advance(psa_solver *solver, psa_work *work, psa_end end,
                               const psa_input *input, const double *p, psa_sensitivities *sens,
                               const psa_watch *watch) {
-    psa_bounds bounds = {end, solver->steps_limit > 0 ? solver->steps_limit : 10000000};
+    const int64_t limit = solver->steps_limit > 0 ? solver->steps_limit : 10000000;
+    psa_bounds bounds = {end, limit};
     while (solver->since < bounds.end.since) {
         /* afresh for each step, because who watches may have changed the input */
         switch (prepare_slope(solver, input, p)) {
@@ -378,6 +391,7 @@ psa_status psa_solver_advance(psa_solver *solver, psa_work *work, psa_end end,
         }
         const psa_status status = one_step(solver, work, &bounds, input, p, sens);
         if (status != PSA_OK) return status;
+        if (limit - bounds.attempts > BUSY && beyond_all_size(solver)) return PSA_TOO_MANY_STEPS;
         if (watch) watch->accepted(watch->owner, &bounds.end);
     }
     return PSA_OK;

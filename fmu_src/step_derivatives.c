@@ -32,6 +32,11 @@ static void stop_there(void *owner, psa_end *end) {
 
 static psa_result refuse(psa_instance *instance) {
     const int failed = instance->state.last.kind == PSA_STEP_BROKEN;
+#ifdef PSA_FIXED_STEP
+    if (!failed)
+        return psa_say(instance, PSA_DISCARD,
+                       "The sensitivity of the last step is not known: it was taken by steps of fixed length.");
+#endif
     if (instance->state.last.kind == PSA_STEP_SAMPLED)
         return psa_say(instance, PSA_DISCARD,
                        "The sensitivity of the last step is not known, because a sample instant fell into"

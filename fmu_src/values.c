@@ -10,6 +10,7 @@ psa_result psa_refresh(psa_instance *instance) {
     const psa_result result = psa_sample_now(instance);
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.since, u);
+    psa_watch_range(instance, u, NULL);
     if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
         psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y) ||
         psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z))
@@ -88,6 +89,11 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
     if (v->kind != PSA_STATE && v->kind != PSA_SAMPLED && v->kind != PSA_INPUT &&
         v->kind != PSA_PARAMETER && v->kind != PSA_OPTION)
         return psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be set.", v->name);
+#ifdef PSA_FIXED_STEP
+    if (v->kind == PSA_PARAMETER)
+        return psa_say(instance, PSA_ERROR, "'%s' is constant: the fixed step was made for its value.",
+                       v->name);
+#endif
     if (value < v->low || value > v->high)
         return psa_say(instance, PSA_ERROR, "'%s' cannot be set to %.9g: it must be at %s %.9g.", v->name,
                        value, value < v->low ? "least" : "most", value < v->low ? v->low : v->high);

@@ -13,7 +13,9 @@ The public names, in the order of the workflow:
     psa.check_fmu("extended.fmu", result.model).passed
     psa.export_modelica(result.model, "PiezoStack.mo")
 
-Each name is loaded when it is first used, so that importing the package is quick.
+`psa.design` holds designed experiments, inputs and mechanisms, `psa.system` what stands around a
+stack, `psa.online` observers and feed-forward for use in a loop. Each name is loaded when it is
+first used, so that importing the package is quick.
 """
 
 from importlib import import_module
@@ -22,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
-    from psa_casadi import datasets
+    from psa_casadi import datasets, design, online, system
     from psa_casadi.component import Component, Equations, Symbols
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
     from psa_casadi.design.mechanism.mechanism import (
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from psa_casadi.effects import EFFECTS
     from psa_casadi.errors import InputError, MachineError, PsaError
     from psa_casadi.export.check.check import CheckReport, check_fmu
+    from psa_casadi.export.fixed_step.export import CodeExport, export_c
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
@@ -166,6 +169,7 @@ _HOMES = {
     "psa_casadi.report.plots.figure": ("save_figure",),
     "psa_casadi.report.page.diagnosis": ("write_report",),
     "psa_casadi.report.page.fit_page": ("write_fit_report",),
+    "psa_casadi.export.fixed_step.export": ("CodeExport", "export_c"),
     "psa_casadi.export.fmu.archive": ("export_fmu",),
     "psa_casadi.export.modelica.package": ("export_modelica",),
     "psa_casadi.export.ssp.archive": ("export_ssp",),
@@ -243,6 +247,8 @@ __all__ = [
     "mechanism_model",
     "port_model",
     "export_fmu",
+    "CodeExport",
+    "export_c",
     "export_modelica",
     "export_ssp",
     "CheckReport",
@@ -251,14 +257,55 @@ __all__ = [
     "MachineError",
     "PsaError",
     "datasets",
+    "design",
+    "online",
+    "system",
     "__version__",
 ]
+#: What `dir` and a notebook's completion show: the names to begin with. What belongs to `design`,
+#: `online` and `system`, and the types of results, answer to their names here as well.
+_FIRST = (
+    "Record",
+    "read_record",
+    "read_records",
+    "record_from",
+    "write_record",
+    "EFFECTS",
+    "Component",
+    "Equations",
+    "Symbols",
+    "STACKS",
+    "stack_model",
+    "Model",
+    "compose",
+    "load_model",
+    "save_model",
+    "simulate",
+    "simulate_record",
+    "identify",
+    "diagnose",
+    "story",
+    "export_fmu",
+    "export_modelica",
+    "export_ssp",
+    "check_fmu",
+    "InputError",
+    "PsaError",
+    "MachineError",
+    "datasets",
+    "design",
+    "online",
+    "system",
+    "__version__",
+)
+#: Packages and modules that are public as such.
+_SPACES = ("datasets", "design", "online", "system")
 
 
 def __getattr__(name: str) -> Any:
     """Load a public name from where it lives."""
-    if name == "datasets":
-        return import_module("psa_casadi.datasets")
+    if name in _SPACES:
+        return import_module(f"psa_casadi.{name}")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'psa_casadi' has no attribute '{name}'")
     value = getattr(import_module(_HOME_OF[name]), name)
@@ -267,5 +314,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names, loaded or not."""
-    return sorted({*globals(), *__all__})
+    """List the public names to begin with, loaded or not."""
+    return sorted(_FIRST)

@@ -1,4 +1,4 @@
-"""The characters that names and texts of a model may have, in whatever file they are written."""
+"""The characters that texts may have: in the files that are written, and on a terminal."""
 
 import re
 
@@ -6,6 +6,10 @@ from psa_casadi.errors import InputError
 
 #: XML 1.0, section 2.2; HTML, JSON as UTF-8 and Modelica carry all of these too.
 _BARRED = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+#: What a terminal obeys instead of showing it: control characters but tab and line end, and those
+#: that turn the direction of writing.
+_OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
 def barred(text: str) -> str:
@@ -31,3 +35,8 @@ def check_text(text: str, what: str) -> None:
 def plain(text: str) -> str:
     """Return a text with a replacement character for each that no document can carry."""
     return _BARRED.sub("\ufffd", text)
+
+
+def visible(text: str) -> str:
+    """Return a text as a terminal may show it: what it would obey is spelled out as an escape."""
+    return _OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode(), text)

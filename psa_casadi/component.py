@@ -41,6 +41,7 @@ BALANCES: dict[str, Balance] = {
         Balance("drive_voltage", "V", "open-circuit voltage of the amplifier"),
         Balance("drive_current", "A", "current through the amplifier's output resistance"),
         Balance("stack_current", "A", "current into the stack's capacitance"),
+        Balance("stack_charge", "C", "charge on the stack's electrodes"),
         Balance("voltage_rate", "V/s", "rate of the voltage at the stack's electrodes"),
         Balance("hysteresis_rate", "N/s", "rate of the hysteresis force"),
         Balance("free_force", "N", "force the wafers generate before the creep lag"),
@@ -102,7 +103,10 @@ class Component:
     means nothing. `trial_starts` are starts of its memory states at which it is looked for, where
     it does nothing at their ordinary start. `curve` names the quantity over which an effect bends
     a static curve, in a form of its own: effects with the same one differ, below the resonances,
-    by these forms only. `more_of` names the effect of which this one is several, `count` of them.
+    by these forms only. `measured_by` names the input whose measured column holds what it adds:
+    with such a column it is no cause. `needs_column` names columns of which a record must have one
+    for the effect to be looked for, as it hardly shows otherwise. `more_of` names the effect of
+    which this one is several, `count` of them.
 
     `sampled` are states that change at sample instants only: at every time that is a multiple of
     the parameter `sample_period` [s], whoever declares it, each takes the value in
@@ -130,6 +134,8 @@ class Component:
     needs: tuple[str, ...] = ()
     trial_starts: tuple[Mapping[str, float], ...] = ()
     curve: str | None = None
+    measured_by: str | None = None
+    needs_column: tuple[str, ...] = ()
     more_of: str | None = None
     count: int = 1
     sampled: tuple[State, ...] = ()

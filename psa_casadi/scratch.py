@@ -1,9 +1,10 @@
-"""Temporary folders, half-written files and child processes that do not outlive their process.
+"""Temporary folders and half-written files that do not outlive their process.
 
-What a block made goes when the block ends; `abandon` removes all of it at once, for a process that
-is told to stop. What a killed process left goes with the next one that writes to the same place: a
-process holds a lock on each thing it made, and the operating system frees the lock when it dies.
-Where there are no locks (Windows, some network drives), what is older than a week counts as left.
+What a block made goes when the block ends; `abandon` removes all of it at once, and ends all child
+processes, for a process that is told to stop. What a killed process left goes with the next one
+that writes to the same place: a process holds a lock on each thing it made, and the operating
+system frees the lock when it dies. Where there are no locks (Windows, some network drives), what is
+older than a week counts as left.
 """
 
 import contextlib
@@ -11,15 +12,16 @@ import os
 import secrets
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
-from psa_casadi.interruption import raise_if_stopped
+from psa_casadi.children import end_children, once_all_are_started
 
 if sys.platform != "win32":
     import fcntl
@@ -28,13 +30,12 @@ if sys.platform != "win32":
 PREFIX = ".psa_casadi-"
 #: Age [s] after which a thing that cannot be locked counts as left.
 _OLD = 7 * 86400.0
-#: Time [s] between two looks whether the work is to end.
-_LOOK = 0.1
 #: A name beside the prefix and the random part; a file system takes 255 bytes, a letter up to 4.
 _LONGEST = 50
+#: Requests to end that a process is sent, where the system has them; Ctrl-C raises by itself.
+_REQUESTS = ("SIGTERM", "SIGHUP", "SIGBREAK")
 
 _MADE: set[Path] = set()
-_CHILDREN: set[subprocess.Popen[str]] = set()
 _SWEPT: set[Path] = set()
 
 
@@ -61,50 +62,49 @@ def temporary_file(place: Path, name: str) -> Iterator[Path]:
         yield path
 
 
-def run_child(
-    command: Sequence[str], *, directory: Path, environment: Mapping[str, str]
-) -> subprocess.CompletedProcess[str]:
-    """Run a program to its end; it and its children are killed if this process does not wait.
-
-    Raises:
-        KeyboardInterrupt: this work is to end.
-        OSError: the program cannot be started.
-    """
-    group = None if sys.platform == "win32" else 0
-    child = subprocess.Popen(
-        command, cwd=directory, env=environment, stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, encoding="utf-8", errors="replace",
-        process_group=group,
-    )  # fmt: skip
-    with child:
-        _CHILDREN.add(child)
-        try:
-            said, complained = _heard(child)
-        finally:
-            _CHILDREN.discard(child)
-            _kill(child)
-    return subprocess.CompletedProcess(list(command), child.returncode, said, complained)
-
-
-def _heard(child: "subprocess.Popen[str]") -> tuple[str, str]:
-    """Return what a child said on its two streams until it ended."""
-    while True:
-        try:
-            return child.communicate(timeout=_LOOK)
-        except subprocess.TimeoutExpired:
-            raise_if_stopped()
-
-
 def abandon() -> None:
     """End all child processes and remove all that this process made and would have removed."""
-    for child in list(_CHILDREN):
-        _kill(child)
+    end_children()
     for _ in range(20):  # a child may write once more until it is gone
         for path in list(_MADE):
             _remove(path)
         if not any(path.exists() for path in list(_MADE)):
             break
         time.sleep(0.01)
+
+
+def answer_requests_to_end() -> tuple[int, ...]:
+    """Let a request to end find nothing left behind; return the signals that are answered so.
+
+    The process then ends at once, with the exit code of one that a signal ended; threads that
+    compute are not waited for. Only in the main thread, and where nobody else answers the signal.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return ()
+    numbers = [getattr(signal, name) for name in _REQUESTS if hasattr(signal, name)]
+    taken = tuple(n for n in numbers if signal.getsignal(n) is signal.SIG_DFL)
+    for number in taken:
+        signal.signal(number, _end)
+    return taken
+
+
+@contextmanager
+def requests_to_end_answered() -> Iterator[None]:
+    """Answer requests to end while the block runs, for a process that does not do so itself."""
+    taken = answer_requests_to_end()
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _end(number: int, _: FrameType | None) -> None:
+    def leave() -> None:
+        abandon()
+        os._exit(128 + number)
+
+    once_all_are_started(leave)
 
 
 def sweep(place: Path) -> None:
@@ -186,14 +186,3 @@ def _remove(path: Path) -> None:
     else:
         with contextlib.suppress(OSError):
             path.unlink()
-
-
-def _kill(child: "subprocess.Popen[str]") -> None:
-    """Kill a child with all its children, which are one group, unless it has ended."""
-    if child.returncode is not None:
-        return
-    with contextlib.suppress(OSError):
-        if sys.platform == "win32":
-            child.kill()
-        else:
-            os.killpg(child.pid, signal.SIGKILL)

@@ -33,13 +33,15 @@ class Shown:
 class Reported(Shown):
     """What a result can show of itself that has a page of its own."""
 
-    def report(self, path: str | os.PathLike[str]) -> None:
+    def report(self, path: str | os.PathLike[str], *, small: bool = False) -> None:
         """Write the page, one HTML file that needs no network.
+
+        A `small` page, below 1 MB for mail, has one picture in place of the plots.
 
         Raises:
             InputError: `path` cannot be written to.
         """
-        _made("page", self, path)
+        _made("page", self, path, small)
 
 
 def frame(columns: dict[str, Any]) -> Any:

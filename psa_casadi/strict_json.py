@@ -17,6 +17,8 @@ MOST_BYTES = 2**24
 DEEPEST = 64
 #: A text, whose brackets do not count, or a bracket.
 _BRACKETS = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?|[\[{]|[\]}]', re.DOTALL)
+#: A list of numbers only, over several lines; no text of JSON has a line end.
+_NUMBERS = re.compile(r"\[\n((?:\s*(?:-?\d[\d.eE+-]*|null),?\n)+)\s*\]")
 
 
 def read_json_text(path: str | os.PathLike[str]) -> str:
@@ -58,11 +60,14 @@ def parse_json(text: str, source: str, advice: str) -> Any:
 def json_text(content: Any) -> str:
     """Return the text of a JSON file that `parse_json` reads back as the same content.
 
+    A list of numbers stands on one line.
+
     Raises:
         ValueError: a number is not finite, or a text has a character that no document can carry.
     """
     check_texts(content)
-    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return _NUMBERS.sub(lambda found: f"[{' '.join(found[1].split())}]", text)
 
 
 def check_texts(content: Any) -> None:

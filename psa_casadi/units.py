@@ -101,6 +101,7 @@ _OTHER_UNITS: tuple[Unit, ...] = (
     Unit("degC", Fraction(1), 273.15, (0, 0, 0, 0, 1, 0, 0, 0), quantity="temperature"),
     Unit("1", Fraction(1), 0.0, NO_DIMENSION, quantity="ratio"),
     Unit("%", Fraction(1, 100), 0.0, NO_DIMENSION, quantity="ratio"),
+    Unit("ppm", Fraction(1, 10**6), 0.0, NO_DIMENSION, quantity="ratio"),
     Unit("counts", Fraction(1), 0.0, NO_DIMENSION, counts=1, quantity="sensor counts"),
 )
 

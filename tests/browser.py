@@ -1,10 +1,13 @@
 """Headless Chromium as a command: a page's document, console and screenshot."""
 
+import json
 import os
 import re
 import shutil
 import subprocess
 from dataclasses import dataclass
+from html import unescape
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -12,6 +15,11 @@ import pytest
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: Headless windows are at least 500 wide; a phone is a frame in one.
 PHONE = 390
+#: A desk has a mouse, which headless browsers lack: pages behave as on a touch screen without it.
+MOUSE = (
+    "--blink-settings=primaryHoverType=2,availableHoverTypes=2,"
+    "primaryPointerType=4,availablePointerTypes=4"
+)
 DARK = "--blink-settings=preferredColorScheme=0"
 _CONSOLE = re.compile(r":CONSOLE[:(]\d+\)?\] (.*)")
 
@@ -45,6 +53,24 @@ window.addEventListener('load', function () {
 </script>"""
 
 
+# Looks for what keeps people out who cannot see the page, or not well, or have no mouse.
+_AXE = """<script>
+window.addEventListener('load', function () {
+  setTimeout(function () {
+    axe.run({resultTypes: ['violations']}).then(function (found) {
+      var told = document.createElement('pre');
+      told.id = 'axe';
+      told.textContent = JSON.stringify(found.violations.map(function (v) {
+        return {impact: v.impact, rule: v.id, places: v.nodes.map(function (n) { return n.html; })};
+      }));
+      document.body.appendChild(told);
+    });
+  }, 500);
+});
+</script>"""
+_FOUND = re.compile(r'<pre id="axe">(.*?)</pre>', re.DOTALL)
+
+
 @dataclass(frozen=True)
 class Browser:
     """The browser at `path`, with a folder for its profile and its pages."""
@@ -62,6 +88,25 @@ class Browser:
         path = self.folder / f"{page.stem}-{width}-{len(flags)}.png"
         self._run(page, f"--screenshot={path}", f"--window-size={width},{height}", *flags)
         return path
+
+    def serious_faults(self, page: Path, *flags: str) -> list[str]:
+        """Return what axe calls serious or critical in a page: the rule, and where first."""
+        axe = files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+        text = page.read_text(encoding="utf-8")
+        copy = page.with_name(f"{page.stem}-axe.html")  # beside it: its links are relative
+        looked = f"<script>{axe}</script>{_AXE}</body>".join(text.rsplit("</body>", 1))
+        copy.write_text(looked, encoding="utf-8")
+        try:
+            found = _FOUND.search(self.document(copy, *flags)[0])
+        finally:
+            copy.unlink()
+        if found is None:
+            pytest.fail(f"axe did not come to an end on {page}")
+        return [
+            f"{fault['rule']}: {fault['places'][0]}"
+            for fault in json.loads(unescape(found[1]))
+            if fault["impact"] in ("serious", "critical")
+        ]
 
     def _run(self, page: Path, *flags: str) -> subprocess.CompletedProcess[str]:
         command = [

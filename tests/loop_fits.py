@@ -25,7 +25,7 @@ def measured(model: Model, name: str, time: FloatArray, voltage: FloatArray, see
     x = simulate(model, time, voltage).displacement
     stroke = model.values["k_L"] * model.values["u_rated"] / model.values["k_B"]
     white = np.random.default_rng(seed).standard_normal(len(time))
-    return Record(name, time, voltage, x + NOISE * stroke * white)
+    return Record(name=name, time=time, voltage=voltage, displacement=x + NOISE * stroke * white)
 
 
 @cache

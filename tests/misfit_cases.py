@@ -35,7 +35,9 @@ def seen(
     voltage: FloatArray, error: FloatArray, *, correlation: float = 0.0, seed: int = 0
 ) -> Misfit:
     residual = error + noise(voltage.size, correlation, seed)
-    record = Record("r", grid(voltage.size), voltage, 1e-7 * voltage + residual)
+    record = Record(
+        name="r", time=grid(voltage.size), voltage=voltage, displacement=1e-7 * voltage + residual
+    )
     (floor,) = noise_floor([record], [residual])
     return misfit(record, residual, floor)
 

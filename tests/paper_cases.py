@@ -59,7 +59,9 @@ def closed_step(p: dict[str, float], duration: float, samples: int, noise: float
     g = step_response(p, time) + noise * np.random.default_rng(0).standard_normal(samples)
     voltage = np.concatenate([[0.0], np.full(samples, p["u_rated"])])
     x = np.concatenate([[0.0], g]) * p["k_L"] * compliance(p) * p["u_rated"]
-    return Record("step", np.concatenate([[0.0], time + 1e-10]), voltage, x)
+    return Record(
+        name="step", time=np.concatenate([[0.0], time + 1e-10]), voltage=voltage, displacement=x
+    )
 
 
 def respond(p: dict[str, float], time: FloatArray, voltage: FloatArray) -> FloatArray:
@@ -77,7 +79,12 @@ def loop(name: str = "P-885.51", frequency: float = 1.0, leading: bool = False) 
         p |= {key: share * p["k_L"] for key, share in LEADING.items()}
     time = time_grid(2.0 / frequency, 1.0 / (500.0 * frequency))
     voltage = sine(time, 0.0, p["u_rated"], frequency)
-    return Record(f"loop {frequency:g} Hz", time, voltage, respond(p, time, voltage))
+    return Record(
+        name=f"loop {frequency:g} Hz",
+        time=time,
+        voltage=voltage,
+        displacement=respond(p, time, voltage),
+    )
 
 
 @lru_cache(maxsize=4)
@@ -87,11 +94,15 @@ def real_step(volts: float, name: str = "P-885.51") -> Record:
     time = np.linspace(0.0, 4e-3, 4001)
     voltage = np.full(time.shape, volts)
     voltage[0] = 0.0
-    return Record(f"step {volts:g} V", time, voltage, respond(p, time, voltage))
+    return Record(
+        name=f"step {volts:g} V", time=time, voltage=voltage, displacement=respond(p, time, voltage)
+    )
 
 
 def changed(record: Record, displacement: FloatArray) -> Record:
-    return Record(record.name, record.time, record.voltage, displacement)
+    return Record(
+        name=record.name, time=record.time, voltage=record.voltage, displacement=displacement
+    )
 
 
 def noisy(record: Record, share: float) -> Record:

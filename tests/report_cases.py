@@ -46,7 +46,11 @@ def experiment(name: str, samples: int) -> tuple[Experiment, FloatArray, FloatAr
     drift = 8e-8 * time / time[-1]
     y = clean + drift + NOISE * np.random.default_rng(1).standard_normal(len(time))
     y[40:50] = np.nan
-    return split(Record(name, time, voltage, y)), clean, clean + drift
+    return (
+        split(Record(name=name, time=time, voltage=voltage, displacement=y)),
+        clean,
+        clean + drift,
+    )
 
 
 @cache
@@ -67,7 +71,13 @@ def periodic(counts: bool = False) -> tuple[Experiment, NoiseFloor, Misfit, Misf
     noise = NOISE * np.random.default_rng(4).standard_normal(time.size)
     size = 1e9 if counts else 1.0
     quiet, record = (
-        Record("loops", time, voltage, size * y, displacement_unit="counts" if counts else "m")
+        Record(
+            name="loops",
+            time=time,
+            voltage=voltage,
+            displacement=size * y,
+            displacement_unit="counts" if counts else "m",
+        )
         for y in (clean + noise, clean + bent + noise)
     )
     # the noise is known from before the hum began
@@ -162,7 +172,7 @@ def long_fit(records: int, samples: int) -> tuple[Identification, tuple[Series, 
         measured = model + NOISE * rng.standard_normal(samples)
         measured[int((0.05 + 0.4 * k / records) * samples)] += 3e-6
         measured[samples // 2 : samples // 2 + samples // 50] = np.nan
-        record = Record(f"long_{k + 1}", time, voltage, measured)
+        record = Record(name=f"long_{k + 1}", time=time, voltage=voltage, displacement=measured)
         experiments.append(whole(record))
         curve = Curve("model", "#0072b2", model)
         held = np.zeros(samples, dtype=bool)

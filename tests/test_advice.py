@@ -85,7 +85,7 @@ def test_what_no_record_can_tell_is_said() -> None:
 def test_plans_stay_within_the_records_voltages() -> None:
     model = stack("P-885.51")
     time, voltage = loop_voltage(model.values, 0.7, 1.0)
-    record = Record("loop", time, voltage - 20.0)
+    record = Record(name="loop", time=time, voltage=voltage - 20.0)
     found = plans([model], [record])
     assert {p.kind for p in found} == {"step", "multisine", "loop", "minor loops"}
     for p in found:

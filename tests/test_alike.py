@@ -45,7 +45,7 @@ def test_bends_are_alike_where_no_resonance_shows(
     time = np.arange(200) / rate
     model, voltage = compose(BASE), 10.0 + 10.0 * np.sin(0.02 * rate * time)
     shown = simulate(model, time, voltage).displacement
-    experiments = (split(Record("r", time, voltage, shown)),)
+    experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=shown)),)
     found = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
     groups = Task(experiments, TABLE).alike(found)
     assert tuple(tuple(sorted(group)) for group in groups) == alike

@@ -33,7 +33,9 @@ def _reading() -> tuple[FloatArray, FloatArray, FloatArray]:
 def test_both_plants_are_offered_and_differ_by_the_bend() -> None:
     """One plant has the bend, the other leaves it to the sensor: apart they are the bend itself."""
     voltage, reading, bend = _reading()
-    d = psa.diagnose([Record("r", TIME, voltage, reading)], effects=TABLE)
+    d = psa.diagnose(
+        [Record(name="r", time=TIME, voltage=voltage, displacement=reading)], effects=TABLE
+    )
     assert d.verdict == "ambiguous"
     (a,) = d.alternatives
     assert {a.cause, a.instead} == {"sensor_nonlinearity", "load_stiffness"}

@@ -12,7 +12,12 @@ def _record() -> Record:
     t = np.linspace(0.0, 2.999, 3000)
     voltage = 50.0 - 40.0 * np.cos(2 * np.pi * t)
     x = simulate(stack_model("P-885.51"), t, voltage).displacement
-    return Record("r", t, voltage, x + 5e-9 * np.random.default_rng(2).standard_normal(t.size))
+    return Record(
+        name="r",
+        time=t,
+        voltage=voltage,
+        displacement=x + 5e-9 * np.random.default_rng(2).standard_normal(t.size),
+    )
 
 
 def test_pieces_are_the_same_every_time_and_of_every_kind() -> None:
@@ -25,7 +30,12 @@ def test_pieces_are_the_same_every_time_and_of_every_kind() -> None:
 
 def test_a_refusal_is_no_crash_and_a_crash_is_told() -> None:
     whole = _record()
-    still = Record("still", whole.time, np.full(whole.n, 3.0), whole.displacement)
+    still = Record(
+        name="still",
+        time=whole.time,
+        voltage=np.full(whole.n, 3.0),
+        displacement=whole.displacement,
+    )
     refused = ended_of(still)
     assert refused.how == "refused"
     found = [refused, Ended("a", "adequate", "", 2.0), Ended("b", "crashed", "KeyError: 'x'", 9.0)]

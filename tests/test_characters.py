@@ -8,8 +8,11 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
+from typer.testing import CliRunner
 
-from psa_casadi.characters import check_text, plain
+from psa_casadi.characters import check_text, plain, visible
+from psa_casadi.cli.app import app
+from psa_casadi.cli.screen import show_table
 from psa_casadi.component import Component, Equations
 from psa_casadi.components import BASE
 from psa_casadi.errors import InputError
@@ -26,6 +29,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.records import read_record
 from psa_casadi.report.page.document import Document
+from psa_casadi.report.words.tables import Table
 from psa_casadi.variables import Parameter
 from tests.record_files import HEADER, ROWS, write
 
@@ -115,3 +119,33 @@ def test_a_page_shows_a_mark_for_what_html_cannot_carry() -> None:
     assert "\0" not in page
     assert "<title>a\ufffdb</title>" in page
     assert plain(CARRIED) == CARRIED
+
+
+def test_what_a_terminal_would_obey_is_spelled_out() -> None:
+    assert visible("a\x1b[31mb\r\x07\x9b2J\x7f\u202e.csv") == (
+        "a\\x1b[31mb\\r\\x07\\x9b2J\\x7f\\u202e.csv"
+    )
+    assert visible("5 µm\n\tü \U0001f600 \\x1b") == "5 µm\n\tü \U0001f600 \\x1b"
+
+
+@pytest.mark.parametrize("command", ["identify", "diagnose", "check"])
+def test_no_name_of_a_file_or_a_column_reaches_the_terminal_raw(
+    command: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "\x1b]0;own\x07.csv", "t\x1b[31m [s],U\x9b2J [V],\u202ex [um]", *ROWS)
+    output = [] if command == "check" else ["-o", str(tmp_path / "m.json")]
+    result = CliRunner().invoke(app, [command, str(path), *output])
+    assert result.exit_code == 2
+    assert "\\x1b]0;own\\x07.csv" in result.output
+    assert all(c.isprintable() or c == "\n" for c in result.output)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_no_cell_of_a_table_reaches_the_terminal_raw(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
+    show_table(Table(("name",), (("\x1b[2Jowned",),)))
+    said = capsys.readouterr().out
+    assert "\\x1b[2Jowned" in said
+    assert "\x1b[2J" not in said

@@ -20,6 +20,7 @@ from psa_casadi.report.words.text import identification_text
 from psa_casadi.simulation.simulate import simulate_record
 from tests.html_page import Page, figures
 from tests.test_report import png_size
+from tests.test_schemas import valid
 
 #: The demo takes half a minute: with pytest-xdist's loadgroup it runs once, else once per process.
 pytestmark = pytest.mark.xdist_group("demo")
@@ -84,14 +85,19 @@ def test_help_shows_an_example_that_is_a_command(command: tuple[str, ...]) -> No
 
 def test_the_version_is_one() -> None:
     assert done("--version").stdout == f"psa_casadi {psa_casadi.__version__}\n"
-    pyproject = Path(__file__).parent.parent / "pyproject.toml"
-    assert f'version = "{psa_casadi.__version__}"' in pyproject.read_text(encoding="utf-8")
+    root = Path(__file__).parent.parent
+    citation = (root / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {psa_casadi.__version__}\n" in citation
+    released = re.search(r"^date-released: (\S+)$", citation, re.MULTILINE)
+    assert released is not None
+    heading = f"\n## [{psa_casadi.__version__}] - {released[1]}\n"
+    assert heading in (root / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_every_public_name_is_there() -> None:
     for name in psa_casadi.__all__:
         assert getattr(psa_casadi, name) is not None
-    assert set(psa_casadi.__all__) <= set(dir(psa_casadi))
+    assert set(dir(psa_casadi)) <= set(psa_casadi.__all__)
     with pytest.raises(AttributeError, match="no attribute 'identfy'"):
         psa_casadi.__getattr__("identfy")
 
@@ -157,11 +163,13 @@ def test_identify_starts_from_a_model_and_writes_its_page(demo: Demo, tmp_path: 
     record = demo.directory / "synthetic_record.csv"
     result = done(
         "identify", record, "--model", demo.directory / "model.json", "--stiffness", "5e7",
-        "-o", model, "--report", page, "--origin", "synthetic",
+        "-o", model, "--report", page, "--origin", "synthetic", "--json", tmp_path / "fit.json",
     )  # fmt: skip
     for part in ("k_L", "95 % interval", "N/V", "written:", "(synthetic:"):
         assert part in result.stdout
+    content = valid("identification", (tmp_path / "fit.json").read_text(encoding="utf-8"))
     found = load_model(model)
+    assert {n: p["value"] for n, p in content["parameters"].items()} == found.values
     assert found.provenance.identified_from[0][1] == read_record(record).sha256
     assert set(found.provenance.free) <= set(found.provenance.intervals)
     shown = Page(page.read_text(encoding="utf-8"))

@@ -14,6 +14,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.records import read_record, sine, time_grid, write_record
 from psa_casadi.simulation.simulate import simulate_record
+from tests.test_schemas import valid
 from tests.tiers import slow
 
 
@@ -70,7 +71,10 @@ def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> No
     assert description.modelName == "P_885_51"
     start = {v.name: v.start for v in description.modelVariables}
     assert float(start["k_B"]) == STACKS["P-885.51"].values["k_B"].value
-    assert psa_casadi.check_fmu(str(fmu), stack_model("P-885.51")).passed
+    assert psa("check", fmu, "--json", tmp_path / "check.json").exit_code == 0
+    content = valid("check", (tmp_path / "check.json").read_text())
+    assert (content["passed"], content["compared"]) == (True, True)
+    assert "equations" in {row["name"] for row in content["rows"]}
 
 
 @slow

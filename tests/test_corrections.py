@@ -30,7 +30,7 @@ NOISE = 2e-9
 
 
 def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
-    experiments = (split(Record("r", TIME, VOLTAGE, y)),)
+    experiments = (split(Record(name="r", time=TIME, voltage=VOLTAGE, displacement=y)),)
     found = fit(compose(BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
     return found, experiments, Colour((np.zeros(0),), NOISE, (len(found.residuals),))
 
@@ -164,7 +164,11 @@ def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
     held = np.arange(4000) % 2 == 1
     noise = NOISE * rng.standard_normal(4000)
     time: FloatArray = np.arange(4000, dtype=float) * 1e-3
-    experiments = (Experiment(Record("r", time, time, truth + noise), ~held, held),)
+    experiments = (
+        Experiment(
+            Record(name="r", time=time, voltage=time, displacement=truth + noise), ~held, held
+        ),
+    )
     one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))
     without = [("one", (truth + one,)), ("other", (truth + other,))]
     spent = budget(experiments, (truth + one + other,), (truth,), without, None, NOISE)

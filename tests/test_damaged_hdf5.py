@@ -72,7 +72,7 @@ def _pressed(file: Any) -> None:
 
 def test_pieces_of_version_7_3_have_the_size_that_they_state() -> None:
     assert "a piece of the array '/t' is larger than it states" in refusal(hdf5(_inflating))
-    assert "'/t' is packed in a way that MATLAB does not use" in refusal(hdf5(_pressed))
+    assert "'/t' is packed in another way than gzip" in refusal(hdf5(_pressed))
     options = {"chunks": (10,), "compression": "gzip", "shuffle": True, "fletcher32": True}
     good = hdf5(lambda f: f.create_dataset("t", data=T, **options))
     np.testing.assert_array_equal(load_arrays("a.mat", good)["t"], T)

@@ -29,7 +29,9 @@ def curve(u: FloatArray) -> FloatArray:
 
 def loop(t: FloatArray = T, seed: int = 1, noise: float = NOISE) -> Record:
     u = sine(t, 0.0, 100.0, 0.05)
-    return Record("loop", t, u, curve(u) + noise * white(seed, t.size))
+    return Record(
+        name="loop", time=t, voltage=u, displacement=curve(u) + noise * white(seed, t.size)
+    )
 
 
 def test_a_million_slow_samples_shrink_and_keep_their_content() -> None:
@@ -61,7 +63,7 @@ def test_a_louder_record_shrinks_further_and_a_quieter_one_less() -> None:
 
 def test_the_tips_of_a_triangle_are_kept() -> None:
     u = triangle(T, 0.0, 100.0, 0.05)
-    record = Record("triangle", T, u, curve(u) + NOISE * white(2))
+    record = Record(name="triangle", time=T, voltage=u, displacement=curve(u) + NOISE * white(2))
     small, q = decimated(record, NOISE, SLOPE)
     assert q >= 8
     tips = 100.0 - small.voltage.max(), small.voltage.min()
@@ -77,7 +79,7 @@ def test_a_ringing_step_is_not_touched() -> None:
         w, d = 2 * np.pi / period, 0.02
         a = [1.0, -2 * np.exp(-d * w) * np.cos(w), np.exp(-2 * d * w)]
         y = lfilter([sum(a)], a, SLOPE * u) + NOISE * white(3)
-        small, q = decimated(Record("step", T, u, y), NOISE, SLOPE)
+        small, q = decimated(Record(name="step", time=T, voltage=u, displacement=y), NOISE, SLOPE)
         assert q == 1
         assert small.n == N
 
@@ -116,7 +118,7 @@ def test_white_noise_of_the_voltage_is_no_reason_to_stop_and_fast_motion_is_none
     noisy = replace(base, voltage=base.voltage + 0.3 * white(8))
     assert decimated(noisy, NOISE, SLOPE)[1] == decimated(base, NOISE, SLOPE)[1]
     fast = sine(T, 0.0, 100.0, 500.0)
-    record = Record("fast", T, fast, curve(fast) + NOISE * white(9))
+    record = Record(name="fast", time=T, voltage=fast, displacement=curve(fast) + NOISE * white(9))
     assert decimated(record, NOISE, SLOPE)[1] == 1
 
 
@@ -143,7 +145,7 @@ def test_short_uneven_and_planned_records() -> None:
     assert decimated(short, NOISE, SLOPE) == (short, 1)
     jitter = T + 2e-5 * np.random.default_rng(11).random(N)
     assert decimated(loop(jitter), NOISE, SLOPE)[1] == 1
-    planned = Record("planned", T, sine(T, 0.0, 100.0, 0.05))
+    planned = Record(name="planned", time=T, voltage=sine(T, 0.0, 100.0, 0.05))
     small, q = decimated(planned, NOISE, SLOPE)
     assert q > 1
     assert small.displacement is None

@@ -21,6 +21,8 @@ EXTRAS = {
 }
 #: The parts of a statement that hold statements.
 _PARTS = ("body", "orelse", "finalbody", "handlers", "cases")
+#: The extras that a file format needs.
+FORMATS = ("excel", "matlab", "parquet", "tdms")
 CLASSIFIED = [
     c.removeprefix("Programming Language :: Python :: ")
     for c in PROJECT["classifiers"]
@@ -50,7 +52,7 @@ def _imports(node: ast.AST, *, inside: bool = False) -> Iterator[tuple[str, bool
 def _third_party() -> frozenset[tuple[Path, str, bool]]:
     """Return file, package and whether a function imports it, of what is neither ours nor Python's.
 
-    Each package here is imported under the name that it is installed by.
+    Each package here is imported under the name that it is installed by, in lower case.
     """
     own = {*sys.stdlib_module_names, "psa_casadi"}
     return frozenset(
@@ -71,15 +73,15 @@ def test_every_requirement_has_a_lower_bound(extra: str) -> None:
 
 
 def test_what_is_imported_is_what_is_required() -> None:
-    optional = {r.name for extra in ("matlab", "parquet") for r in EXTRAS[extra]}
+    optional = {r.name.lower() for extra in FORMATS for r in EXTRAS[extra]}
     imported = {name for _, name, _ in _third_party()}
     assert imported - optional == {r.name for r in CORE}
     assert optional <= imported
 
 
-@pytest.mark.parametrize("extra", ["matlab", "parquet"])
+@pytest.mark.parametrize("extra", FORMATS)
 def test_an_optional_package_is_asked_for_in_a_sentence(extra: str) -> None:
-    names = {r.name for r in EXTRAS[extra]}
+    names = {r.name.lower() for r in EXTRAS[extra]}
     users = {(path, inside) for path, name, inside in _third_party() if name in names}
     assert users
     for path, inside in users:

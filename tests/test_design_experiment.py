@@ -49,7 +49,7 @@ def rivals(share: float = 0.2, bent: str = "sensor_nonlinearity") -> list[Rival]
 def planned(kind: Kind, limits: Limits = LIMITS, seed: int = 3) -> Record:
     wave = draw(kind, limits, limits.steepest(None), np.random.default_rng(seed))
     time = limits.grid()
-    return Record(kind, time, wave.voltage(wave.start, time))
+    return Record(name=kind, time=time, voltage=wave.voltage(wave.start, time))
 
 
 def test_all_that_is_wrong_with_limits_is_said_at_once() -> None:
@@ -72,12 +72,12 @@ def test_voltages_keep_every_limit(kind: Kind, seed: int) -> None:
     rng = np.random.default_rng(seed)
     wave, time = draw(kind, limits, steepest, rng), limits.grid()
     voltage = wave.voltage(wave.start, time)
-    assert excess(Record(kind, time, voltage), limits, capacitance) == ()
+    assert excess(Record(name=kind, time=time, voltage=voltage), limits, capacitance) == ()
     np.testing.assert_allclose(voltage[time <= rest_of(limits)], limits.low, atol=1e-9)
     assert np.ptp(voltage) > 0.1 * limits.span
     assert np.all(wave.slack(wave.start) >= -1e-9)
     quiet = Limits(-20.0, 100.0, 2.0, 1000, rate=1e2)
-    assert excess(Record(kind, time, voltage), quiet, None) != ()
+    assert excess(Record(name=kind, time=time, voltage=voltage), quiet, None) != ()
     tones = np.abs(np.fft.rfft((voltage - voltage.mean()) * np.hanning(len(time)))) ** 2
     above = np.fft.rfftfreq(len(time), time[1]) > 4.0 * limits.band
     assert tones[above].sum() < 0.02 * tones.sum()
@@ -107,7 +107,7 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
     p = np.clip(wave.start, wave.lower + 0.02, wave.upper - 0.02)
 
     def at(share: float) -> Record:
-        return Record(kind, time, wave.voltage(p + share * way, time))
+        return Record(name=kind, time=time, voltage=wave.voltage(p + share * way, time))
 
     frozen = criterion.at(at(0.0)).frozen
     told = (frozen(at(step)) - frozen(at(-step))) / (2.0 * step)
@@ -203,7 +203,7 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
     assert told.factor("sine") > 1.0
     assert told.factor("triangle") > 1.0
     assert "plays" not in " ".join(sentences(told, None))
-    assert "3 plays, each from rest" in " ".join(sentences(replace(told, plays=3), None))
+    assert "3 runs, each from rest" in " ".join(sentences(replace(told, plays=3), None))
     assert "look alike" in " ".join(sentences(replace(told, plays=None), None))
     rival = rival_of_model("base", stack_model(STACK), FREE)
     sharp = informative_experiment(rival, NOISE, limits, optimality="A", kinds=kinds, effort=BRIEF)

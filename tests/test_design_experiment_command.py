@@ -33,7 +33,7 @@ def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None
     limits = Limits(0.0, 60.0, 0.5, 60, current=0.01)
     assert record.n == 60
     assert excess(record, limits, stack_model(STACK).values["C_p"]) == ()
-    assert "The voltage to play" in page.read_text(encoding="utf-8")
+    assert "The voltage to apply" in page.read_text(encoding="utf-8")
 
 
 def test_the_command_fits_the_rivals_to_the_records_at_hand(tmp_path: Path) -> None:

@@ -88,12 +88,12 @@ def test_omnibus_sees_structure(structure: Callable[[FloatArray], FloatArray]) -
 
 def test_harmonics_of_a_periodic_drive_are_known_and_those_of_noise_are_not() -> None:
     time = grid(5e-3)
-    sine = Record("sine", time, 1.8 - 1.8 * np.cos(2 * np.pi * time))
+    sine = Record(name="sine", time=time, voltage=1.8 - 1.8 * np.cos(2 * np.pi * time))
     assert drive_frequency(sine) == pytest.approx(1.0, rel=0.02)
     assert among_harmonics(2.02, sine)
     assert among_harmonics(6.6, sine)
     assert not among_harmonics(57.9, sine)
-    noise = Record("noise", time, np.random.default_rng(0).standard_normal(N))
+    noise = Record(name="noise", time=time, voltage=np.random.default_rng(0).standard_normal(N))
     assert drive_frequency(noise) is None
     assert not among_harmonics(2.0, noise)
 
@@ -103,7 +103,9 @@ def test_gain_is_the_reduction_of_the_held_out_rms() -> None:
     rng = np.random.default_rng(5)
     truth = np.sin(2 * np.pi * time)
     held = np.arange(N) >= 3000
-    record = Record("r", time, truth, truth + 0.01 * rng.standard_normal(N))
+    record = Record(
+        name="r", time=time, voltage=truth, displacement=truth + 0.01 * rng.standard_normal(N)
+    )
     experiment = Experiment(record, ~held, held)
     base = truth + 0.1 * rng.standard_normal(N)
     gain = gain_of([experiment], [base], [truth])
@@ -132,7 +134,9 @@ def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> 
         "holdout_max_m",
         "holdout_nrmse_percent",
     }
-    assert {c["effect"] for c in content["candidates"]} == set(psa.EFFECTS) - {"temperature"}
+    shown = {n for n, e in psa.EFFECTS.items() if not e.needs_column} - {"temperature"}
+    assert {c["effect"] for c in content["candidates"]} == shown
+    assert content["columns"] == []
     assert content["next_experiment"]["why"]
 
 
@@ -152,7 +156,7 @@ def test_a_single_slow_triangle_is_said_to_be_blind_to_fast_effects(
     voltage = 40 * (1 - np.abs(1 - (time / 15) % 2))
     slow = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
     noisy = slow + truth.sigma * np.random.default_rng(0).standard_normal(len(slow))
-    found = psa.diagnose([Record("slow", time, voltage, noisy)])
+    found = psa.diagnose([Record(name="slow", time=time, voltage=voltage, displacement=noisy)])
     assert record.n > 0
     assert "sensor_delay" in {b.effect for b in found.blind_to}
     assert found.verdict in ("adequate", "ambiguous")

@@ -13,9 +13,12 @@ from psa_casadi.identification.start.doubts import (
     doubtful_sign,
     doubtful_time,
     doubtful_unit,
+    doubtful_voltage,
     refuse_unusable,
 )
 from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
+from psa_casadi.identification.start.readings import refuse_few
 from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
@@ -40,7 +43,7 @@ def scaled(
     given: tuple[FloatArray, FloatArray, FloatArray], t: float = 1.0, v: float = 1.0, y: float = 1.0
 ) -> Record:
     time, voltage, shown = given
-    return Record("r", t * time, v * voltage, y * shown)
+    return Record(name="r", time=t * time, voltage=v * voltage, displacement=y * shown)
 
 
 @pytest.mark.parametrize(
@@ -50,10 +53,10 @@ def scaled(
         ({"y": 1e9}, "displacement is in nm, not m .*--columns displacement=NAME:nm"),
         ({"y": 1e-12}, "changes by 2.9e-17 m, less than a stack with any sensor"),
         ({"y": 1e-310}, "less than a stack with any sensor"),
-        ({"y": 1e290}, "The displacement reaches 2.9e[+]285: that is no reading"),
+        ({"y": 1e95}, "The displacement reaches 2.9e[+]90: that is no reading"),
         ({"v": 1e6}, "reaches 6e[+]07 V.* voltage is in uV, not V .*--columns voltage=NAME:uV"),
         ({"v": 1e-310}, "changes by 6e-309 V only: that drives no stack"),
-        ({"v": 1e290}, "The voltage reaches 6e[+]291: that is no reading"),
+        ({"v": 1e95}, "The voltage reaches 6e[+]96: that is no reading"),
         ({"t": 1e12}, "Samples are 5e[+]09 s apart: the unit of time is probably another"),
     ],
 )
@@ -100,11 +103,13 @@ def test_a_stray_voltage_is_named_with_its_time(
     time, voltage, y = given
     stray = np.where(np.arange(600) == 300, 1e6, voltage)
     with pytest.raises(InputError, match=r"voltage is 1e\+06 V at 1.5 s, and all others lie with"):
-        refuse_unusable([Record("r", time, stray, y)])
+        refuse_unusable([Record(name="r", time=time, voltage=stray, displacement=y)])
     with pytest.raises(InputError, match=r"reaches 1e[+]09 V, and changes by 60 V.*has an offset"):
-        refuse_unusable([Record("r", time, voltage + 1e9, y)])
+        refuse_unusable([Record(name="r", time=time, voltage=voltage + 1e9, displacement=y)])
     with pytest.raises(InputError, match=r"voltage changes by .* V only: that drives no stack"):
-        refuse_unusable([Record("r", time, 50.0 + 1e-7 * voltage, y)])
+        refuse_unusable(
+            [Record(name="r", time=time, voltage=50.0 + 1e-7 * voltage, displacement=y)]
+        )
 
 
 @pytest.mark.parametrize(("t", "bound"), [(1e5, "R_s"), (1e-6, "c_P")])
@@ -122,7 +127,9 @@ def test_a_spike_of_a_million_metres_moves_nothing(
 ) -> None:
     time, voltage, y = given
     spoiled = np.where(np.arange(600) == 300, 1e6, y)
-    found = diagnose([Record("r", time, voltage, spoiled)], effects=TABLE)
+    found = diagnose(
+        [Record(name="r", time=time, voltage=voltage, displacement=spoiled)], effects=TABLE
+    )
     assert found.verdict == "adequate"
 
 
@@ -132,7 +139,7 @@ def test_a_saturated_sensor_is_named_and_masked(
 ) -> None:
     time, voltage, y = given
     ends = y.min() + np.array([low, high]) * np.ptp(y)
-    record = Record("r", time, voltage, np.clip(y, *ends))
+    record = Record(name="r", time=time, voltage=voltage, displacement=np.clip(y, *ends))
     found = suspects(record)
     flat = (y <= ends[0]) & (low > 0.0) | (y >= ends[1]) & (high < 1.0)
     assert np.mean(found.mask != flat) < 0.01
@@ -145,7 +152,9 @@ def test_a_saturated_record_is_diagnosed_without_its_flat_top(
     given: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
     time, voltage, y = given
-    record = Record("r", time, voltage, np.minimum(y, y.min() + 0.6 * np.ptp(y)))
+    record = Record(
+        name="r", time=time, voltage=voltage, displacement=np.minimum(y, y.min() + 0.6 * np.ptp(y))
+    )
     found = diagnose([record], effects=TABLE)
     assert found.verdict == "adequate"
     assert "the largest value, while the voltage moves the stack: the sensor" in found.notes[-1]
@@ -156,16 +165,29 @@ def test_what_is_flat_for_other_reasons_is_not_a_saturated_sensor(
 ) -> None:
     time, voltage, y = given
     quantum = np.ptp(y) / 50.0
-    assert not suspects(Record("coarse", time, voltage, quantum * np.round(y / quantum))).ends
+    assert not suspects(
+        Record(
+            name="coarse", time=time, voltage=voltage, displacement=quantum * np.round(y / quantum)
+        )
+    ).ends
     held = np.minimum(voltage, 0.6 * voltage.max())
-    assert not suspects(Record("held", time, held, np.round(1e-6 * held, 9))).ends
-    assert not suspects(Record("as it is", time, voltage, y)).ends
+    assert not suspects(
+        Record(name="held", time=time, voltage=held, displacement=np.round(1e-6 * held, 9))
+    ).ends
+    assert not suspects(Record(name="as it is", time=time, voltage=voltage, displacement=y)).ends
 
 
 def test_a_coarse_sensor_is_named(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
     time, voltage, y = given
     quantum = np.ptp(y) / 9.0
-    found = diagnose([Record("r", time, voltage, quantum * np.round(y / quantum))], effects=TABLE)
+    found = diagnose(
+        [
+            Record(
+                name="r", time=time, voltage=voltage, displacement=quantum * np.round(y / quantum)
+            )
+        ],
+        effects=TABLE,
+    )
     assert "r: the sensor resolves 9 steps over the whole range." in found.notes[-1]
 
 
@@ -175,4 +197,115 @@ def test_hardly_a_reading_left_is_refused_with_the_reason(
     time, voltage, y = given
     tenth = np.sort(y)[12]
     with pytest.raises(InputError, match=r"(?s)sensor is saturated there.*Only 12 of 600 reading"):
-        identify([Record("r", time, voltage, np.minimum(y, tenth))])
+        identify([Record(name="r", time=time, voltage=voltage, displacement=np.minimum(y, tenth))])
+
+
+@pytest.mark.parametrize("command", [identify, diagnose])
+def test_a_sensor_that_wraps_round_is_named(
+    command: Callable[[list[Record]], object], given: tuple[FloatArray, FloatArray, FloatArray]
+) -> None:
+    time, voltage, y = given
+    period = 0.6 * np.ptp(y)
+    wrapped = Record(
+        name="r", time=time, voltage=voltage, displacement=(y - y.min() + 0.1 * period) % period
+    )
+    with pytest.raises(
+        InputError, match=r"jumps \d+ times by 1[67].\d+ um, up or down, and follows"
+    ):
+        command([wrapped])
+
+
+def test_what_jumps_otherwise_is_not_wrapped(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    switched = np.where(time % 1.0 < 0.5, 0.0, voltage)
+    refuse_wrapped(
+        [
+            scaled(given),
+            Record(name="steps", time=time, voltage=switched, displacement=4e-7 * switched),
+        ]
+    )
+    stray = np.where(np.isin(np.arange(600), (200, 400)), y - np.ptp(y), y)
+    refuse_wrapped([Record(name="stray", time=time, voltage=voltage, displacement=stray)])
+
+
+def test_a_rate_an_integral_and_a_rectified_displacement_are_doubted(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    assert not doubtful_quantity([scaled(given)])
+    integral = Record(
+        name="r", time=time, voltage=voltage, displacement=np.cumsum(y - y.mean()) * 5e-3
+    )
+    assert "the rate of the displacement follows the voltage" in doubtful_quantity([integral])
+    rectified = Record(
+        name="r", time=time, voltage=voltage, displacement=np.abs(y - y.min() - 0.5 * np.ptp(y))
+    )
+    assert "V the displacement follows the voltage" in doubtful_quantity([rectified])
+    rate = Record(name="r", time=time, voltage=voltage, displacement=np.gradient(y, time))
+    assert "the integral of the displacement follows" in doubtful_quantity([rate])
+
+
+def test_a_voltage_in_counts_is_doubted(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    time, voltage, y = given
+    assert not doubtful_voltage([scaled(given)])
+    counts = Record(
+        name="r", time=time, voltage=np.round(32768.0 + 200.0 * voltage), displacement=y
+    )
+    found = diagnose([counts], effects=[])
+    assert "no stack bears such a voltage, and what depends on its level" in found.doubt
+    assert any("no stack bears more than 2000 V" in note for note in found.notes)
+
+
+def test_hardly_a_reading_that_differs_is_refused(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    ordered = np.sort(y)
+    hardly, enough = (
+        Record(name="r", time=time, voltage=voltage, displacement=np.maximum(y, ordered[-k]))
+        for k in (16, 17)
+    )
+    with pytest.raises(InputError, match=r"Only 15 readings of the displacement differ from"):
+        refuse_few([hardly], [hardly], [])
+    refuse_few([enough], [enough], [])
+
+
+def _heavy(y: FloatArray) -> FloatArray:
+    return y + 1e-3 * np.ptp(y) * np.random.default_rng(9).standard_t(1.5, y.size)
+
+
+def _torn(y: FloatArray) -> FloatArray:
+    return np.where(np.arange(y.size) % 200 < 60, np.nan, y)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("late", "change"),
+    [(30.0, lambda y: y), (0.0, _heavy), (0.0, _torn)],
+    ids=["late", "heavy", "torn"],
+)
+def test_an_odd_record_of_a_sound_stack_is_adequate(
+    late: float,
+    change: Callable[[FloatArray], FloatArray],
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """A record that starts late, noise with heavy tails, runs of missing readings."""
+    time, voltage, y = given
+    found = diagnose(
+        [Record(name="r", time=time + late, voltage=voltage, displacement=change(y))], effects=TABLE
+    )
+    assert found.verdict == "adequate"
+    assert not found.doubt
+
+
+@pytest.mark.slow
+def test_a_voltage_with_the_other_sign_is_told(
+    given: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    time, voltage, y = given
+    found = diagnose([Record(name="r", time=time, voltage=-voltage, displacement=y)], effects=TABLE)
+    assert found.verdict == "not_driven"
+    assert any("connected the other way round" in note for note in found.notes)
+    assert found.next_experiment.why.startswith("Correct the record")

@@ -42,7 +42,7 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
         "drift": 1e-6 * TIME + 1e-8 * rng.standard_normal(TIME.size),
         "another device": 1e-6 * np.sin(2 * np.pi * 3.7 * TIME),
     }[kind]
-    found = diagnose([Record(kind, TIME, VOLTAGE, y)], effects=TABLE)
+    found = diagnose([Record(name=kind, time=TIME, voltage=VOLTAGE, displacement=y)], effects=TABLE)
     assert found.verdict == "not_driven"
     assert not found.causes
     assert "same device" in found.notes[-1]
@@ -50,7 +50,9 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
 
 
 def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
-    found = diagnose([Record("r", TIME, VOLTAGE, -shown)], effects=TABLE)
+    found = diagnose(
+        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=-shown)], effects=TABLE
+    )
     assert found.verdict == "not_driven"
     assert (
         "the sign of the displacement flipped the base model explains 100.00 %" in found.notes[-1]
@@ -59,14 +61,18 @@ def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
 
 @pytest.mark.parametrize("factor", [1e-6, 1e3])
 def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray) -> None:
-    found = diagnose([Record("r", TIME, VOLTAGE, factor * shown)], effects=TABLE)
+    found = diagnose(
+        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=factor * shown)], effects=TABLE
+    )
     assert found.verdict == "adequate"
     assert "its unit, or that of the voltage, is probably another" in found.notes[-1]
 
 
 def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
     with pytest.raises(InputError, match="m, more than a stack with any sensor: its unit"):
-        diagnose([Record("r", TIME, VOLTAGE, 1e6 * shown)], effects=TABLE)
+        diagnose(
+            [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=1e6 * shown)], effects=TABLE
+        )
 
 
 def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
@@ -80,7 +86,7 @@ def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
         y += lfilter([size * (1.0 - abs(pole))], [1.0, -2 * pole.real, abs(pole) ** 2], late)
     y *= 1e-5 / np.std(y)
     y += 1e-7 * np.random.default_rng(3).standard_normal(time.size)
-    found = diagnose([Record("r", time, voltage, y)], effects=TABLE)
+    found = diagnose([Record(name="r", time=time, voltage=voltage, displacement=y)], effects=TABLE)
     assert found.verdict == "unexplained"
     assert any("A linear filter of the voltage explains" in n for n in found.notes)
     assert not any("of the same device" in n for n in found.notes)
@@ -89,17 +95,27 @@ def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
 def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: FloatArray) -> None:
     rest = np.full(TIME.size, 1e-6)
     with pytest.raises(InputError, match="The voltage is 40 V throughout"):
-        diagnose([Record("r", TIME, np.full(TIME.size, 40.0), shown)], effects=TABLE)
+        diagnose(
+            [Record(name="r", time=TIME, voltage=np.full(TIME.size, 40.0), displacement=shown)],
+            effects=TABLE,
+        )
     with pytest.raises(InputError, match="The displacement is 1e-06 m throughout: the sensor"):
-        diagnose([Record("r", TIME, VOLTAGE, rest)], effects=TABLE)
+        diagnose([Record(name="r", time=TIME, voltage=VOLTAGE, displacement=rest)], effects=TABLE)
     bit: FloatArray = np.where(shown > np.mean(shown), 1e-5, 0.0)
     with pytest.raises(InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
-        diagnose([Record("r", TIME, VOLTAGE, bit)], effects=TABLE)
+        diagnose([Record(name="r", time=TIME, voltage=VOLTAGE, displacement=bit)], effects=TABLE)
 
 
 def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArray) -> None:
-    hold = Record("hold", TIME, np.full(TIME.size, VOLTAGE[0]), np.full(TIME.size, shown[0]))
-    found = diagnose([Record("r", TIME, VOLTAGE, shown), hold], effects=TABLE)
+    hold = Record(
+        name="hold",
+        time=TIME,
+        voltage=np.full(TIME.size, VOLTAGE[0]),
+        displacement=np.full(TIME.size, shown[0]),
+    )
+    found = diagnose(
+        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=shown), hold], effects=TABLE
+    )
     assert np.isfinite(found.base_errors.holdout_nrmse_percent)
 
 

@@ -34,7 +34,7 @@ def _recorded(step: float, tones: tuple[float, ...], *, noise: float = 0.01) -> 
     )
     current = found.current + noise * np.std(found.current) * rng.standard_normal(t.size)
     shown = found.displacement + 2e-9 * rng.standard_normal(t.size)
-    return Record("r", t, voltage, shown, current=current + 0.003)
+    return Record(name="r", time=t, voltage=voltage, displacement=shown, current=current + 0.003)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,9 @@ def test_a_slow_current_of_any_size_and_a_lossy_ceramic(capacitance: float) -> N
     omega, loss = 2 * np.pi, 0.03
     clean = capacitance * omega * 40.0 * (np.sin(omega * t) - loss * np.cos(omega * t))
     noise = 0.01 * np.std(clean) * np.random.default_rng(2).standard_normal(t.size)
-    found = capacitance_of([Record("r", t, voltage, None, current=clean + noise)])
+    found = capacitance_of(
+        [Record(name="r", time=t, voltage=voltage, displacement=None, current=clean + noise)]
+    )
     assert found is not None
     assert found.value == pytest.approx(capacitance, rel=0.01)
     assert found.error < 0.01 * capacitance

@@ -26,6 +26,8 @@ from tests.record_files import HEADER, ROWS, write
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
 MODEL = dumps(compose(BASE))
 FAULT = "This is a fault of psa_casadi"
+#: A locale that knows ASCII alone, which Python does not replace by UTF-8.
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
 def shell(line: str, **variables: str) -> "subprocess.CompletedProcess[str]":
@@ -35,6 +37,17 @@ def shell(line: str, **variables: str) -> "subprocess.CompletedProcess[str]":
         ["bash", "-c", start + line], capture_output=True, encoding="utf-8", check=False,
         env={**os.environ, **variables}, timeout=60,
     )  # fmt: skip
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Path:
+    return write(tmp_path / "record.csv", HEADER, *ROWS)
+
+
+def program(path: Path, *lines: str) -> Path:
+    """Write a shell script that can be run."""
+    write(path, "#!/bin/sh", *lines).chmod(0o700)
+    return path
 
 
 STREAMS = {
@@ -62,11 +75,10 @@ def test_output_that_cannot_be_written(case: str) -> None:
 
 @posix
 def test_letters_that_the_terminal_lacks_do_not_end_a_command() -> None:
-    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     code = "from psa_casadi.cli.surroundings import prepare; prepare()"
     done = shell(
         f"""'{sys.executable}' -c '{code}; print("5 \\u00b5m, \\udcff.csv")'""",
-        PYTHONIOENCODING="ascii", **plain,
+        PYTHONIOENCODING="ascii", **ASCII,
     )  # fmt: skip
     assert done.stdout == "5 ?m, ?.csv\n", done.stderr
 
@@ -174,8 +186,7 @@ def test_a_compiler_that_does_not_work(
 def test_a_compiler_may_have_arguments_and_spaces(
     tmp_path: Path, empty_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    script = write(tmp_path / "my cc", "#!/bin/sh", 'echo "$@" > ../../said; exec cc "$@"')
-    script.chmod(0o700)
+    script = program(tmp_path / "my cc", 'echo "$@" > ../../said; exec cc "$@"')
     monkeypatch.setenv("CC", str(script))
     compiler.shared_library({"a.c": "int a;"}, ())
     monkeypatch.setenv("CC", f"'{script}' -D'X=\"a b\"'")
@@ -187,8 +198,7 @@ def test_a_compiler_may_have_arguments_and_spaces(
 def test_a_compiler_on_a_full_disk_is_no_broken_one(
     tmp_path: Path, empty_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    script = write(tmp_path / "full", "#!/bin/sh", "echo 'x: No space left on device' >&2; exit 1")
-    script.chmod(0o700)
+    script = program(tmp_path / "full", "echo 'x: No space left on device' >&2; exit 1")
     monkeypatch.setenv("CC", str(script))
     with pytest.raises(OSError, match="No space left"):
         compiler.shared_library({"a.c": "int a;"}, ())
@@ -226,8 +236,9 @@ def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
 
 
 @posix
-def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(tmp_path: Path) -> None:
-    record = write(tmp_path / "record.csv", HEADER, *ROWS)
+def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(
+    record: Path, tmp_path: Path
+) -> None:
     where = {"CC": "nothing-of-this-name", "PSA_CASADI_CACHE": str(tmp_path / "cache")}
     done = shell(f"psa identify '{record}' -q -o '{tmp_path}/m.json'", **where)
     assert done.returncode == 1
@@ -237,8 +248,7 @@ def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(tmp_path: Path
 @posix
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="no prlimit")
-def test_a_command_with_too_little_memory_says_so(tmp_path: Path) -> None:
-    record = write(tmp_path / "record.csv", HEADER, *ROWS)
+def test_a_command_with_too_little_memory_says_so(record: Path, tmp_path: Path) -> None:
     done = shell(f"ulimit -v 150000; psa identify '{record}' -q -o '{tmp_path}/m.json'")
     assert done.returncode == 1
     assert "there is too little memory" in done.stderr
@@ -247,14 +257,15 @@ def test_a_command_with_too_little_memory_says_so(tmp_path: Path) -> None:
 
 @posix
 @pytest.mark.slow
-def test_a_command_without_home_cache_temporary_folder_and_docstrings(tmp_path: Path) -> None:
-    record = write(tmp_path / "record.csv", HEADER, *ROWS)
+def test_a_command_without_home_cache_temporary_folder_and_docstrings(
+    record: Path, tmp_path: Path
+) -> None:
     output = tmp_path / "m.json"
     done = shell(
         f"unset HOME; psa simulate --model '{write(tmp_path / 'model.json', MODEL)}'"
         f" --input '{record}' -o '{output}'",
         PSA_CASADI_CACHE="/dev/null/cache", TMPDIR=str(tmp_path / "no"), MPLCONFIGDIR="/dev/null",
-        PYTHONOPTIMIZE="2", LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0",
+        PYTHONOPTIMIZE="2", **ASCII,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     told = [line for line in done.stderr.splitlines() if "cache" in line]

@@ -28,7 +28,7 @@ def record_at(time: FloatArray, sigma: float, seed: int = 1) -> Record:
     voltage = np.interp(time, grid, multisine(grid, 2.0, 60.0, (3.0, 40.0), seed=seed))
     x = simulate(model_with(), time, voltage, rtol=1e-9).displacement
     white = np.random.default_rng(seed).standard_normal(len(time))
-    return Record(f"r{seed}", time, voltage, x + sigma * white)
+    return Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x + sigma * white)
 
 
 def regular(sigma: float = SIGMA, seed: int = 1) -> Record:

@@ -68,6 +68,15 @@ def _tracking_on_the_fmu(found: Mapping[str, float]) -> None:
     assert error < 0.1
 
 
+def _uncertainty_in_fmpy(found: Mapping[str, float]) -> None:
+    """Two ways to the standard deviation; 20 samples tell one to a sixth."""
+    sets, stroke, by_points, by_samples = found.values()
+    assert sets > 1 + 2 + 20
+    assert stroke > 20.0
+    assert 1.0 < by_points < 50.0
+    assert by_samples == pytest.approx(by_points, rel=0.5)
+
+
 #: What the returned figures must be, beyond that the example runs and leaves its files.
 FIGURES: dict[str, Callable[[Any], None]] = {
     "van_der_pol": _van_der_pol,
@@ -75,6 +84,7 @@ FIGURES: dict[str, Callable[[Any], None]] = {
     "use_in_casadi": _use_in_casadi,
     "co_simulation": _co_simulation,
     "tracking_on_the_fmu": _tracking_on_the_fmu,
+    "uncertainty_in_fmpy": _uncertainty_in_fmpy,
 }
 
 

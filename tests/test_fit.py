@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import Fit, fit, objective
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.minimum import objective
 from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
@@ -41,7 +42,9 @@ def record_of(model: Model, seed: int, samples: int = 400) -> Record:
     voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
     x = simulate(model, time, voltage).displacement
     white = np.random.default_rng(seed).standard_normal(samples)
-    return Record(f"r{seed}", time, voltage, x + 1e-6 * seed + SIGMA * white)
+    return Record(
+        name=f"r{seed}", time=time, voltage=voltage, displacement=x + 1e-6 * seed + SIGMA * white
+    )
 
 
 def moved(unknowns: Unknowns, seed: int) -> FloatArray:
@@ -184,7 +187,10 @@ def _after_a_history(model: Model, peak: float, seed: int) -> Record:
     x = simulate(model, time, voltage).displacement
     noise = SIGMA * np.random.default_rng(seed).standard_normal(time.size)
     return Record(
-        f"h{seed}", time[~before] - time[~before][0], voltage[~before], (x + noise)[~before]
+        name=f"h{seed}",
+        time=time[~before] - time[~before][0],
+        voltage=voltage[~before],
+        displacement=(x + noise)[~before],
     )
 
 
@@ -231,7 +237,7 @@ def test_a_trial_whose_numbers_overflow_has_failed(monkeypatch: pytest.MonkeyPat
         one = Prediction(np.full(len(weights), 1.0), np.full((len(weights), size), 1e160), "exact")
         return [one]
 
-    monkeypatch.setattr("psa_casadi.identification.fitting.fit.predict", huge)
+    monkeypatch.setattr("psa_casadi.identification.fitting.minimum.predict", huge)
     assert evaluate(found.theta) is None
 
 

@@ -117,7 +117,7 @@ def test_parameters_are_graded_as_the_determinacy_says() -> None:
         "The records determine 1 of 5 fitted parameters to 10 % or better; A and tau are weakly"
         " determined; R_s is undetermined; c_P is on its bound."
     )
-    assert "A may be zero and is taken relative to an ordinary change" in error_bar_note(graded)
+    assert "A may be zero, so the error is relative to an ordinary change" in error_bar_note(graded)
     rows = {
         r[0]: r[4] for r in parameter_table(found.model, replace(found, determinacy=known)).rows
     }

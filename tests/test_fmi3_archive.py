@@ -67,6 +67,9 @@ def test_archive_of_fmi_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert binaries == {
         "x86_64-linux/demo.so",
         "aarch64-linux/demo.so",
+        "riscv64-linux/demo.so",
+        "aarch32-linux/demo.so",
+        "x86-linux/demo.so",
         "x86_64-windows/demo.dll",
         "x86-windows/demo.dll",
         "x86_64-darwin/demo.dylib",

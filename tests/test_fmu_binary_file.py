@@ -14,6 +14,11 @@ from tests.tiers import slow
 pytestmark = [pytest.mark.xdist_group("platforms"), slow]
 
 FORMATS = {".so": "ELF", ".dll": "PE", ".dylib": "Mach-O"}
+#: lief's words for the machines.
+MACHINES = {
+    "I386": "x86", "AMD64": "x86_64", "X86_64": "x86_64", "ARM": "aarch32", "AARCH64": "aarch64",
+    "ARM64": "aarch64", "RISCV": "riscv64",
+}  # fmt: skip
 
 
 def _independent(path: Path) -> Binary:
@@ -22,15 +27,20 @@ def _independent(path: Path) -> Binary:
         required = found.symbols_version_requirement
         needs = {str(v.name) for r in required for v in r.get_auxiliary_symbols()}
         names = {str(s.name) for s in found.exported_symbols}
-        return Binary("ELF", frozenset(names), frozenset(needs))
+        machine = MACHINES[found.header.machine_type.name]
+        return Binary("ELF", f"{machine}-linux", frozenset(names), frozenset(needs))
     if isinstance(found, lief.PE.Binary):
         export = found.get_export()
         assert export is not None
-        return Binary("PE", frozenset(str(e.name) for e in export.entries), frozenset())
+        machine = MACHINES[found.header.machine.name]
+        names = {str(e.name) for e in export.entries}
+        return Binary("PE", f"{machine}-windows", frozenset(names), frozenset())
     assert isinstance(found, lief.MachO.Binary)
     of_the_linker = {"__mh_dylib_header", "___dso_handle"}
     names = {str(s.name) for s in found.exported_symbols} - of_the_linker
-    return Binary("Mach-O", frozenset(n.removeprefix("_") for n in names), frozenset())
+    machine = MACHINES[found.header.cpu_type.name]
+    exported = frozenset(n.removeprefix("_") for n in names)
+    return Binary("Mach-O", f"{machine}-darwin", exported, frozenset())
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
@@ -39,6 +49,7 @@ def test_exports_and_needs(name: str, fmi: int) -> None:
     path = binary(fmi, PLATFORMS[name])
     found = read_binary(path)
     assert found == _independent(path)
+    assert found.platform == name
     assert found.format == FORMATS[PLATFORMS[name].suffix]
     assert f"fmi{fmi}DoStep" in found.exports
     assert bool(found.needs) == (found.format == "ELF")

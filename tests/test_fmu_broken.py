@@ -10,8 +10,10 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check import agreement
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.check import CheckReport, check_fmu
+from psa_casadi.export.check.description import misplaced_binaries
 from psa_casadi.export.fmu.archive import MODEL_ENTRY, write_archive
 from psa_casadi.export.fmu.platforms import compile_library, host_platform
+from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.units import FloatArray
@@ -110,6 +112,12 @@ CORE = {
         "state->input.rate[index] = rate[i];",
         "state->input.rate[index] = 0.0 * rate[i];",
         {"co-simulation, step 0.001 s"},
+    ),
+    "no line of the input": (
+        "instance.c",
+        "if (state->stride > 0.0)",
+        "if (state->stride < 0.0)",
+        {"line of the input"},
     ),
     "parameters without effect during a run": (
         "values.c",
@@ -221,6 +229,18 @@ def test_names_in_the_binary(fmi: int, tmp_path: Path) -> None:
     change = _edit("GLIBC_2.2.5\0", "GLIBC_2.38\0\0")
     found = _failures(check_fmu(rewritten(exported(STACK, fmi), path, {name: change})))
     assert "needs GLIBC_2.38" in found["GNU libc 2.17"]
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) -> None:
+    """Importers go by the folder alone, and would fail to load it."""
+    path, found = tmp_path / "b.fmu", entries(STACK, fmi)
+    write_archive(path, {**found, "binaries/riscv64-linux/psa.so": found[_binary(fmi)]})
+    with Archive(path) as moved:
+        (said,) = misplaced_binaries(moved)
+    assert said.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
+    with Archive(exported(STACK, fmi)) as whole:
+        assert not list(misplaced_binaries(whole))
 
 
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))

@@ -2,6 +2,7 @@
 
 import ctypes
 import re
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
@@ -57,6 +58,18 @@ def test_failed_step_names_state_and_time_and_can_be_undone(slave: Instance) -> 
     assert 0.0 < slave.get(["displacement"])[0] < 20e-6
     slave.drop(snapshot)
     assert snapshot.value is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("load_force", 1e18), ("load_force", -1e24), ("voltage", 1e13), ("voltage", 1e15)],
+)
+def test_an_absurd_input_ends_the_step_soon(name: str, value: float, slave: Instance) -> None:
+    slave.set({name: value})
+    begun = time.process_time()
+    assert slave.call("DoStep", 0.0, 1e-3, 1) == DISCARD
+    assert time.process_time() - begun < 0.5
+    assert "an input or a parameter is far from its physical range" in slave.messages[-1]
 
 
 def test_values_are_set_all_or_none(slave: Instance) -> None:

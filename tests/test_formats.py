@@ -171,7 +171,7 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
         ("voltage", "'voltage': is not understood; write NAME=ARRAY:UNIT"),
         ("voltage=", "'voltage=': is not understood"),
         ("voltag=u", "'voltag' is no column of a record; is 'voltage' meant?"),
-        ("strain=u", "'strain' is no column of a record; there are time, voltage"),
+        ("torque=u", "'torque' is no column of a record; there are time, voltage"),
         ("voltage=u,voltage=v", "'voltage=v': 'voltage' is given twice"),
         ("voltage=u:um", "the unit 'um' does not measure voltage"),
         ("voltage=u:volts", "the unit 'volts' is unknown"),
@@ -212,7 +212,7 @@ def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     problems = problems_of(path)
     assert len(problems) == 3
     assert "no array is named 'voltage' (arrays and their lengths: t (24), u (24)" in problems[1]
-    assert "such as --columns displacement=ARRAY:um" in problems[2]
+    assert "--columns time=t:s,voltage=u:V,displacement=y:um (with your units)." in problems[2]
     problems = problems_of(path, "time=t,voltage=w,displacement=y")
     assert "there is no array 'w' of numbers" in problems[0]
     assert (
@@ -270,7 +270,11 @@ def test_a_damaged_matlab_file_is_told_in_sentences(tmp_path: Path, version: str
 @pytest.mark.parametrize(
     ("module", "name", "sentence"),
     [
-        ("h5py", "a.mat", "version 7.3, and reading it needs h5py, which is not installed; run"),
+        (
+            "h5py",
+            "a.mat",
+            "version 7.3 are), and reading it needs h5py, which is not installed; run",
+        ),
         ("pyarrow", "a.parquet", "reading Parquet needs pyarrow, which is not installed; run"),
     ],
 )

@@ -26,7 +26,7 @@ if not hasattr(os, "fork"):
     pytest.skip("the inputs are attacked in forked processes", allow_module_level=True)
 
 from tests.benchmarks.fuzz import app
-from tests.fuzz import valid_files
+from tests.fuzz import laboratory, valid_files
 from tests.fuzz.campaign import Amount, Tally, run
 from tests.fuzz.mutators import damaged_bytes, damaged_json, damaged_table
 from tests.fuzz.replay import replay
@@ -37,6 +37,8 @@ from tests.fuzz.target import CRASH, FALSE_PASS, FOREIGN, HANG, LEFT_OVER, Found
 QUICK = {"records-csv": 500, "column-maps": 500, "paths": 200, "models": 200}
 FULL = {
     "records-csv": 6000, "records-mat": 1500, "records-hdf5": 10, "records-parquet": 700,
+    "records-xlsx": 150, "records-tdms": 600, "records-h5": 10, "records-npz": 600,
+    "records-npy": 600, "records-lvm": 600, "records-dat": 600,
     "column-maps": 6000, "mapped-records": 1000, "units": 4000, "models": 1500, "paths": 2000,
     "binaries": 6000, "zips": 150, "descriptions": 500, "states": 1000,
 }  # fmt: skip
@@ -83,6 +85,7 @@ def test_the_files_that_are_damaged_are_sound(tmp_path: Path) -> None:
         "csv": [t.encode() for t in valid_files.csv_texts()],
         "mat": [*valid_files.mat_files(), *valid_files.hdf5_files()],
         "parquet": valid_files.parquet_files(),
+        **{suffix[1:]: contents for suffix, contents in laboratory.sound_files().items()},
     }
     for suffix, contents in files.items():
         for content in contents:

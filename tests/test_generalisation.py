@@ -35,14 +35,14 @@ def fitted() -> tuple[Fit, FloatArray, FloatArray]:
     voltage: FloatArray = 40.0 * (1.0 - np.cos(2 * np.pi * 4.0 * TIME))
     model = compose(BASE)
     clean = simulate(model, TIME, voltage).displacement
-    record = Record("r", TIME, voltage, clean)
+    record = Record(name="r", time=TIME, voltage=voltage, displacement=clean)
     return fit(model, (split(record),), ["k_L"], sigma=[LEVEL]), voltage, clean
 
 
 def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> float:
     """What is said of an error (n,) [m] of that model."""
     found, voltage, clean = fitted
-    experiments = (split(Record("r", TIME, voltage, clean + error)),)
+    experiments = (split(Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),)
     used = error[experiments[0].used]
     seen = replace(found, residuals=used)
     colour = colour_of(used, [len(used)])
@@ -65,7 +65,7 @@ def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
     fitted: tuple[Fit, FloatArray, FloatArray], seed: int
 ) -> None:
     _, voltage, clean = fitted
-    held = split(Record("r", TIME, voltage, clean)).held_out
+    held = split(Record(name="r", time=TIME, voltage=voltage, displacement=clean)).held_out
     noise = LEVEL * np.random.default_rng(seed).standard_normal(SAMPLES)
     assert _excess(fitted, np.where(held, 1.3 * noise, noise)) == pytest.approx(1.3, rel=0.12)
     stray = noise.copy()
@@ -85,7 +85,10 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
     for _ in range(25):
         draws = LEVEL * rng.standard_normal((2, SAMPLES)) * np.array([[1.0], [3.0]])
         errors = lfilter([1.0], [1.0, -correlation], draws, axis=1)
-        records = [Record(f"r{k}", TIME, voltage, clean + e) for k, e in enumerate(errors)]
+        records = [
+            Record(name=f"r{k}", time=TIME, voltage=voltage, displacement=clean + e)
+            for k, e in enumerate(errors)
+        ]
         experiments = divided(records[:1], [records[1].slice(0, samples)])
         lead = experiments[1].used
         offset = float(np.mean(errors[1][:samples][lead]))

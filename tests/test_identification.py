@@ -106,7 +106,12 @@ def test_a_given_stiffness_scales_the_forces() -> None:
 def shifted(record: Record, start: int, stop: int, offset: float) -> Record:
     part = record.slice(start, stop)
     assert part.displacement is not None
-    return Record(part.name, part.time, part.voltage, part.displacement + offset)
+    return Record(
+        name=part.name,
+        time=part.time,
+        voltage=part.voltage,
+        displacement=part.displacement + offset,
+    )
 
 
 @slow
@@ -137,7 +142,9 @@ def reference_record(p: dict[str, float], sigma: float) -> Record:
         p, drive, time, initial=start, breakpoints=list(time[1:-1]), rtol=1e-8
     ).displacement
     white = np.random.default_rng(5).standard_normal(len(x))
-    return Record("reference", time, voltage, x + sigma * np.ptp(x) * white)
+    return Record(
+        name="reference", time=time, voltage=voltage, displacement=x + sigma * np.ptp(x) * white
+    )
 
 
 def start_model(p: dict[str, float]) -> Model:

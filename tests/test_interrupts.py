@@ -48,7 +48,12 @@ def record() -> Record:
     """A stack with a drift that the base does not have."""
     y = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
     noise = 3e-9 * np.random.default_rng(2).standard_normal(TIME.size)
-    return Record("drifting", TIME, VOLTAGE, y + noise + 2e-7 * (TIME / TIME[-1]) ** 2)
+    return Record(
+        name="drifting",
+        time=TIME,
+        voltage=VOLTAGE,
+        displacement=y + noise + 2e-7 * (TIME / TIME[-1]) ** 2,
+    )
 
 
 def at(word: str) -> Callable[[str], None]:
@@ -175,7 +180,7 @@ def test_a_command_says_what_it_kept(
 ) -> None:
     for home in ("diagnose", "identify"):
         module = sys.modules[f"psa_casadi.cli.{home}"]
-        monkeypatch.setattr(module, "working", lambda what, quiet: nullcontext(at(word)))
+        monkeypatch.setattr(module, "working", lambda *given: nullcontext(at(word)))
     if word == "writing":
         finished = diagnosis("cause_named")
         module = sys.modules["psa_casadi.diagnosis.diagnose"]

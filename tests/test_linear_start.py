@@ -38,14 +38,19 @@ def simulated(
 
 def noisy(name: str, time: FloatArray, voltage: FloatArray, x: FloatArray, share: float) -> Record:
     noise = share * np.ptp(x) * np.random.default_rng(1).standard_normal(x.size)
-    return Record(name, time, voltage, x + noise)
+    return Record(name=name, time=time, voltage=voltage, displacement=x + noise)
 
 
 @cache
 def step_of(name: str, effect: str = "") -> Record:
     values = values_of(name)
     time, voltage = step_voltage(values)
-    return Record("step", time, voltage, simulated(values, time, voltage, effect))
+    return Record(
+        name="step",
+        time=time,
+        voltage=voltage,
+        displacement=simulated(values, time, voltage, effect),
+    )
 
 
 def step(name: str, share: float, effect: str = "") -> Record:
@@ -148,7 +153,12 @@ def test_no_size_is_built_in(scale: float) -> None:
     """Times, volts and metres in other units give the same candidates in those units."""
     record = step("WYDS0808020", 1e-3)
     assert record.displacement is not None
-    other = Record("scaled", scale * record.time, 0.1 * record.voltage, 3.0 * record.displacement)
+    other = Record(
+        name="scaled",
+        time=scale * record.time,
+        voltage=0.1 * record.voltage,
+        displacement=3.0 * record.displacement,
+    )
     base = starting_model([record]).values
     first, second = linear_start([record], base), linear_start([other], base)
     assert first is not None
@@ -165,7 +175,9 @@ def test_gaps_offset_clock_and_polarity_do_not_matter() -> None:
     x = np.array(record.displacement)
     x[np.random.default_rng(0).uniform(size=x.size) < 0.2] = np.nan
     x[300:340] = np.nan
-    other = Record("gaps", record.time + 7.0, record.voltage - 50.0, 3e-5 - x)
+    other = Record(
+        name="gaps", time=record.time + 7.0, voltage=record.voltage - 50.0, displacement=3e-5 - x
+    )
     assert errors(start(other), values_of("PTBS200"), other)[0] < 0.05
 
 

@@ -67,13 +67,15 @@ def test_loops_that_begin_amid_a_period_tell_it_too() -> None:
 
 def replace_from(r: Record, first: int) -> Record:
     y = np.array(r.displacement)
-    return Record(r.name, r.time[first:], r.voltage[first:], y[first:])
+    return Record(
+        name=r.name, time=r.time[first:], voltage=r.voltage[first:], displacement=y[first:]
+    )
 
 
 def test_nothing_is_read_where_nothing_turns_or_moves() -> None:
     p = truth("P-885.51")
     t, v = step_voltage(p)
-    step = Record("step", t, v, 1e-7 * v)
+    step = Record(name="step", time=t, voltage=v, displacement=1e-7 * v)
     assert loop_start(starting_model([step]), [step]) is None
     still = replace_from(loops("P-885.51")[0], 0)
     still = replace(still, displacement=np.full(still.n, 1e-6))

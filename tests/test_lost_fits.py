@@ -144,7 +144,7 @@ def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
             y[k : k + length] = y[k - 1]
             stuck.append(k + length - 1)
     assert len(stuck) > 10
-    record = Record("a", given.time, given.voltage, y)
+    record = Record(name="a", time=given.time, voltage=given.voltage, displacement=y)
     found = diagnose([record], effects=[EFFECTS["mains_hum"]])
     used = found.experiments[0].record.mask
     assert [c.effect for c in found.causes] == ["mains_hum"]

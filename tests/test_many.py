@@ -23,7 +23,7 @@ def record(uneven: bool = False) -> Record:
         t = t + 1e-5 * np.random.default_rng(1).standard_normal(600)
     s = np.arange(600) / 600
     v = np.where(s < 0.6, 40.0 * (1.0 - np.cos(2 * np.pi * s / 0.3)), np.minimum(400 * s - 240, 80))
-    return Record("sets", t, np.asarray(v, dtype=np.float64))
+    return Record(name="sets", time=t, voltage=np.asarray(v, dtype=np.float64))
 
 
 def sets(model: Model, count: int) -> list[dict[str, float]]:

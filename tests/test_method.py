@@ -40,7 +40,9 @@ def fitted() -> tuple[Fit, tuple[Experiment, ...]]:
     clean = simulate(model, time, voltage).displacement
     noise = 2e-3 * np.ptp(clean) * np.random.default_rng(4).standard_normal(time.size)
     bent = 0.02 * np.ptp(clean) * (time / time[-1]) ** 2
-    experiments = (split(Record("r", time, voltage, clean + bent + noise)),)
+    experiments = (
+        split(Record(name="r", time=time, voltage=voltage, displacement=clean + bent + noise)),
+    )
     return fit(model, experiments, ["k_L"], sigma=[float(np.std(noise))]), experiments
 
 

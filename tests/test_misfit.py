@@ -158,7 +158,7 @@ def test_standard_errors_know_of_correlation(correlation: float) -> None:
 def test_missing_samples_and_rejected_ones() -> None:
     error = 3e-8 * np.sin(2 * np.pi * SINE / 100.0)
     residual = error + noise(TIME.size, 0.0, 0)
-    record = Record("r", TIME, SINE, 1e-7 * SINE + residual)
+    record = Record(name="r", time=TIME, voltage=SINE, displacement=1e-7 * SINE + residual)
     gone = residual.copy()
     gone[np.random.default_rng(0).random(TIME.size) < 0.3] = np.nan
     gone[3_000:6_000] = np.nan
@@ -175,7 +175,13 @@ def test_missing_samples_and_rejected_ones() -> None:
 def test_counts_stay_counts() -> None:
     residual: FloatArray = 3.0 * np.sin(2 * np.pi * SINE / 100.0)
     residual = residual + noise(TIME.size, 0.0, 0) / NOISE
-    record = Record("r", TIME, SINE, 100.0 * SINE + residual, displacement_unit="counts")
+    record = Record(
+        name="r",
+        time=TIME,
+        voltage=SINE,
+        displacement=100.0 * SINE + residual,
+        displacement_unit="counts",
+    )
     m = misfit(record, residual, noise_floor([record], [residual])[0])
     assert "2.1 counts rms" in m.sentences[0]
     assert "+3 counts at" in m.sentences[1] or "-3 counts at" in m.sentences[1]
@@ -190,7 +196,7 @@ def test_a_constant_voltage_is_no_trouble() -> None:
 
 def test_rate_and_turns_of_a_noisy_voltage() -> None:
     measured = SINE + 0.05 * np.random.default_rng(0).standard_normal(TIME.size)
-    drive = drive_of(Record("r", TIME, measured))
+    drive = drive_of(Record(name="r", time=TIME, voltage=measured))
     assert len(drive.turns) == len(reversals(SINE))
     inner = slice(50, -50)
     assert np.std((drive.rate - np.gradient(SINE, TIME))[inner]) < 0.15 * np.std(drive.rate)
@@ -203,7 +209,7 @@ def test_a_million_samples() -> None:
     n = 1_000_000
     v = 50.0 * (1.0 - np.cos(2 * np.pi * np.arange(n) / 800.0))
     residual = 1e-8 * np.sin(v / 30.0) + noise(n, 0.0, 0)
-    record = Record("r", grid(n), v, 1e-7 * v + residual)
+    record = Record(name="r", time=grid(n), voltage=v, displacement=1e-7 * v + residual)
     (floor,) = noise_floor([record], [residual])
     before = time.process_time()
     m = misfit(record, residual, floor)

@@ -27,7 +27,7 @@ def test_the_mains_and_the_drive_are_named() -> None:
     assert (mains.name, mains.of_drive) == ("50 Hz mains", False)
     assert (harmonic.name, harmonic.of_drive) == ("harmonic 3 of the drive", True)
     slow = grid(4_000, 1.0 / 45.0)
-    aliased = Record("a", slow, np.sin(40.0 * slow), np.zeros(4_000))
+    aliased = Record(name="a", time=slow, voltage=np.sin(40.0 * slow), displacement=np.zeros(4_000))
     residual = 2e-8 * np.sin(2 * np.pi * 50.0 * aliased.time) + noise(4_000, 0.0, 0)
     (line,) = misfit(aliased, residual, *noise_floor([aliased], [residual])).spectrum.lines
     assert line.frequency == pytest.approx(5.0, abs=0.01)

@@ -130,7 +130,7 @@ def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN
         contribution(run, {"frequency": f, "zeta": z}, share) for f, z, share in modes
     )
     x = x + 1e-3 * np.ptp(x) * rng.standard_normal(COUNT)
-    return Record("shaken", time, command, x)
+    return Record(name="shaken", time=time, voltage=command, displacement=x)
 
 
 @slow

@@ -10,14 +10,33 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.variables import Interval, Provenance
+from tests.evidence_models import evident_model
 from tests.mutations import changed, sentences
 
 MODEL = stack_model("demo")
+
+
+def _short() -> Evidence | None:
+    """Return evidence whose reference run has three samples, one of them not measured."""
+    told = evident_model().evidence
+    if told is None or told.reference is None:
+        return told
+    reference = replace(
+        told.reference,
+        time=told.reference.time[:3],
+        inputs={n: c[:3] for n, c in told.reference.inputs.items()},
+        displacement=(None, *told.reference.displacement[1:3]),
+    )
+    return replace(told, reference=reference)
+
+
 SAVED = replace(
     MODEL,
+    evidence=_short(),
     provenance=Provenance(
         identified_from=(("rig", "0" * 64),),
         free=("k_L", "tau"),
@@ -47,6 +66,7 @@ def same_or_refused(text: str) -> bool:
     again = loads(written)
     assert dumps(again) == written
     assert again.provenance == model.provenance
+    assert again.evidence == model.evidence
     assert dict(again.values) == dict(model.values)
     assert again.own_starts() == model.own_starts()
     return False

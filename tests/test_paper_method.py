@@ -167,7 +167,9 @@ def test_steps_and_loops_are_told_by_their_voltage() -> None:
         "minor": decaying_triangle(time, 0.0, 60.0, 4),
         "multisine": multisine(time, 0.0, 60.0, (1.0, 20.0), seed=2),
     }
-    records = [Record(n, time, v, 1e-7 * v) for n, v in shapes.items()]
+    records = [
+        Record(name=n, time=time, voltage=v, displacement=1e-7 * v) for n, v in shapes.items()
+    ]
     found = {s.name: s for s in find_steps(records)}
     assert list(found) == ["held", "ramped"]
     assert found["held"].volts == 50.0
@@ -265,7 +267,7 @@ def test_a_hysteresis_that_runs_away_is_set_back(monkeypatch: pytest.MonkeyPatch
 def test_a_record_without_displacement_is_refused() -> None:
     time = time_grid(1.0, 1e-3)
     with pytest.raises(InputError, match="has no displacement"):
-        paper_method([Record("planned", time, triangle(time, 0.0, 60.0, 2.0))])
+        paper_method([Record(name="planned", time=time, voltage=triangle(time, 0.0, 60.0, 2.0))])
 
 
 @pytest.mark.parametrize("with_step", [True, False])

@@ -32,7 +32,7 @@ def test_a_current_limit_of_any_height_is_near_one_that_is_tried(share: float, s
     levels = np.array([0.0, 0.3, 0.1, 0.5, 0.2, 0.25, 0.7, 0.02, 0.95, 0.4])
     voltage = size * model.values["u_rated"] * np.repeat(np.tile(levels, 2), 60)
     clean = simulate(model, time, voltage).displacement
-    experiments = (whole(Record("r", time, voltage, clean)),)
+    experiments = (whole(Record(name="r", time=time, voltage=voltage, displacement=clean)),)
     base = fit(model, experiments, ["k_L"], sigma=[1e-8])
     current = model.values["C_p"] * float(np.max(np.abs(np.diff(voltage)))) / 1e-3
     limited = model.with_effect(effect, {"inverse_current_limit": 1.0 / (share * current)})
@@ -55,7 +55,7 @@ def test_the_period_of_a_ripple_is_read_off_the_residual(period: float) -> None:
     x = simulate(model, t, voltage).displacement
     noise = 2e-8 * np.random.default_rng(4).standard_normal(t.size)
     reading = x + 2e-8 * np.sqrt(2.0) * np.sin(2 * np.pi * x / period + 0.4) + noise
-    experiments = (whole(Record("r", t, voltage, reading)),)
+    experiments = (whole(Record(name="r", time=t, voltage=voltage, displacement=reading)),)
     found = residual_periods(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
     count = float(np.ptp(x)) / period
     assert min(abs(np.ptp(x) / p - count) for p in found) < 0.25
@@ -70,7 +70,7 @@ def test_the_place_of_a_jump_is_read_off_the_residual(share: float) -> None:
     noise = 1e-8 * np.random.default_rng(4).standard_normal(t.size)
     place = float(x.min() + share * np.ptp(x))
     reading = x + 2e-8 * (x > place) + noise + 3e-6
-    experiments = (whole(Record("r", t, voltage, reading)),)
+    experiments = (whole(Record(name="r", time=t, voltage=voltage, displacement=reading)),)
     places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
     assert min(abs(p - place) for p in places) < 0.01 * np.ptp(x)
 
@@ -79,7 +79,7 @@ def test_a_memory_that_adds_a_static_curve_shows_none() -> None:
     model = compose(BASE)
     t, voltage = _loops()
     x = simulate(model, t, voltage).displacement
-    experiments = (whole(Record("r", t, voltage, x)),)
+    experiments = (whole(Record(name="r", time=t, voltage=voltage, displacement=x)),)
     before = root_of(fit(model, experiments, ["k_L", "A", "beta"], sigma=[1e-8]), experiments)
 
     def shown(added: FloatArray) -> bool:

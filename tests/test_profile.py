@@ -40,7 +40,12 @@ def record_of(model: Model, seed: int, noise: float = SIGMA) -> Record:
     time = time_grid(400 * SAMPLE, SAMPLE)
     voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
     x = simulate(model, time, voltage).displacement
-    return Record(f"r{seed}", time, voltage, x + noise * coloured(seed, len(time)))
+    return Record(
+        name=f"r{seed}",
+        time=time,
+        voltage=voltage,
+        displacement=x + noise * coloured(seed, len(time)),
+    )
 
 
 def coloured(seed: int, count: int) -> FloatArray:

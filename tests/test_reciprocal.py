@@ -207,7 +207,9 @@ def test_data_can_ask_for_it(truth: float) -> None:
         ).displacement
     sigma = 1e-3 * float(np.ptp(x))
     noisy = x + sigma * np.random.default_rng(4).standard_normal(len(x))
-    record = Record("pushed", run.times, run.command, noisy, load_force=load)
+    record = Record(
+        name="pushed", time=run.times, voltage=run.command, displacement=noisy, load_force=load
+    )
     free = ["k_L", "tau", "c_P", "c_B", "reciprocal_gain"]
     starts = [reciprocal("PTBS200", g) for g in (0.1, 0.9)]
     fits = [fit(s, [whole(record)], free, sigma=[sigma], evaluations=80) for s in starts]

@@ -2,6 +2,7 @@ import hashlib
 import math
 import time as clock
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,12 @@ from hypothesis import strategies as st
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record, write_record
-from psa_casadi.records.read.checks import LARGEST
+from psa_casadi.records.checks import LARGEST
+from psa_casadi.units import FloatArray
 from tests.record_files import HEADER, ROWS, write
 from tests.tiers import slow
+
+T = np.arange(24) / 8.0
 
 
 def test_a_record_is_read_in_si_units_whatever_the_order_and_the_unit(tmp_path: Path) -> None:
@@ -134,12 +138,17 @@ def test_a_million_rows_are_read_quickly(tmp_path: Path) -> None:
 
 def make_record() -> Record:
     time = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
-    return Record("r", time, 2 * time, np.array([1.0, np.nan, 3.0, -1.0, 0.0]) * 1e-6)
+    return Record(
+        name="r",
+        time=time,
+        voltage=2 * time,
+        displacement=np.array([1.0, np.nan, 3.0, -1.0, 0.0]) * 1e-6,
+    )
 
 
 def test_a_record_cannot_be_changed_and_does_not_share_memory() -> None:
     voltage = np.arange(5.0)
-    record = Record("r", np.arange(5.0), voltage)
+    record = Record(name="r", time=np.arange(5.0), voltage=voltage)
     voltage[0] = 99.0
     assert record.voltage[0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
@@ -160,9 +169,9 @@ def test_facts_of_a_record() -> None:
 def test_records_made_in_memory_are_told_apart_by_their_hash() -> None:
     record = make_record()
     assert record.sha256 == make_record().sha256
-    other = Record("r", record.time, record.voltage, record.voltage)
+    other = Record(name="r", time=record.time, voltage=record.voltage, displacement=record.voltage)
     assert other.sha256 != record.sha256
-    as_force = Record("r", record.time, record.voltage, load_force=record.voltage)
+    as_force = Record(name="r", time=record.time, voltage=record.voltage, load_force=record.voltage)
     assert as_force.sha256 != other.sha256
 
 
@@ -180,12 +189,12 @@ def test_a_slice_keeps_origin_and_all_columns() -> None:
 
 def test_arrays_that_do_not_fit_are_all_named() -> None:
     with pytest.raises(InputError) as caught:
-        Record("r", np.arange(4.0), np.arange(3.0), np.zeros((4, 1)))
+        Record(name="r", time=np.arange(4.0), voltage=np.arange(3.0), displacement=np.zeros((4, 1)))
     assert len(caught.value.problems) == 2
     assert "'voltage' has shape (3,)" in caught.value.problems[0]
     assert "'displacement' has shape (4, 1)" in caught.value.problems[1]
     with pytest.raises(InputError, match="has no range"):
-        _ = Record("r", np.arange(4.0), np.arange(4.0)).range_m
+        _ = Record(name="r", time=np.arange(4.0), voltage=np.arange(4.0)).range_m
 
 
 def test_writing_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
@@ -196,3 +205,25 @@ def test_writing_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no columns to write"):
         write_record(path, {})
     assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "sentence"),
+    [
+        ("time", T[::-1], "sample 1 the first of them: the samples are not in the order of time"),
+        ("time", np.zeros(24), "sample 1 the first of them: their time stands still"),
+        ("voltage", np.where(T < 1.0, np.nan, T), "sample 0, column 'voltage': found no value"),
+        ("current", np.full(24, np.inf), "column 'current': found inf, expected a finite number"),
+        ("displacement", np.full(24, 1e200), "expected a measured number, below 1e[+]100"),
+    ],
+)
+def test_arrays_are_checked_as_files_are(column: str, values: FloatArray, sentence: str) -> None:
+    sound: dict[str, Any] = {"time": T, "voltage": T, "displacement": 1e-6 * T}
+    assert Record(name="r", **sound).n == 24
+    with pytest.raises(InputError, match=sentence):
+        Record(name="r", **{**sound, column: values})
+
+
+def test_a_record_is_made_by_keywords() -> None:
+    with pytest.raises(TypeError, match="positional"):
+        Record("r", T, T)  # type: ignore[call-arg]

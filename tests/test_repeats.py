@@ -31,7 +31,7 @@ def grid(samples: int) -> FloatArray:
 
 
 def record(voltage: FloatArray, displacement: FloatArray) -> Record:
-    return Record("r", grid(voltage.size), voltage, displacement)
+    return Record(name="r", time=grid(voltage.size), voltage=voltage, displacement=displacement)
 
 
 def sine(samples: int, period: float = 500.0) -> FloatArray:

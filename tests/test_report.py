@@ -27,7 +27,7 @@ SENTENCES = {
     "adequate": "Nothing beyond the noise is missing",
     "cause_named": "The cause is slow creep (plant, confidence 97 %)",
     "partly_explained": "The closest known cause is slow creep",
-    "ambiguous": "cannot tell whether it is slow creep or offset drift",
+    "ambiguous": "do not decide whether it is slow creep or offset drift",
     "unexplained": "no effect in the table explains",
     "not_driven": "The displacement does not follow the voltage",
 }
@@ -55,8 +55,8 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
     assert "measured" not in page.text
     assert d.experiments[0].record.sha256 in page.text
     assert "The record is slow <and> short." in page.text
-    # at the top 1, views 3, evidence 1, record 7; signature and data 2
-    assert len(figures(text)) == (14 if verdict in ADDED else 12)
+    # at the top 1, views 3, evidence 1, record 6; signature and data 2
+    assert len(figures(text)) == (13 if verdict in ADDED else 11)
     assert "The residual of the" in page.text
     shown = story(d, origin="synthetic")
     assert SENTENCES[verdict] in " ".join(shown.split())

@@ -54,7 +54,7 @@ def test_the_page_tells_the_story_in_its_order(tmp_path: Path) -> None:
     for label in ("base model, held-out rms", "extended model, held-out rms", "noise, rms"):
         assert f"<dt>{label}</dt>" in top
     assert re.search(r"falls by</dt><dd>83\s%<small>95\s% interval 79 to 86\s%", top)
-    assert "speaks for these voltages only" in page.text
+    assert "holds for these voltages only" in page.text
     for sentence in diagnosis("cause_named").misfit[0].sentences:
         assert sentence in page.text.replace("\u00a0", " ")
     assert diagnosis("cause_named").noise[0].sentence in page.text.replace("\u00a0", " ")
@@ -141,7 +141,7 @@ def test_the_terminal_tells_what_is_wrong_and_how_sure_the_cause_is() -> None:
     assert lines["noise"] == f"5.00 nm rms, from {d.noise[0].source}"
     assert lines["cause"].startswith("slow creep (plant, 97 %): creep_gain = 0.0400")
     assert lines["rivals"].endswith("the next is offset drift (8 %)")
-    assert "cannot tell it from offset drift (8 %)" in told(diagnosis("ambiguous"))["rivals"]
+    assert "cannot distinguish it from offset drift (8 %)" in told(diagnosis("ambiguous"))["rivals"]
     assert lines["verdict"].endswith("the held-out error falls by 83 % (95 % interval 79 to 86 %).")
     assert lines["blind to"] == "current limit and sensor delay"
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from psa_casadi import scratch
+from psa_casadi.children import run_child
 from psa_casadi.files import atomic_write
-from psa_casadi.scratch import abandon, run_child, sweep, temporary_file, temporary_folder
+from psa_casadi.scratch import abandon, sweep, temporary_file, temporary_folder
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and locks of POSIX")
 
@@ -125,6 +126,84 @@ def test_a_child_that_is_not_waited_for_dies_with_its_children(tmp_path: Path) -
     finally:
         signal.signal(signal.SIGALRM, before)
     assert ended(int((tmp_path / "pid").read_text()))
+
+
+#: Reads an HDF5 file by an interpreter that notes its number and never ends.
+READS = """
+import sys
+from psa_casadi.cli.surroundings import prepare
+from psa_casadi.records.read.hdf5_process import arrays_apart
+prepare()
+sys.executable = sys.argv[1]
+arrays_apart("f.mat", b"nothing")
+"""
+
+
+@posix
+def test_a_request_to_end_ends_the_python_that_reads_a_file_too(tmp_path: Path) -> None:
+    interpreter, note = tmp_path / "python", tmp_path / "pid"
+    interpreter.write_text(
+        f"#!/bin/sh\nsleep 60 & echo $! > {note}.new; mv {note}.new {note}; wait\n"
+    )
+    interpreter.chmod(0o755)
+    reading = subprocess.Popen(
+        [sys.executable, "-c", READS, str(interpreter)], env={**os.environ, "TMPDIR": str(tmp_path)}
+    )
+    while reading.poll() is None and not note.exists():
+        time.sleep(0.01)
+    reading.terminate()
+    assert reading.wait(10) == 128 + signal.SIGTERM
+    assert ended(int(note.read_text()))
+    assert sorted(os.listdir(tmp_path)) == ["pid", "python"]
+
+
+#: Is told to end when its child runs, and `Popen` has not come back with it yet.
+STARTS = """
+import os, subprocess, sys
+from psa_casadi.children import started
+from psa_casadi.scratch import answer_requests_to_end
+popen = subprocess.Popen
+def told(*given, **options):
+    child = popen(*given, **options)
+    print(child.pid, flush=True)
+    os.kill(os.getpid(), 15)
+    return child
+subprocess.Popen = told
+answer_requests_to_end()
+with started(["sleep", "60"]):
+    print("goes on")
+"""
+
+
+@posix
+def test_a_child_that_is_just_being_started_is_ended_too() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STARTS], stdout=subprocess.PIPE, text=True, check=False
+    )
+    assert done.returncode == 128 + signal.SIGTERM
+    assert ended(int(done.stdout))
+
+
+#: Is told to end in a block that answers, or after it.
+TOLD = """
+import os, pathlib, sys
+from psa_casadi.scratch import requests_to_end_answered, temporary_folder
+with requests_to_end_answered(), temporary_folder(pathlib.Path(sys.argv[1])):
+    if sys.argv[2] == "inside":
+        os.kill(os.getpid(), 15)
+with temporary_folder(pathlib.Path(sys.argv[1])):
+    os.kill(os.getpid(), 15)
+"""
+
+
+@posix
+@pytest.mark.parametrize(("where", "code", "left"), [("inside", 143, 0), ("after", -15, 1)])
+def test_requests_to_end_are_answered_in_the_block_alone(
+    where: str, code: int, left: int, tmp_path: Path
+) -> None:
+    done = subprocess.run([sys.executable, "-c", TOLD, str(tmp_path), where], check=False)
+    assert done.returncode == code
+    assert len(os.listdir(tmp_path)) == left
 
 
 def ended(pid: int) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import psa_casadi.identification.fitting.fit as fitting
+import psa_casadi.identification.fitting.minimum as fitting
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.search.exchanges import exchanges
@@ -151,7 +151,7 @@ def test_oversampled_records_are_averaged_and_say_so() -> None:
     t: FloatArray = 2.5e-6 * np.arange(400_000.0)
     v: FloatArray = 50.0 * (1.0 - np.cos(2 * np.pi * t))
     y: FloatArray = 1e-7 * v + 1e-9 * np.random.default_rng(1).standard_normal(t.size)
-    shorter, sentences = prepared(Record("fast", t, v, y))
+    shorter, sentences = prepared(Record(name="fast", time=t, voltage=v, displacement=y))
     factor = t.size // shorter.n
     assert factor >= 8
     assert f"averaged in blocks of {factor}" in sentences[-1]

@@ -35,7 +35,7 @@ def case(seed: int) -> tuple[Fit, list[Direction], FloatArray, FloatArray]:
     columns[:, 8] = columns[:, 0] + columns[:, 6] + 0.3 * columns[:, 8]
     truth = 2.0 * columns[:, 0] + 2.0 * columns[:, 6] + base @ [5.0, -3.0, 1.0]
     residual = truth + 0.1 * rng.standard_normal(SAMPLES)
-    fit = cast("Fit", cast("Any", SimpleNamespace(jacobian=base, residuals=residual)))
+    fit = cast("Fit", cast("Any", SimpleNamespace(jacobian=base, residuals=residual, further=())))
     own = [direction(NAMES[k // 2], columns[:, k]) for k in range(columns.shape[1])]
     return fit, own, base, residual
 

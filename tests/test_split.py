@@ -15,7 +15,10 @@ FloatArray = NDArray[np.float64]
 
 def record(voltage: FloatArray) -> Record:
     return Record(
-        "r", np.linspace(0.0, 1e-3 * (len(voltage) - 1), len(voltage)), voltage, 1e-7 * voltage
+        name="r",
+        time=np.linspace(0.0, 1e-3 * (len(voltage) - 1), len(voltage)),
+        voltage=voltage,
+        displacement=1e-7 * voltage,
     )
 
 
@@ -156,7 +159,7 @@ def test_what_has_no_reading_is_no_extreme() -> None:
     given = record(blocks)
     y = np.array(given.displacement)
     y[1200:1300] = np.nan
-    e = split(Record("r", given.time, blocks, y))
+    e = split(Record(name="r", time=given.time, voltage=blocks, displacement=y))
     assert e.used[1560:].all()
 
 
@@ -169,7 +172,12 @@ def test_a_single_fast_step_is_fitted_and_the_displacement_has_no_say() -> None:
     assert e.held_out[1570]
     assert with_step.used[1550:].all()
     np.testing.assert_array_equal(e.held_out[:1100], with_step.held_out[:1100])
-    noisy = Record("r", with_step.record.time, blocks, np.random.default_rng(1).normal(size=1600))
+    noisy = Record(
+        name="r",
+        time=with_step.record.time,
+        voltage=blocks,
+        displacement=np.random.default_rng(1).normal(size=1600),
+    )
     np.testing.assert_array_equal(split(noisy).held_out, with_step.held_out)
 
 
@@ -178,7 +186,7 @@ def test_missing_samples_are_neither_fitted_nor_held_out() -> None:
     assert r.displacement is not None
     y = r.displacement.copy()
     y[::10] = np.nan
-    e = split(Record("r", r.time, r.voltage, y))
+    e = split(Record(name="r", time=r.time, voltage=r.voltage, displacement=y))
     assert not (e.used | e.held_out)[::10].any()
     assert int((e.used | e.held_out).sum()) == 900
     assert not (e.used & e.held_out).any()

@@ -14,7 +14,7 @@ from psa_casadi.variables import Provenance
 
 TIME = np.linspace(0.0, 0.02, 400)
 VOLTAGE = 50.0 * (1.0 - np.cos(2 * np.pi * 100.0 * TIME))
-RECORD = Record("r", TIME, VOLTAGE, 1e-7 * VOLTAGE)
+RECORD = Record(name="r", time=TIME, voltage=VOLTAGE, displacement=1e-7 * VOLTAGE)
 
 
 def _extended() -> Model:

@@ -60,7 +60,7 @@ def record(voltage: str, noise: str, seed: int = 0, f: float = 200.0) -> Record:
     y = stack(u, f) + RANGE * NOISES[noise](np.random.default_rng(seed))
     if noise in STEP:
         y = np.round(y / STEP[noise]) * STEP[noise]
-    return Record(f"{voltage}, {noise}", T, u, y)
+    return Record(name=f"{voltage}, {noise}", time=T, voltage=u, displacement=y)
 
 
 @pytest.mark.parametrize("noise", NOISES)
@@ -79,7 +79,7 @@ def test_ringing_after_a_jump_is_not_suspect(period: float, delay: int) -> None:
     y = np.where(np.arange(T.size) < at, 0.0, RANGE)
     y[at:] -= RANGE * ringing(T.size - at, period)
     y += 2e-4 * RANGE * np.random.default_rng(1).standard_normal(T.size)
-    assert not suspects(Record("ringing", T, u, y)).mask.any()
+    assert not suspects(Record(name="ringing", time=T, voltage=u, displacement=y)).mask.any()
 
 
 def test_a_kick_of_the_load_is_not_suspect() -> None:
@@ -156,9 +156,13 @@ def test_a_flat_dwell_after_a_reversal_and_a_held_voltage_are_not_stuck() -> Non
         y[k] = play
     for step in (0.5, 1e-9):
         levels = np.asarray(np.round(y / step) * (step * RANGE / 100.0), dtype=float)
-        assert not suspects(Record("backlash", T, u, levels)).mask.any()
+        assert not suspects(
+            Record(name="backlash", time=T, voltage=u, displacement=levels)
+        ).mask.any()
     held = steps(T, [0.0, 100.0, 50.0])
-    assert not suspects(Record("held", T, held, 1e-7 * held)).mask.any()
+    assert not suspects(
+        Record(name="held", time=T, voltage=held, displacement=1e-7 * held)
+    ).mask.any()
 
 
 def test_cleaned_masks_and_makes_nothing_up() -> None:
@@ -174,7 +178,7 @@ def test_cleaned_masks_and_makes_nothing_up() -> None:
     np.testing.assert_array_equal(result.displacement[result.mask], y[result.mask])
     assert (result.name, result.sha256) == (spoilt.name, spoilt.sha256)
     assert cleaned(base) is base
-    planned = Record("planned", T, VOLTAGES["sine"])
+    planned = Record(name="planned", time=T, voltage=VOLTAGES["sine"])
     assert cleaned(planned) is planned
     assert suspects(spoilt).sentences("r")[0].startswith("r: 2 samples stand out as spikes")
 
@@ -195,7 +199,15 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
     assert found.quantum == pytest.approx(STEP["coarse steps"])
     assert found.sentences("r") == ("r: the displacement is quantised in steps of 400 nm.",)
     counts = np.round(np.asarray(record("sine", "white").displacement) / 1e-7)
-    found = suspects(Record("c", T, VOLTAGES["sine"], counts, displacement_unit="counts"))
+    found = suspects(
+        Record(
+            name="c",
+            time=T,
+            voltage=VOLTAGES["sine"],
+            displacement=counts,
+            displacement_unit="counts",
+        )
+    )
     assert found.sentences("c") == ("c: the displacement is quantised in steps of 1 counts.",)
 
 
@@ -206,7 +218,7 @@ def test_a_million_samples_are_looked_at_quickly() -> None:
     y = 1e-7 * u + 2e-8 * np.random.default_rng(5).standard_normal(t.size)
     y[[200, 500_000, t.size - 5]] += 5e-6
     started = clock.process_time()
-    found = suspects(Record("long", t, u, y))
+    found = suspects(Record(name="long", time=t, voltage=u, displacement=y))
     assert clock.process_time() - started < 10.0
     assert list(np.flatnonzero(found.mask)) == [200, 500_000, t.size - 5]
 
@@ -262,5 +274,5 @@ def test_what_chance_and_digits_repeat_is_not_stuck(seed: int) -> None:
     voltage = np.sum(np.sin(2 * np.pi * np.outer(T, frequencies)), axis=1)
     voltage -= voltage[300]
     voltage[:301] = 0.0
-    smooth = Record("smooth", T, 10.0 * voltage, 1e-7 * voltage)
+    smooth = Record(name="smooth", time=T, voltage=10.0 * voltage, displacement=1e-7 * voltage)
     assert not suspects(smooth).mask.any()

@@ -1,5 +1,6 @@
 """The table of subcommands."""
 
+import shlex
 import sys
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from psa_casadi.cli.design_mechanism import mechanism
 from psa_casadi.cli.diagnose import diagnose
 from psa_casadi.cli.effects import effects
 from psa_casadi.cli.examples import examples
+from psa_casadi.cli.export_c import c
 from psa_casadi.cli.export_fmu import fmu
 from psa_casadi.cli.export_modelica import modelica
 from psa_casadi.cli.export_ssp import ssp
@@ -22,6 +24,7 @@ from psa_casadi.cli.identify import identify
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
 from psa_casadi.cli.surroundings import prepare
+from psa_casadi.command_line import typed
 from psa_casadi.version import __version__
 
 app = typer.Typer(
@@ -74,6 +77,7 @@ export.command(epilog="Example: psa export fmu --model extended.json -o stack.fm
 export.command(epilog="Example: psa export modelica --model extended.json -o PiezoStack.mo")(
     guarded(modelica)
 )
+export.command(epilog="Example: psa export c --stack P-885.51 --step 10us -o code")(guarded(c))
 export.command(epilog="Example: psa export ssp --stack P-885.51 -o stage.ssp")(guarded(ssp))
 app.add_typer(design, name="design")
 design.command(
@@ -96,6 +100,7 @@ app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(
 def main() -> None:
     """Run the command line."""
     prepare()
+    typed.set(shlex.join(["psa", *sys.argv[1:]]))
     try:
         guarded(app)(prog_name="psa")
     except typer.Exit as end:  # of what fails outside the commands, such as writing the help

@@ -6,10 +6,12 @@ from typing import Annotated
 import typer
 
 from psa_casadi.cli.screen import (
+    ColumnsOption,
     EffectsOption,
     Quiet,
     show,
     show_table,
+    tell_written,
     working,
 )
 
@@ -20,6 +22,20 @@ def check(
         Path | None,
         typer.Option(help="MODEL.json to compare with; by default the one that the FMU carries."),
     ] = None,
+    evidence: Annotated[
+        bool,
+        typer.Option(
+            "--evidence", help="Play the run that the FMU carries as evidence, and compare it."
+        ),
+    ] = False,
+    record: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Record that the model comes from (may be repeated): is its error as stated?"
+        ),
+    ] = None,
+    columns: ColumnsOption = None,
+    json: Annotated[Path | None, typer.Option(help="JSON file of all checks to write.")] = None,
     effects: EffectsOption = None,
     timeout: Annotated[
         float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
@@ -41,19 +57,35 @@ def check(
     """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.check.check import check_fmu
+    from psa_casadi.files import atomic_write
     from psa_casadi.model.model_file import load_model
+    from psa_casadi.report.documents.check_file import check_file
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
+    from psa_casadi.strict_json import json_text
 
     given = Given(effects)
+    given.outputs({"--json": json}, [fmu, model])
     if not fmu.is_file():
         what = "is a directory" if fmu.is_dir() else "there is no such file"
         given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
     chosen = None if model is None else given.attempt(lambda: load_model(model, given.effects))
+    records = given.records(record, columns=columns) if record else ()
     given.check()
     with working("checking", quiet):
-        report = check_fmu(fmu, chosen, effects=given.effects, timeout=timeout, memory=memory << 20)
+        report = check_fmu(
+            fmu,
+            chosen,
+            effects=given.effects,
+            timeout=timeout,
+            memory=memory << 20,
+            evidence=evidence,
+            records=records,
+        )
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)
+    if json is not None:
+        atomic_write(json, json_text(check_file(report)))
+        tell_written(json, quiet=quiet)
     if not report.passed:
         raise typer.Exit(1)

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from psa_casadi.cli.screen import Quiet, show, show_table, width, working
+from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY
 
 RECORD = "synthetic_record.csv"
 FILES = {
@@ -19,6 +20,17 @@ FILES = {
     "extended.fmu": "the extended model as an FMU (FMI 2.0), checked",
 }
 _ORIGIN = "synthetic"
+#: What to do after the demonstration.
+NEXT = """
+Next: open {report} in a browser. Then the same with a record of your own:
+time, voltage and displacement with their units, such as 'voltage [V]', as CSV, Excel, MATLAB,
+LabVIEW or HDF5.
+
+  psa diagnose my_record.csv -o extended.json --report page.html
+  psa export fmu --model extended.json -o stack.fmu
+
+Where a column cannot be told, the message ends with the option to type. Without a record:
+`psa datasets` lists measured ones."""
 
 
 def demo(
@@ -43,9 +55,9 @@ def demo(
     paths = _prepared(directory)
     record = read_record(paths[RECORD], need_excitation=True)
     show("A synthetic record, made by a simulated stack with one effect hidden in it.", quiet)
-    with working("identifying", quiet) as progress:
+    with working("identifying", quiet, IDENTIFY) as progress:
         save_model(identify([record], progress=progress).model, paths["model.json"])
-    with working("diagnosing", quiet) as progress:
+    with working("diagnosing", quiet, DIAGNOSE) as progress:
         d = diagnose([record], progress=progress)
         save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
@@ -60,6 +72,7 @@ def demo(
     show(f"\n{check_sentence(checked)}\n\nleft in {directory}:\n{files}", quiet)
     if not checked.passed:
         raise typer.Exit(1)
+    show(NEXT.format(report=paths["report.html"]), quiet)
 
 
 def _prepared(directory: Path) -> dict[str, Path]:

@@ -10,6 +10,7 @@ from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
     Quiet,
+    SampleTimeOption,
     StackOption,
     show,
     show_table,
@@ -56,13 +57,13 @@ def experiment(
         list[Path] | None,
         typer.Option(
             "--record",
-            help="Record at hand (repeat for several); the rivals are fitted"
-            " to it, and its voltages and length are the design's.",
+            help="Record already measured (repeat for several); the rivals are fitted"
+            " to it, and the design has its voltages and length.",
         ),
     ] = None,
     separate: Annotated[
         list[str] | None,
-        typer.Option("--separate", help="Effect to tell from the others that are named."),
+        typer.Option("--separate", help="Effect to separate from the others that are named."),
     ] = None,
     parameter: Annotated[
         list[str] | None,
@@ -92,16 +93,17 @@ def experiment(
     starts: Annotated[int, typer.Option(help="Voltages that are improved, at most.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the drawn voltages.")] = 1,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="CSV with the voltage to play.")
+        Path | None, typer.Option("-o", "--output", help="CSV with the voltage to apply.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     columns: ColumnsOption = None,
+    sample_time: SampleTimeOption = None,
     own: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
-    """Design the record to measure next: best for parameters, or to tell effects apart.
+    """Design the record to measure next: best for parameters, or to separate effects.
 
-    With --separate the rivals are fitted to the records at hand, or have ordinary sizes.
+    With --separate the rivals are fitted to the records given, else they have ordinary sizes.
     """
     from psa_casadi.cli import design_given
     from psa_casadi.cli.inputs import Given
@@ -111,7 +113,7 @@ def experiment(
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
     effects = design_given.effects(given, [*(separate or []), *(more or [])], parameter or [])
     chosen = given.model_or_stack(model, stack)
-    records = given.records(record, columns=columns) if record else []
+    records = given.records(record, columns=columns, sample_time=sample_time) if record else []
     design_given.check_noise(given, noise, correlation, starts)
     wanted = {
         "low": low, "high": high, "duration": duration, "samples": samples,

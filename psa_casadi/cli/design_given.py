@@ -49,7 +49,7 @@ def effects(
         if name not in table:
             given.add(f"There is no effect '{name}'; `psa effects` lists them.")
     if len(set(names)) == 1:
-        given.add(f"{names[0]} alone cannot be told from anything; name two effects or more.")
+        given.add(f"{names[0]} alone cannot be separated from anything; name two effects or more.")
     if names and parameters:
         given.add("--separate and --parameter are both given; design one record for each.")
     return [table[n] for n in dict.fromkeys(names) if n in table]

@@ -27,13 +27,14 @@ def input_(
     ] = None,
     measured: Annotated[
         Path | None,
-        typer.Option(help="Record of an earlier voltage for this path: correct that one by it."),
+        typer.Option(help="Measured trial of an earlier voltage for this path, to correct it."),
     ] = None,
     minimax: Annotated[
-        bool, typer.Option("--minimax", help="Least largest error, not least mean square.")
+        bool, typer.Option("--minimax", help="Minimise the largest error, not the mean square.")
     ] = False,
     fast: Annotated[
-        bool, typer.Option("--fast", help="Inversion only, cut by the limits: for long paths.")
+        bool,
+        typer.Option("--fast", help="Only invert the model and cut at the limits: for long paths."),
     ] = False,
     max_voltage: Annotated[float | None, typer.Option(help="Highest voltage [V].")] = None,
     min_voltage: Annotated[float | None, typer.Option(help="Lowest voltage [V].")] = None,
@@ -41,12 +42,12 @@ def input_(
     max_current: Annotated[float | None, typer.Option(help="Largest current [A].")] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
     check_fmu: Annotated[
-        bool, typer.Option("--check-fmu/--no-check-fmu", help="Play it on the exported FMU too.")
+        bool, typer.Option("--check-fmu/--no-check-fmu", help="Simulate the exported FMU too.")
     ] = True,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
-    """Design the voltage for a path or for a quickest move; judge it by simulator and FMU."""
+    """Design the voltage for a path or for a quickest move; test it on simulator and FMU."""
     from psa_casadi.cli import design_input_runs as runs
     from psa_casadi.cli.inputs import Given
     from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits

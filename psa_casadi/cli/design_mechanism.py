@@ -53,7 +53,9 @@ def mechanism(
     max_damping: Annotated[float, typer.Option(help="Largest damping [N.s/m].")] = 1e5,
     acts_on: Annotated[
         ActsOn,
-        typer.Option(help="Around all of the mechanics as in the paper, or on the output mass."),
+        typer.Option(
+            help="Where it acts: on all of the mechanics as in the paper, or on the output mass."
+        ),
     ] = ActsOn.WAFERS,
     starts: Annotated[int, typer.Option(help="Starts of the search.")] = 6,
     port: Annotated[

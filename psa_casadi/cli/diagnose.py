@@ -14,12 +14,15 @@ from psa_casadi.cli.screen import (
     Origin,
     OriginOption,
     Quiet,
+    SampleTimeOption,
+    SmallOption,
     show,
     show_table,
     tell_written,
     width,
     working,
 )
+from psa_casadi.cli.steps import DIAGNOSE
 
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
@@ -30,7 +33,7 @@ def diagnose(
     records: Annotated[
         list[Path],
         typer.Argument(
-            help="Records of one device: CSV, MATLAB or Parquet files.", show_default=False
+            help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
         ),
     ],
     holdout: Annotated[
@@ -62,8 +65,8 @@ def diagnose(
         Path | None,
         typer.Option(
             "--next",
-            help="VOLTAGE.csv to write if the verdict is ambiguous and a voltage would tell;"
-            " without it, beside the JSON or the page.",
+            help="VOLTAGE.csv to write if the verdict is ambiguous and a further record would"
+            " decide; by default next to the JSON file or the page.",
         ),
     ] = None,
     timings: Annotated[
@@ -72,7 +75,9 @@ def diagnose(
             "--timings", help="Print what each stage took: time, processor time, simulations."
         ),
     ] = False,
+    small: SmallOption = False,
     columns: ColumnsOption = None,
+    sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
     effects: EffectsOption = None,
     quiet: Quiet = False,
@@ -104,11 +109,11 @@ def diagnose(
             given.stiffness(stiffness)
             given.outputs({**outputs, "--next": following}, [*records, *held, model])
             _keep_apart(given, output, model)
-            found = given.records(records, held_out=held, columns=columns)
+            found = given.records(records, held_out=held, columns=columns, sample_time=sample_time)
             start = given.model(model)
             given.check()
         count = len(records)
-        with working("diagnosing", quiet) as progress:
+        with working("diagnosing", quiet, DIAGNOSE) as progress:
             try:
                 d = run(
                     found[:count],
@@ -121,7 +126,7 @@ def diagnose(
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = following or _beside(json or report)
-            d, unpatched = _finish(d, place, outputs, origin.value, progress)
+            d, unpatched = _finish(d, place, outputs, (origin.value, small), progress)
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
@@ -141,20 +146,24 @@ def _finish(
     d: "Diagnosis",
     following: Path | None,
     outputs: Mapping[str, Path | None],
-    origin: str,
+    page: tuple[str, bool],
     progress: Callable[[str], None],
 ) -> "tuple[Diagnosis, str]":
-    """Design what follows and write all files; return the diagnosis and why a patch is missing."""
+    """Design what follows and write all files; return the diagnosis and why a patch is missing.
+
+    `page` says what the page calls the records, and whether it is small.
+    """
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
 
     written: list[Path] = []
+    origin, small = page
     try:
         with stage("next experiment"):
             d = _with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
-            files.write(d, {**outputs, "--patch": None}, origin, written)
+            files.write(d, {**outputs, "--patch": None}, origin, written, small=small)
         with stage("unnamed correction"):
             return d, _write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:
@@ -196,7 +205,7 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
         return replace(d, next_experiment=replace(d.next_experiment, why=why))
     write_voltage(path, design.record)
     said = " ".join(sentences(design, d.model.values.get("C_p")))
-    why = f"Play {path} and diagnose all records together. {said} {same}".rstrip()
+    why = f"Apply {path} and diagnose all records together. {said} {same}".rstrip()
     following = NextExperiment(str(path), design.names, why, dict(design.chance))
     return replace(d, next_experiment=following)
 

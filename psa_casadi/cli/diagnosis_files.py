@@ -53,7 +53,12 @@ def keep(
 
 
 def write(
-    d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str, written: list[Path]
+    d: "Diagnosis",
+    outputs: Mapping[str, Path | None],
+    origin: str,
+    written: list[Path],
+    *,
+    small: bool = False,
 ) -> None:
     """Write what was asked for, each file whole or not at all, and add it to what is `written`."""
     import psa_casadi as psa
@@ -62,7 +67,7 @@ def write(
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
         "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: psa.write_report(d, path, origin=origin),
+        "--report": lambda path: psa.write_report(d, path, origin=origin, small=small),
         "--figure": lambda path: psa.save_figure(d, path, origin=origin),
     }
     for option, path in outputs.items():

@@ -1,5 +1,7 @@
 """`psa export fmu`: a model as an FMU."""
 
+import json
+import zipfile
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,6 +22,8 @@ from psa_casadi.cli.screen import (
     StartVoltageOption,
     SweepOption,
     show,
+    show_inside,
+    show_table,
     tell_written,
     working,
 )
@@ -35,6 +39,13 @@ class FmiVersion(StrEnum):
     THREE = "3"
 
 
+class Solver(StrEnum):
+    """Ways through a communication step."""
+
+    ADAPTIVE = "adaptive"
+    FIXED = "fixed"
+
+
 def fmu(
     output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
@@ -44,6 +55,12 @@ def fmu(
     platforms: Annotated[
         str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
     ] = "host",
+    solver: Annotated[
+        Solver, typer.Option(help="adaptive: to a tolerance; fixed: steps of constant cost.")
+    ] = Solver.ADAPTIVE,
+    step: Annotated[
+        str | None, typer.Option(help="Time of a fixed step with its unit, such as 10us.")
+    ] = None,
     name: Annotated[
         str | None, typer.Option(help="Model identifier, a C name; by default the model's name.")
     ] = None,
@@ -51,6 +68,26 @@ def fmu(
         bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
     ] = False,
     start_voltage: StartVoltageOption = None,
+    parameter_sets: Annotated[
+        int,
+        typer.Option(
+            help="Random parameter sets within the uncertainty to put inside, beside their mean and"
+            " sigma points; 0 leaves all of them out.",
+            min=0,
+            max=999,
+        ),
+    ] = 20,
+    sets_to: Annotated[
+        Path | None,
+        typer.Option("--sets-to", help="Folder to write the parameter sets to as well."),
+    ] = None,
+    validity_output: Annotated[
+        bool,
+        typer.Option(
+            "--validity-output",
+            help="Add the output outside_validity: how far a run has left what the records show.",
+        ),
+    ] = False,
     history: HistoryOption = None,
     sweep: SweepOption = 1.0,
     rest: RestOption = 0.0,
@@ -62,15 +99,20 @@ def fmu(
     quiet: Quiet = False,
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
+    from psa_casadi.cli.export_c import error_table, step_words
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu.archive import export_fmu
+    from psa_casadi.export.fmu.fixed import FIXED_ENTRY
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
     given = Given(effects)
     given.outputs({"--output": output}, [model])
+    if sets_to is not None and sets_to.exists() and not sets_to.is_dir():
+        given.add(f"{sets_to}: is a file; name a folder for the parameter sets.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
+    seconds = given.fixed_step(step, wanted=solver is Solver.FIXED)
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     chosen = given.published(
@@ -88,15 +130,21 @@ def fmu(
             include_sensor=include_sensor,
             platforms=wanted,
             fmi=int(fmi),
+            parameter_sets=parameter_sets,
+            validity_output=validity_output,
+            step=seconds,
         )
-    kept = chosen if include_sensor else chosen.plant()
-    inside = ", ".join(c.name for c in kept.components)
-    left_out = [c.name for c in chosen.components if c not in kept.components]
-    show(f"inside: {inside}", quiet)
-    if left_out:
-        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    kept = show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
+    sets = write_sets(kept, parameter_sets, sets_to)
     show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
     show(f"start: {start_words(kept)}", quiet)
+    if seconds is None:
+        show(f"evidence: {evidence_words(kept, sets)}", quiet)
+    else:
+        with zipfile.ZipFile(output) as archive:
+            fixed = json.loads(archive.read(FIXED_ENTRY))
+        show(step_words(seconds, fixed["substeps"], "double"), quiet)
+        show_table(error_table(fixed["errors"]), quiet)
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"
@@ -104,6 +152,27 @@ def fmu(
             quiet,
         )
     tell_written(output, quiet=quiet)
+
+
+def write_sets(model: "Model", samples: int, folder: Path | None) -> int:
+    """Write the parameter sets to a folder, if one is named, and return how many there are."""
+    from psa_casadi.export.fmu.evidence_files import set_files
+    from psa_casadi.files import atomic_write
+
+    texts = set_files(model, samples)
+    if folder is not None and texts:
+        folder.mkdir(parents=True, exist_ok=True)
+        for place, text in texts.items():
+            atomic_write(folder / place.rpartition("/")[2], text)
+    return len(texts)
+
+
+def evidence_words(model: "Model", sets: int) -> str:
+    """Say what the FMU holds of what stands behind its values."""
+    if model.evidence is None:
+        return "none; a MODEL.json of `psa identify` or `psa diagnose` has it"
+    of = ", ".join(r.record for r in model.evidence.runs)
+    return f"documentation/evidence.html (records: {of}), {sets} parameter sets"
 
 
 def start_words(model: "Model") -> str:

@@ -19,6 +19,7 @@ from psa_casadi.cli.screen import (
     StartVoltageOption,
     SweepOption,
     show,
+    show_inside,
     tell_written,
 )
 
@@ -58,10 +59,6 @@ def modelica(
     if chosen is None:
         return
     export_modelica(chosen, output, name=name, include_sensor=include_sensor)
-    kept = chosen if include_sensor else chosen.plant()
-    left_out = [c.name for c in chosen.components if c not in kept.components]
-    show(f"inside: {', '.join(c.name for c in kept.components)}", quiet)
-    if left_out:
-        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    kept = show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
     show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", quiet)
     tell_written(output, quiet=quiet)

@@ -9,6 +9,7 @@ import typer
 
 from psa_casadi.cli import INTERRUPTED
 from psa_casadi.cli.interrupts import interrupts
+from psa_casadi.cli.screen import tell
 from psa_casadi.cli.surroundings import refused_by_the_machine, silence
 from psa_casadi.errors import InputError, MachineError, PsaError
 from psa_casadi.files import written
@@ -42,7 +43,7 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except KeyboardInterrupt as stop:
             there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
             told = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
-            typer.echo(f"Interrupted: {told}", err=True)
+            tell(f"Interrupted: {told}")
             raise typer.Exit(INTERRUPTED) from None
         except InputError as error:
             if os.environ.get(DEBUG):
@@ -60,24 +61,23 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
 
 def _tell_problems(problems: tuple[str, ...]) -> None:
     if len(problems) == 1:
-        typer.echo(f"Error: {problems[0]}", err=True)
+        tell(f"Error: {problems[0]}")
         return
     count = sum(not p.startswith("... and") for p in problems)
-    typer.echo(f"Error: {count} problems with what was given:", err=True)
+    tell(f"Error: {count} problems with what was given:")
     for problem in problems:
-        typer.echo(f"  - {problem}", err=True)
+        tell(f"  - {problem}")
 
 
 def _tell_failure(error: Exception) -> None:
     if isinstance(error, (PsaError, MachineError)):
-        typer.echo(f"Failed: {error}", err=True)
+        tell(f"Failed: {error}")
         return
     refused = refused_by_the_machine(error)
     if refused is not None:
-        typer.echo(f"Failed: {refused}", err=True)
+        tell(f"Failed: {refused}")
         return
-    typer.echo(
+    tell(
         f"Failed: an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi,"
-        f" not of the input; set {DEBUG}=1 to see where it happened, and report it.",
-        err=True,
+        f" not of the input; set {DEBUG}=1 to see where it happened, and report it."
     )

@@ -13,11 +13,14 @@ from psa_casadi.cli.screen import (
     Origin,
     OriginOption,
     Quiet,
+    SampleTimeOption,
+    SmallOption,
     show,
     tell_written,
     width,
     working,
 )
+from psa_casadi.cli.steps import IDENTIFY
 
 if TYPE_CHECKING:
     from psa_casadi.identification.certainty.profile import Profile
@@ -35,7 +38,7 @@ def identify(
     records: Annotated[
         list[Path],
         typer.Argument(
-            help="Records of one device: CSV, MATLAB or Parquet files.", show_default=False
+            help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="MODEL.json to write.")],
@@ -52,8 +55,13 @@ def identify(
         list[str] | None,
         typer.Option(help="Parameter whose profile likelihood is wanted; may be repeated."),
     ] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="JSON file of parameters and records to write.")
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
+    small: SmallOption = False,
     columns: ColumnsOption = None,
+    sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
     effects: EffectsOption = None,
     quiet: Quiet = False,
@@ -71,16 +79,18 @@ def identify(
     if method is Method.PAPER and model is not None:
         given.add("--method paper starts from no model; leave --model or --method out.")
     given.stiffness(stiffness)
-    given.outputs({"--output": output, "--report": report}, [*records, model])
-    measured = given.records(records, columns=columns)
+    given.outputs({"--output": output, "--json": json, "--report": report}, [*records, model])
+    measured = given.records(records, columns=columns, sample_time=sample_time)
     start = given.model(model)
     given.check()
-    with working("identifying", quiet) as progress:
+    with working("identifying", quiet, IDENTIFY) as progress:
         if method is Method.PAPER:
             found = by_paper(measured, stiffness=stiffness, progress=progress)
         else:
             found = run(measured, model=start, stiffness=stiffness, progress=progress)
-        profiles = _finish(found, output, report, profile or (), origin.value, progress)
+        profiles = _finish(
+            found, output, (json, report, small), profile or (), origin.value, progress
+        )
     show(identification_text(found, origin=origin.value, width=width()), quiet)
     for found_profile in profiles:
         show("\n" + "\n".join(profile_sentences(found_profile)), quiet)
@@ -91,30 +101,41 @@ def identify(
             f" searched are {', '.join(found.determinacy.names)}.",
             quiet,
         )
-    tell_written(output, report, quiet=quiet)
+    tell_written(output, json, report, quiet=quiet)
 
 
 def _finish(
     found: "Identification",
     output: Path,
-    report: Path | None,
+    more: tuple[Path | None, Path | None, bool],
     wanted: Sequence[str],
     origin: str,
     progress: Callable[[str], None],
 ) -> "list[Profile]":
-    """Write the files and return the profiles; at an interrupt the model is kept, which it says."""
+    """Write the files and return the profiles; at an interrupt the model is kept, which it says.
+
+    `more` are the JSON file, the page, and whether that is small.
+    """
     from psa_casadi.cli.interrupts import kept
+    from psa_casadi.files import atomic_write
     from psa_casadi.identification.certainty.profile import profile
     from psa_casadi.model.model_file import save_model
+    from psa_casadi.report.documents.identification_file import identification_file
     from psa_casadi.report.page.fit_page import write_fit_report
+    from psa_casadi.strict_json import json_text
 
+    json, report, small = more
+    done = [output]
     try:
         save_model(found.model, output)
         names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
         profiles = [profile(found.fit, found.experiments, n, progress=progress) for n in names]
+        if json is not None:
+            atomic_write(json, json_text(identification_file(found, profiles)))
+            done.append(json)
         if report is not None and not found.interrupted:
             progress("writing the report")
-            write_fit_report(found, report, origin=origin, profiles=profiles)
+            write_fit_report(found, report, origin=origin, profiles=profiles, small=small)
         ended = found.interrupted
     except KeyboardInterrupt:
         save_model(found.model, output)
@@ -124,4 +145,4 @@ def _finish(
     cut = found.fit.interrupted
     what = "the search was cut off" if cut else "the fit was finished before"
     mark = " (marked as interrupted)" if cut else ""
-    raise KeyboardInterrupt(kept(what, [output], [report], mark))
+    raise KeyboardInterrupt(kept(what, done, [p for p in (json, report) if p not in done], mark))

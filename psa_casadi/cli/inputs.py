@@ -1,6 +1,7 @@
 """What a command is given, checked as a whole before any long work starts."""
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,6 +19,7 @@ from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.column_map import parse_columns
 from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.simulation.history import settled_at
+from psa_casadi.units import parse_unit, to_si, units_of
 
 T = TypeVar("T")
 
@@ -54,11 +56,13 @@ class Given:
         *,
         held_out: Sequence[Path] = (),
         columns: str | None = None,
+        sample_time: float | None = None,
     ) -> list[Record]:
         """Read records to fit, then those held out; no record may be given twice.
 
         A record to fit must have a voltage that changes, all must have a displacement. `columns` is
-        what --columns says. Nothing is read where that is not understood.
+        what --columns says. Nothing is read where that is not understood. `sample_time` [s] gives
+        the time of files without one.
         """
         wanted = self.columns(columns)
         if wanted is None:
@@ -69,7 +73,7 @@ class Given:
             # the loop's values are bound as defaults, whose types a lambda cannot state
             record = self.attempt(
                 lambda p=path, f=fitted: read_record(  # type: ignore[misc]
-                    p, need_excitation=f, columns=wanted
+                    p, need_excitation=f, columns=wanted, sample_time=sample_time
                 )
             )
             if record is None:
@@ -83,12 +87,18 @@ class Given:
             found.append(record)
         return found
 
-    def voltage(self, path: Path, *, columns: str | None = None) -> Record | None:
+    def voltage(
+        self, path: Path, *, columns: str | None = None, sample_time: float | None = None
+    ) -> Record | None:
         """Read a record whose voltage is to be applied; it need not have a displacement."""
         wanted = self.columns(columns)
         if wanted is None:
             return None
-        return self.attempt(lambda: read_record(path, need_displacement=False, columns=wanted))
+        return self.attempt(
+            lambda: read_record(
+                path, need_displacement=False, columns=wanted, sample_time=sample_time
+            )
+        )
 
     def columns(self, text: str | None) -> ColumnMap | None:
         """Return what --columns says, nothing where it is left out; None where it is wrong."""
@@ -145,6 +155,12 @@ class Given:
         except ValueError:
             self.add(f"{option} is '{text}'; give {what} with commas between, such as 150,0.")
             return ()
+
+    def fixed_step(self, text: str | None, *, wanted: bool) -> float | None:
+        """Return the time [s] of a fixed step, where one is wanted."""
+        if wanted != (text is not None):
+            self.add("--solver fixed and --step belong together; give both or neither.")
+        return self.attempt(lambda: step_seconds(text)) if text is not None and wanted else None
 
     def started(
         self, model: Model | None, voltage: float | None, history: str | None, **durations: float
@@ -204,3 +220,19 @@ class Given:
                 f"{path}: cannot write, {path.resolve().parent} may not be written to; choose"
                 " another place."
             )
+
+
+def step_seconds(text: str) -> float:
+    """Return the time [s] of a step that is given as a number with a unit, s where it has none.
+
+    Raises InputError for anything else.
+    """
+    found = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
+    try:
+        number = float(found["number"]) if found else 0.0
+    except ValueError:
+        found = None
+    unit = parse_unit(found["unit"] or "s", "time").name if found else ""
+    if unit not in units_of("time"):
+        raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
+    return float(to_si(number, unit))

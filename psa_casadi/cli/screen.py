@@ -11,7 +11,11 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from psa_casadi.characters import visible
+from psa_casadi.cli.steps import PLAIN, Course, Told
+
 if TYPE_CHECKING:
+    from psa_casadi.model.compose import Model
     from psa_casadi.report.words.tables import Table
 
 Quiet = Annotated[
@@ -27,7 +31,7 @@ PartOption = Annotated[
     str | None,
     typer.Option(
         "--part",
-        help="A part that stands around a stack, in place of a model: flexure_stage,"
+        help="Part around a stack, in place of a model: flexure_stage,"
         " position_controller, hysteresis_compensator, voltage_amplifier, charge_amplifier.",
     ),
 ]
@@ -45,8 +49,20 @@ ColumnsOption = Annotated[
     str | None,
     typer.Option(
         "--columns",
-        help="Arrays of the files that are the columns, where their names differ:"
+        help="Which array of the file is which column, if the names differ:"
         " time=t:ms,voltage=log.u,displacement=m.2:um",
+    ),
+]
+
+SmallOption = Annotated[
+    bool,
+    typer.Option("--small", help="Page below 1 MB, for mail: one picture in place of the plots."),
+]
+
+SampleTimeOption = Annotated[
+    float | None,
+    typer.Option(
+        "--sample-time", help="Time from sample to sample \\[s], for files without a time."
     ),
 ]
 
@@ -55,14 +71,15 @@ HistoryOption = Annotated[
     str | None,
     typer.Option(
         "--history",
-        help="Voltages before [V], such as 120,0,120: swept through in turn from a relaxed 0 V.",
+        help="Earlier voltages [V], swept in turn from a relaxed 0 V, such as 120,0,120.",
     ),
 ]
 
 SweepOption = Annotated[
     float,
     typer.Option(
-        "--sweep", help="Duration of each sweep of the history \\[s]; delta and creep see it."
+        "--sweep",
+        help="Duration of each sweep of the history \\[s]; it matters to delta and creep.",
     ),
 ]
 
@@ -119,23 +136,46 @@ def width() -> int:
 
 
 @contextmanager
-def working(what: str, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal."""
+def working(what: str, quiet: bool, course: Course = PLAIN) -> Iterator[Callable[[str], None]]:
+    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal.
+
+    Both tell the time so far, and the step of how many where the `course` of the work is known.
+    """
+    told = Told(what, course)
     if quiet:
         yield lambda step: None
     elif sys.stderr.isatty():
-        console = Console(stderr=True)
-        with console.status(what) as status:
-            yield lambda step: status.update(Text(f"{what}: {step}"))
+        with Console(stderr=True).status(told):
+            yield told.tell
     else:
-        typer.echo(f"{what} ...", err=True)
-        yield lambda step: typer.echo(f"  {step}", err=True)
+        tell(f"{what} ...")
+
+        def next_step(step: str) -> None:
+            told.tell(step)
+            tell(f"  {told.line()}")
+
+        yield next_step
 
 
 def show(text: str, quiet: bool = False) -> None:
-    """Print text as it is."""
+    """Print a result, with what a terminal would obey spelled out."""
     if not quiet:
-        typer.echo(text)
+        typer.echo(visible(text))
+
+
+def show_inside(model: "Model", *, include_sensor: bool, quiet: bool) -> "Model":
+    """Print which components an export holds, and which it leaves out; return what it holds."""
+    kept = model if include_sensor else model.plant()
+    show(f"inside: {', '.join(c.name for c in kept.components)}", quiet)
+    left_out = [c.name for c in model.components if c not in kept.components]
+    if left_out:
+        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    return kept
+
+
+def tell(text: str) -> None:
+    """Print a message on stderr, with what a terminal would obey spelled out."""
+    typer.echo(visible(text), err=True)
 
 
 def show_table(table: "Table", quiet: bool = False) -> None:
@@ -143,14 +183,14 @@ def show_table(table: "Table", quiet: bool = False) -> None:
     if quiet:
         return
     if not sys.stdout.isatty():
-        typer.echo(str(table))
+        show(str(table))
         return
     drawn = RichTable(show_edge=False)
     for name in table.head:
         drawn.add_column(name, overflow="fold")
     styles = {"FAIL": "bold red", "pass": "green"}
     for row in table.rows:
-        drawn.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+        drawn.add_row(*(Text(visible(cell), style=styles.get(cell, "")) for cell in row))
     Console().print(drawn)
 
 

@@ -11,6 +11,7 @@ from psa_casadi.cli.screen import (
     HistoryOption,
     Quiet,
     RestOption,
+    SampleTimeOption,
     StackOption,
     SweepOption,
     show,
@@ -33,6 +34,7 @@ def simulate(
     model: Annotated[Path | None, typer.Option(help="MODEL.json to simulate.")] = None,
     stack: StackOption = None,
     columns: ColumnsOption = None,
+    sample_time: SampleTimeOption = None,
     effects: EffectsOption = None,
     start_voltage: Annotated[
         float | None,
@@ -49,9 +51,9 @@ def simulate(
 ) -> None:
     """Simulate a model on a measured or planned voltage; write every output with its unit.
 
-    It starts settled at the first voltage, hysteresis and creep where --history leaves them, else
-    relaxed. With --start-voltage, or a model file that has start values, it starts where an FMU
-    exported with the same options does. Example:
+    The stack starts settled at the first voltage, its hysteresis and creep relaxed, or as --history
+    leaves them. With --start-voltage, or a model file that has start values, it starts like an FMU
+    exported with the same options. Example:
     psa simulate --stack P-885.51 --input voltage.csv --history 120,0,120 -o out.csv
     """
     from psa_casadi.cli.inputs import Given
@@ -62,7 +64,7 @@ def simulate(
     given = Given(effects)
     given.outputs({"--output": output}, [model, record])
     chosen = given.model_or_stack(model, stack)
-    voltage = given.voltage(record, columns=columns)
+    voltage = given.voltage(record, columns=columns, sample_time=sample_time)
     if start_voltage is not None:
         chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     turns = given.numbers(history, "--history", "voltages in V")

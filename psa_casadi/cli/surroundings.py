@@ -5,13 +5,11 @@ import contextlib
 import errno
 import io
 import os
-import signal
 import sys
 import tempfile
-from types import FrameType
 
 from psa_casadi.cache import sweep_rooms
-from psa_casadi.scratch import abandon, temporary_folder
+from psa_casadi.scratch import answer_requests_to_end, temporary_folder
 
 #: What the operating system refuses: what happened, and what to do.
 _REFUSALS = {
@@ -38,10 +36,7 @@ _MEMORY = ("bad_alloc", "failed to map segment", "Cannot allocate memory", "cann
 def prepare() -> None:
     """Give a command streams that can be written to, and an end that leaves nothing behind."""
     _open_streams()
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, _end)
+    answer_requests_to_end()
     _take_temporary_folder()
     sweep_rooms()
 
@@ -100,12 +95,3 @@ def refused_by_the_machine(error: BaseException) -> str | None:
             " needs."
         )
     return None
-
-
-def _end(number: int, _: FrameType | None) -> None:
-    """End at once, with the exit code of a command that a signal ended, and leave nothing behind.
-
-    Threads that compute are not waited for.
-    """
-    abandon()
-    os._exit(128 + number)

@@ -4,12 +4,14 @@ from psa_casadi.component import Component
 from psa_casadi.components.amplifiers import CHARGE_AMPLIFIER, VOLTAGE_AMPLIFIER
 from psa_casadi.components.drive import DRIVE
 from psa_casadi.components.flexure import FLEXURE
+from psa_casadi.components.further_sensors import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.components.hysteresis_compensator import HYSTERESIS_COMPENSATOR
 from psa_casadi.components.mechanics import CASCADE_MECHANICS, SINGLE_MASS
 from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
 from psa_casadi.components.position_controller import POSITION_CONTROLLER
 from psa_casadi.components.prestress import PRESTRESS_MECHANISM, PRESTRESS_PORT
 from psa_casadi.components.sensor import SENSOR
+from psa_casadi.components.validity import VALIDITY, VALIDITY_WITH_TEMPERATURE
 from psa_casadi.components.wafers import BOUC_WEN, CREEP_LAG, LINEAR_FORCE
 
 COMPONENTS: dict[str, Component] = {
@@ -22,6 +24,9 @@ COMPONENTS: dict[str, Component] = {
         CASCADE_MECHANICS,
         SINGLE_MASS,
         SENSOR,
+        MONITOR,
+        SECOND_SENSOR,
+        STRAIN_GAUGE,
         FLEXURE,
         POSITION_CONTROLLER,
         HYSTERESIS_COMPENSATOR,
@@ -30,6 +35,8 @@ COMPONENTS: dict[str, Component] = {
         ONLINE_IDENTIFICATION,
         PRESTRESS_MECHANISM,
         PRESTRESS_PORT,
+        VALIDITY,
+        VALIDITY_WITH_TEMPERATURE,
     )
 }
 
@@ -46,4 +53,4 @@ BASE: tuple[Component, ...] = (
 #: The simplified model with one mass (paper eq. 6).
 SIMPLIFIED: tuple[Component, ...] = (DRIVE, LINEAR_FORCE, BOUC_WEN, CREEP_LAG, SINGLE_MASS, SENSOR)
 
-__all__ = ["BASE", "COMPONENTS", "SIMPLIFIED"]
+__all__ = ["BASE", "COMPONENTS", "MONITOR", "SECOND_SENSOR", "SIMPLIFIED", "STRAIN_GAUGE"]

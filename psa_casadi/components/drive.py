@@ -12,9 +12,10 @@ def _equations(s: Symbols) -> Equations:
             "drive_voltage": s.G * s.voltage,
             "drive_current": (s.drive_voltage - s.u) / s.R_s,
             "stack_current": s.drive_current,
+            "stack_charge": s.C_p * s.u,
             "voltage_rate": s.stack_current / s.C_p,
         },
-        out={"current": s.stack_current, "charge": s.C_p * s.u},
+        out={"current": s.stack_current, "charge": s.stack_charge},
     )
 
 

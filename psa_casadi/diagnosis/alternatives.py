@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.evidence import diagnosis_evidence
 from psa_casadi.diagnosis.judgement import told_from
 from psa_casadi.diagnosis.result import Alternative
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
@@ -54,7 +55,10 @@ def alternatives(
                 continue
             told = determinacy(fitted.fit, experiments)
             records = [e.record for e in experiments]
-            model = with_provenance(fitted.fit.model, told, records, stiffness_given)
+            evidence = diagnosis_evidence(fitted.fit, told, experiments, fitted.predicted)
+            model = with_provenance(
+                fitted.fit.model, told, records, stiffness_given, evidence=evidence
+            )
             found.append(
                 Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
             )

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.columns import decisions
 from psa_casadi.diagnosis.driven import driven
 from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
@@ -14,13 +15,17 @@ from psa_casadi.diagnosis.thresholds import using
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished
+from psa_casadi.identification.search.measured_load import LOAD, is_measured, loads_as_curves
 from psa_casadi.identification.search.multistart import fit_base
-from psa_casadi.identification.search.refitting import Progress
-from psa_casadi.identification.start.doubts import refuse_few, refuse_still, refuse_stuck
+from psa_casadi.identification.search.refitting import Progress, relevelled
+from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.identification.start.other_quantities import refuse_wrapped
+from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
+from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -33,8 +38,8 @@ MORE = 3
 #: Steps of a sensor over a record's range below which it is coarse, and what is said then.
 COARSE = 32
 COARSE_NOTE = (
-    "{}: the sensor resolves {:.0f} steps over the whole range. They are what the model's error is"
-    " made of: nothing that is smaller can be told from them."
+    "{}: the sensor resolves {:.0f} steps over the whole range. They make up the model's error:"
+    " nothing smaller can be distinguished from them."
 )
 #: What is said of readings that a stuck sensor repeats.
 STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
@@ -67,18 +72,23 @@ def diagnose(
     with using(method.thresholds):
         with stage("preparing"):
             table = list(effects if effects is not None else known_effects().values())
-            ordered, apart = in_one_order(given), in_one_order(kept)
-            clean, said = _cleaned(ordered)
+            (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
+            ordered, apart = in_one_order(whole), in_one_order(held)
+            clean, said, hidden = _cleaned(ordered)
+            said += [*cut, *cut_too]
             experiments = divided(clean, [cleaned(r) for r in apart])
             start, scale_given = chosen_start(clean, model, stiffness)
+            columns = columns_of(start, [e.record for e in experiments])
+            start, experiments = columns.model, with_levels(experiments, columns.fitted)
             refuse_stuck([e.record for e in experiments])
             known = {e.name for e in table}
             searched = (*table, *(c for c in start.effects if c.more_of in known))
             start = start.without(c.name for c in searched if c.gain is not None)
             there = {c.name for c in start.components}
             table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
+            said += columns.left_out
         so_far: list[Fit] = []
-        task = Task(experiments, tuple(table), method, progress, so_far.append)
+        task = Task(experiments, tuple(table), method, progress, so_far.append, hidden)
         try:
             found = _diagnose(start, task, scale_given)
             return replace(found, notes=(*found.notes, *said))
@@ -88,12 +98,15 @@ def diagnose(
             raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
-def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
+def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]:
     """Return the records without suspect samples, and where a sensor was saturated or coarse.
+
+    And the share of the readings that a saturated sensor has made.
 
     Raises InputError where hardly a sample is left.
     """
     refuse_still(records)
+    refuse_wrapped(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
     said = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
@@ -101,42 +114,63 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     for r, own in zip(records, found, strict=True):
         if own.quantum is not None and r.range_m < COARSE * own.quantum:
             said.append(COARSE_NOTE.format(r.name, r.range_m / own.quantum))
-    return clean, said
+    saturated = sum(own.counts["saturated"] for own in found)
+    return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 
 
 def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     """Diagnose from where the base fit starts; the task's `keep` gets the best fit so far."""
     experiments, table, progress = task.experiments, task.table, task.progress
-    base = _base(start, task)
-    experiments, stuck = without_stuck_readings(experiments, base)
+    every = table
+    if is_measured(experiments):
+        table = tuple(e for e in table if e.measured_by != LOAD)
+        experiments = loads_as_curves(start, experiments, progress)
+        task = replace(task, table=table, experiments=experiments)
+    base, task = _base(start, task)
+    experiments, stuck = without_stuck_readings(task.experiments, base)
     if stuck:
         refuse_stuck([e.record for e in experiments])
-        task = replace(task, experiments=experiments)
-        base = _base(start, task)
+        base, task = _base(start, replace(task, experiments=experiments))
+    experiments = task.experiments
     seen = driven(base, start, experiments, progress)
     if not seen.follows:
         steps = unsearched(base, task)
-        found = conclude(steps, experiments, table, scale_given, driven=seen.filtered)
+        found = conclude(
+            steps, experiments, table, scale_given, driven=seen.filtered, hidden=task.hidden
+        )
         return replace(found, notes=(*found.notes, *seen.notes))
     steps = _search(base, task)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
-        experiments, stuck = fewer, stuck + more
-        task = replace(task, experiments=experiments)
-        steps = _search(_base(start, task), task)
+        stuck += more
+        steps, task = _searched(start, replace(task, experiments=fewer))
+        experiments = task.experiments
     progress("judging")
-    found = conclude(steps, experiments, table, scale_given)
-    notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []))
+    found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
+    decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
+    found = replace(found, columns=decided)
+    turned = [f.turned for f in steps[0].fit.further if f.turned]
+    notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
     return replace(found, notes=(*found.notes, *notes))
 
 
-def _base(start: Model, task: Task) -> Fit:
-    """Fit the base model and keep it. Raises KeyboardInterrupt after a fit that was interrupted."""
+def _base(start: Model, task: Task) -> tuple[Fit, Task]:
+    """Fit the base model and keep it; return it with the task, further columns at their levels.
+
+    Raises KeyboardInterrupt after a fit that was interrupted.
+    """
     base = fit_base(start, task.experiments, progress=task.progress)
+    base, experiments = relevelled(base, task.experiments)
     task.keep(base)
     if base.interrupted:
         raise KeyboardInterrupt
-    return base
+    return base, replace(task, experiments=experiments)
+
+
+def _searched(start: Model, task: Task) -> tuple[list[Step], Task]:
+    """Fit the base and search; return the steps, and the task with its columns' levels."""
+    base, task = _base(start, task)
+    return _search(base, task), task
 
 
 def _search(base: Fit, task: Task) -> list[Step]:
@@ -146,7 +180,8 @@ def _search(base: Fit, task: Task) -> list[Step]:
 
 
 def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:
-    """Whether a record has the columns that an effect follows (a temperature)."""
-    return all(
+    """Whether a record has the columns that an effect follows (a temperature) or needs."""
+    columns = [n for n in effect.needs_column if any(n == q.column for q in experiments[0].further)]
+    return bool(columns or not effect.needs_column) and all(
         any(getattr(e.record, i.name, None) is not None for e in experiments) for i in effect.inputs
     )

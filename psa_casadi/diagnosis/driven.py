@@ -14,7 +14,13 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
-from psa_casadi.identification.start.doubts import correlation, doubtful_time, doubtful_unit
+from psa_casadi.identification.start.doubts import (
+    correlation,
+    doubtful_time,
+    doubtful_unit,
+    doubtful_voltage,
+)
+from psa_casadi.identification.start.other_quantities import doubtful_quantity
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 
@@ -56,7 +62,8 @@ def driven(
         base = from_resonances(base, experiments, progress) or base
     share = explained(base, experiments)
     records = [e.record for e in experiments]
-    notes = tuple(s for s in (doubtful_unit(records), doubtful_time(records)) if s)
+    doubts = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_quantity)
+    notes = tuple(s for doubt in doubts if (s := doubt(records)))
     if share >= thresholds().follows and correlation(records) > thresholds().falling:
         return Driven(follows=True, notes=notes)
     progress("the displacement with its sign flipped")
@@ -81,7 +88,8 @@ def driven(
             " and no more with the other sign: check that both columns are of the same device and"
             " the same time.",
         )
-        return Driven(follows=False, notes=said)
+        quantity = doubtful_quantity(records)
+        return Driven(follows=False, notes=(*said, quantity) if quantity else said)
     return Driven(follows=True, notes=notes)
 
 

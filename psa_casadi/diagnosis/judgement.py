@@ -50,17 +50,18 @@ def verdict_of(
     steps: Sequence[Step],
     *,
     missing: bool,
-    beaten: bool,
+    withdrawn: bool,
     share: float,
 ) -> Verdict:
     """Return the verdict on what a search found; the last step is the model with all causes.
 
-    `missing` says that the base leaves something, `beaten` that an unnamed correction takes the
-    names away, `share` of the held-out excess the causes remove.
+    `missing` says that the base leaves something, `withdrawn` that an unnamed correction takes the
+    names away or held-out samples do not confirm them, `share` of the held-out excess the causes
+    remove.
     """
     if not missing:
         return "adequate"
-    if len(steps) == 1 or beaten:
+    if len(steps) == 1 or withdrawn:
         return "unexplained"
     partly = steps[-1].test.alarm
     if partly and share < thresholds().partly:
@@ -76,3 +77,26 @@ def told_from(step: Step) -> tuple[str, ...]:
         return ()
     within = credible_set(step.probability, thresholds().credible)
     return tuple(name for name in within if name != step.cause.name)
+
+
+def withdrawn_names(
+    steps: Sequence[Step], weighed: Weighed, beaten: Correction | None, doubt: str
+) -> tuple[str, ...]:
+    """Say which names were found but not told, and why: `doubt` is that of held-out samples."""
+    names = ", ".join(s.cause.name for s in steps if s.chosen is not None)
+    if not names:
+        return ()
+    found = (
+        f"{names}: found with a ln of the Bayes factor over the base of {weighed.evidence:.0f},"
+        f" would remove {100 * max(0.0, weighed.share):.0f} % of the held-out error above the noise"
+    )
+    if doubt:
+        return (f"{found}; not named, because {doubt}.",)
+    if beaten is None:
+        least = 100 * thresholds().partly
+        return (f"{found}; not named, because that is less than {least:.0f} % and much remains.",)
+    share = weighed.shares[list(weighed.corrections).index(beaten)]
+    return (
+        f"{found}; not named, because an unnamed correction explains more: {beaten.kind.sentence},"
+        f" with {beaten.evidence:.0f} and {100 * share:.0f} %.",
+    )

@@ -129,6 +129,29 @@ class Alternative:
         return {n: getattr(self, n) for n in names}
 
 
+@dataclass(frozen=True)
+class Decision:
+    """What a further column decided: what is named with it and without it, and in words.
+
+    An `output` is fitted, with `noise` and held-out errors `base_rms` and `extended_rms` in its SI
+    `unit`; an `input` drives the model, and has none. `named` and `named_without` hold the named
+    sets with their probabilities, `ruled_out` what is only in the latter; `evidence` is what the
+    column adds to ln of the Bayes factor of the extended model over the base.
+    """
+
+    column: str
+    role: Literal["output", "input"]
+    unit: str
+    noise: float | None
+    base_rms: float | None
+    extended_rms: float | None
+    named: Mapping[str, float]
+    named_without: Mapping[str, float]
+    ruled_out: tuple[str, ...]
+    evidence: float
+    sentence: str
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Reported):
     """A diagnosis: verdict, causes, the base and the extended model, errors, and what remains.
@@ -137,9 +160,11 @@ class Diagnosis(Reported):
     predictions [m] of every record in full, in the order of `experiments`. `noise` is the floor of
     every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
     records with enough samples. `contenders` are the fitted rivals of an ambiguous verdict.
+    `doubt` says why held-out samples cannot confirm a cause, "" where they can.
     `budget` says where the base's held-out error goes, `patch` the unnamed correction that would
     remove most of what the named causes leave. `alternatives` are models for causes of which the
-    records do not tell whether an exported plant holds them.
+    records do not tell whether an exported plant holds them. `columns` say what each further column
+    of the records decided.
     """
 
     verdict: Verdict
@@ -163,9 +188,11 @@ class Diagnosis(Reported):
     misfit: tuple[Misfit, ...] = ()
     remainder: tuple[Misfit, ...] = ()
     contenders: tuple[Contender, ...] = ()
+    doubt: str = ""
     budget: Budget | None = None
     patch: Patch | None = None
     alternatives: tuple[Alternative, ...] = ()
+    columns: tuple[Decision, ...] = ()
 
     def to_frame(self) -> Any:
         """Return the samples as a pandas DataFrame: measured, base and extended, in metres."""
@@ -188,6 +215,7 @@ class Diagnosis(Reported):
         return {
             "format": FORMAT,
             "verdict": self.verdict,
+            "doubt": self.doubt,
             "causes": [asdict(c) for c in self.causes],
             "candidates": [asdict(c) for c in self.candidates],
             "errors": {
@@ -199,6 +227,7 @@ class Diagnosis(Reported):
             "budget": None if self.budget is None else asdict(self.budget),
             "patch": None if self.patch is None else self.patch.to_dict(),
             "alternatives": [a.to_dict() for a in self.alternatives],
+            "columns": [asdict(c) for c in self.columns],
             "blind_to": [asdict(b) for b in self.blind_to],
             "remaining": asdict(self.remaining),
             "next_experiment": asdict(self.next_experiment),

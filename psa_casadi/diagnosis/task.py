@@ -11,6 +11,8 @@ from psa_casadi.records.split import Experiment
 #: Sampling interval [s] below which a stack may ring within the record's band.
 FAST = 7e-4
 _MASSES = ("m_P", "m_B", "m")
+#: Further columns that show the displacement.
+_TELL_BENDS = ("displacement_2", "strain")
 
 #: The steps of the method that a diagnosis can go without, to show what each is good for, and what
 #: is done in their place.
@@ -41,7 +43,8 @@ class Method:
 class Task:
     """The records, the table of effects to search, the method, and who is told of the progress.
 
-    `keep` gets the best fit so far where a keyboard interrupt ends the search.
+    `keep` gets the best fit so far where a keyboard interrupt ends the search; `hidden` is the
+    share of the readings that a saturated sensor has made.
     """
 
     experiments: tuple[Experiment, ...]
@@ -49,6 +52,7 @@ class Task:
     method: Method = field(default_factory=Method)
     progress: Callable[[str], None] = lambda _: None
     keep: Callable[[Fit], None] = lambda _: None
+    hidden: float = 0.0
 
     @property
     def fast(self) -> bool:
@@ -65,8 +69,11 @@ def same_curves(
 ) -> tuple[tuple[str, ...], ...]:
     """Return groups of effects that bend the same curve, where the records show no resonance.
 
-    They show one if a `fit` of them needed a mass and a record is fast enough to see it ring.
+    They show one if a `fit` of them needed a mass and a record is fast enough to see it ring. A
+    second sensor of the displacement tells them apart.
     """
+    if any(f.column in _TELL_BENDS for f in fit.further):
+        return ()
     rings = shows_ringing(experiments) and any(n in fit.unknowns.names for n in _MASSES)
     curves = () if rings else sorted({e.curve for e in effects if e.curve is not None})
     groups = (tuple(e.name for e in effects if e.curve == c) for c in curves)

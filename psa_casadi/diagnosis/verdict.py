@@ -9,9 +9,11 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.alternatives import alternatives
 from psa_casadi.diagnosis.blind_spots import blind_spots, shown
 from psa_casadi.diagnosis.budget import Budget, Removed, budget
-from psa_casadi.diagnosis.corrections.correct import Correction, corrections
+from psa_casadi.diagnosis.corrections.correct import corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
 from psa_casadi.diagnosis.corrections.patch import patch_of
+from psa_casadi.diagnosis.evidence import diagnosis_evidence
+from psa_casadi.diagnosis.held_out.confirmation import unconfirmed
 from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import (
     errors_of,
@@ -19,7 +21,7 @@ from psa_casadi.diagnosis.held_out.errors import (
     whole_residuals,
 )
 from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
-from psa_casadi.diagnosis.judgement import Weighed, told_from, verdict_of
+from psa_casadi.diagnosis.judgement import Weighed, told_from, verdict_of, withdrawn_names
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
@@ -62,10 +64,12 @@ def conclude(
     stiffness_given: bool,
     *,
     driven: bool = True,
+    hidden: float = 0.0,
 ) -> Diagnosis:
     """Judge the steps of a search and return the diagnosis.
 
-    Of records whose displacement is not `driven` by the voltage nothing more is said.
+    Of records whose displacement is not `driven` by the voltage nothing more is said. `hidden` is
+    the share of the readings that a saturated sensor has made.
     """
     first, last = steps[0], steps[-1]
     colour = last.screening.colour
@@ -88,10 +92,14 @@ def conclude(
         shares=[removed.from_base(c.predicted) for c in beside_base],
     )
     beaten = weighed.beaten_by()
+    gain = gain_of(experiments, first.predicted, last.predicted)
+    partly = last.test.alarm and len(steps) > 1
+    whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
+    doubt = unconfirmed(experiments, gain, whole=whole, partly=partly, hidden=hidden)
     verdict: Verdict = (
         "not_driven"
         if not driven
-        else verdict_of(steps, missing=missing, beaten=beaten is not None, share=share)
+        else verdict_of(steps, missing=missing, withdrawn=bool(beaten or doubt), share=share)
     )
     named = [s for s in steps if s.chosen] if verdict in NAMING else []
     final = last if named else first
@@ -112,7 +120,11 @@ def conclude(
         floor,
     )
     model = with_provenance(
-        final.fit.model, found, [e.record for e in experiments], stiffness_given
+        final.fit.model,
+        found,
+        [e.record for e in experiments],
+        stiffness_given,
+        evidence=diagnosis_evidence(final.fit, found, experiments, final.predicted, spent),
     )
     causes = tuple(_cause(s, last.fit, found, spent) for s in named)
     return Diagnosis(
@@ -122,15 +134,19 @@ def conclude(
         noise_floor_rms_m=floor,
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
-        gain=gain_of(experiments, first.predicted, final.predicted),
+        gain=gain if named else gain_of(experiments, first.predicted, final.predicted),
         blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
         remaining=_remaining(final, Excess() if named else beyond),
         next_experiment=_next_experiment(
-            causes, verdict, same_curves(experiments, table, first.fit)
+            causes,
+            verdict,
+            same_curves(experiments, table, first.fit),
+            doubted=bool(doubt),
         ),
+        doubt=doubt if verdict in ("adequate", "unexplained") else "",
         notes=(
             *model.provenance.notes,
-            *(_withdrawn(steps, weighed, beaten) if verdict == "unexplained" else ()),
+            *(withdrawn_names(steps, weighed, beaten, doubt) if verdict == "unexplained" else ()),
             *coverage_notes(experiments),
         ),
         experiments=tuple(experiments),
@@ -162,28 +178,9 @@ def patched_model(d: Diagnosis) -> Model:
     found = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
     given = d.model.provenance.force_scale == "given"
     told = determinacy(found, d.experiments)
-    return with_provenance(found.model, told, [e.record for e in d.experiments], given)
-
-
-def _withdrawn(
-    steps: Sequence[Step], weighed: Weighed, beaten: Correction | None
-) -> tuple[str, ...]:
-    """Say which names were found but not told, and why."""
-    names = ", ".join(s.cause.name for s in steps if s.chosen is not None)
-    if not names:
-        return ()
-    found = (
-        f"{names}: found with a ln of the Bayes factor over the base of {weighed.evidence:.0f},"
-        f" would remove {100 * max(0.0, weighed.share):.0f} % of the held-out error above the noise"
-    )
-    if beaten is None:
-        least = 100 * thresholds().partly
-        return (f"{found}; not named, because that is less than {least:.0f} % and much remains.",)
-    share = weighed.shares[list(weighed.corrections).index(beaten)]
-    return (
-        f"{found}; not named, because an unnamed correction explains more: {beaten.kind.sentence},"
-        f" with {beaten.evidence:.0f} and {100 * share:.0f} %.",
-    )
+    evidence = diagnosis_evidence(found, told, d.experiments, found.predicted(d.experiments))
+    records = [e.record for e in d.experiments]
+    return with_provenance(found.model, told, records, given, evidence=evidence)
 
 
 def _misfits(
@@ -250,7 +247,7 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
 
 def _remaining(r: Step, beyond: Excess) -> Remaining:
     """Describe what is left; `beyond` the fit where that leaves nothing to be seen."""
-    where = "What remains cannot be told from noise."
+    where = "What remains cannot be distinguished from noise."
     if r.test.alarm:
         where = f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
     elif beyond:
@@ -260,15 +257,21 @@ def _remaining(r: Step, beyond: Excess) -> Remaining:
 
 
 _ADVICE = (
-    "Play a hold of several seconds, the same loop at three rates and at three amplitudes, and a"
+    "Record a hold of several seconds, the same loop at three rates and at three amplitudes, and a"
     " repeated step: rates separate delay, lag and creep; amplitudes separate asymmetry and memory;"
     " holds separate creep and drift; the repeat shows the noise."
 )
+_AGAIN = "Correct the record, or record again, so that what the verdict says of it no longer holds."
+_COLUMNS = "Correct the record as the notes say, and diagnose it again."
 
 
 def _next_experiment(
-    causes: Sequence[Cause], verdict: Verdict, alike: Sequence[Sequence[str]]
+    causes: Sequence[Cause], verdict: Verdict, alike: Sequence[Sequence[str]], *, doubted: bool
 ) -> NextExperiment:
+    if verdict == "not_driven":
+        return NextExperiment(None, (), _COLUMNS)
+    if doubted:
+        return NextExperiment(None, (), _AGAIN)
     rivals = tuple(dict.fromkeys(n for c in causes for n in (c.effect, *c.cannot_be_told_from)))
     if verdict == "ambiguous":
         own = (causes[0].effect, *causes[0].cannot_be_told_from)

@@ -2,10 +2,12 @@
 
 from psa_casadi.component import Component
 from psa_casadi.effects.ageing import AGEING
+from psa_casadi.effects.amplifier_nonlinearity import AMPLIFIER_NONLINEARITY
 from psa_casadi.effects.backlash import BACKLASH
 from psa_casadi.effects.charge_leakage import CHARGE_LEAKAGE
 from psa_casadi.effects.current_limit import CURRENT_LIMIT
 from psa_casadi.effects.drive_lag import DRIVE_LAG
+from psa_casadi.effects.field_dependent_capacitance import FIELD_DEPENDENT_CAPACITANCE
 from psa_casadi.effects.field_dependent_gain import FIELD_DEPENDENT_GAIN
 from psa_casadi.effects.hysteresis_memory import HYSTERESIS_MEMORY
 from psa_casadi.effects.load_stiffness import LOAD_STIFFNESS
@@ -35,6 +37,7 @@ EFFECTS: dict[str, Component] = {
         HYSTERESIS_MEMORY,
         RATE_INDEPENDENT_ASYMMETRY,
         FIELD_DEPENDENT_GAIN,
+        FIELD_DEPENDENT_CAPACITANCE,
         SATURATION_OF_STRAIN,
         RECIPROCAL_COUPLING,
         STRUCTURAL_MODE,
@@ -46,6 +49,7 @@ EFFECTS: dict[str, Component] = {
         CURRENT_LIMIT,
         VOLTAGE_SATURATION,
         DRIVE_LAG,
+        AMPLIFIER_NONLINEARITY,
         CHARGE_LEAKAGE,
         SENSOR_DELAY,
         SENSOR_LAG,

@@ -48,6 +48,7 @@ LOAD_STIFFNESS = Component(
     ),
     equations=_equations,
     curve="displacement",
+    measured_by="load_force",
     probe={"load_angle": ANGLES},
     looks_like="the curve bends with displacement, however fast or by what force it got there",
 )

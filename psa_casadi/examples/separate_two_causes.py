@@ -1,9 +1,9 @@
-"""A triangle leaves two causes open; the designed record of the same length tells them apart.
+"""A triangle leaves two causes open; the designed record of the same length separates them.
 
-A stack's gain grows with the field, which a triangle cannot tell from a bent sensor: every loop is
-the same. Three further records of the same length and the same range of voltages are played to the
-simulated device, with noise: a sine, a triangle again, and the one that `psa design experiment`
-designs, which comes to its levels by different ways.
+A stack's gain grows with the field. A triangle cannot distinguish that from a bent sensor: every
+loop is the same. Three further records of the same length and the same range of voltages are
+simulated, with noise: a sine, a triangle again, and the one that `psa design experiment` designs,
+which comes to its levels by different ways.
 """
 
 from pathlib import Path
@@ -50,11 +50,13 @@ def measured(record: Record, seed: int) -> Record:
     model = stack_model("P-885.51").with_effect(EFFECTS[EFFECT], {"field_gain": GROWTH})
     x = simulate(model, record.time, record.voltage).outputs["displacement"]
     noise = NOISE * np.random.default_rng(seed).standard_normal(record.n)
-    return Record(record.name, record.time, record.voltage, x + noise)
+    return Record(
+        name=record.name, time=record.time, voltage=record.voltage, displacement=x + noise
+    )
 
 
 def said(d: Diagnosis) -> str:
-    """Return what a diagnosis names, with what it cannot tell it from."""
+    """Return what a diagnosis names, with what cannot be distinguished from it."""
     names = [n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)]
     return " or ".join(names) or d.verdict
 

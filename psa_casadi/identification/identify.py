@@ -9,22 +9,28 @@ import numpy as np
 from psa_casadi.identification.advice.advice import Advice, advice
 from psa_casadi.identification.certainty.combinations import Combination, free_combinations
 from psa_casadi.identification.certainty.determinacy import Determinacy, assumed_ratio, determinacy
+from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.search.measured_load import loads_as_curves
 from psa_casadi.identification.search.multistart import Search, StartOutcome, search
-from psa_casadi.identification.search.refitting import Progress, record_rms, refit
+from psa_casadi.identification.search.refitting import Progress, record_rms, refit, relevelled
+from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.doubts import (
     doubtful_sign,
     doubtful_time,
     doubtful_unit,
-    refuse_few,
-    refuse_still,
+    doubtful_voltage,
 )
 from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
+from psa_casadi.identification.start.readings import refuse_few, refuse_still
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import Evidence
+from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -107,11 +113,17 @@ def identify(
     """
     given_records = records_given(records)
     refuse_still(given_records)
-    ready = [prepared(r) for r in given_records]
+    refuse_wrapped(given_records)
+    parts, cut = without_gaps(given_records)
+    ready = [prepared(r) for r in parts]
     fitted = [r for r, _ in ready]
-    refuse_few(given_records, fitted, [s for _, said in ready for s in said])
-    experiments = tuple(whole(r) for r in fitted)
+    said = [*cut, *(s for _, own in ready for s in own)]
+    refuse_few(given_records, fitted, said)
     start, given = chosen_start(fitted, model, stiffness)
+    columns = columns_of(start, fitted)
+    start = columns.model
+    experiments = with_levels([whole(r) for r in fitted], columns.fitted)
+    experiments = loads_as_curves(start, experiments, progress)
     linear = None
     if model is None:
         progress("starting values from the records")
@@ -123,7 +135,8 @@ def identify(
         thorough=True,
         progress=progress,
     )
-    best = _with_own_levels(found.best, experiments, progress)
+    best, experiments = relevelled(found.best, experiments)
+    best = _with_own_levels(best, experiments, progress)
     if best.interrupted:
         current_work().wrap_up()
     determined = determinacy(
@@ -131,22 +144,36 @@ def identify(
     )
     open_ones = free_combinations(best.model, determined, force_scale_given=given)
     advised: tuple[Advice, ...] | None = None
+    told: Evidence | None = None
     if not best.interrupted:
         try:
+            told = evidence_of(
+                best,
+                determined,
+                experiments,
+                best.predicted(experiments),
+                by="psa identify",
+                sampled=parts,
+            )
             progress("what further records would tell")
             advised = advice(best, experiments, determined, force_scale_given=given)
         except KeyboardInterrupt:
             current_work().wrap_up()
     return Identification(
         model=with_provenance(
-            best.model, determined, given_records, given, interrupted=best.interrupted
+            best.model,
+            determined,
+            given_records,
+            given,
+            interrupted=best.interrupted,
+            evidence=told,
         ),
         fit=best,
         determinacy=determined,
         experiments=experiments,
         warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
-        sentences=tuple(s for _, said in ready for s in said),
+        sentences=(*said, *columns.left_out, *(f.sentence for f in best.further)),
         combinations=open_ones,
         advice=advised or (),
         interrupted=advised is None,
@@ -160,11 +187,13 @@ def with_provenance(
     stiffness_given: bool,
     *,
     interrupted: bool = False,
+    evidence: Evidence | None = None,
 ) -> Model:
     """Return a fitted model that says from which records it comes and how sure its values are."""
     c_p = model.values.get("C_p", 0.0)
     current = capacitance_of(records)
-    told = {"C_p": current.interval} if current is not None and current.is_that_of(c_p) else {}
+    fits = current is not None and current.source == "current" and current.is_that_of(c_p)
+    told = {"C_p": current.interval} if current is not None and fits else {}
     provenance = Provenance(
         identified_from=tuple((r.name, r.sha256) for r in records),
         package_version=__version__,
@@ -178,7 +207,7 @@ def with_provenance(
             *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
-    return replace(model, provenance=provenance)
+    return replace(model, provenance=provenance, evidence=evidence)
 
 
 def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
@@ -191,7 +220,7 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
         notes=(INTERRUPTED, *(() if stiffness_given else (FORCE_NOTE,))),
         interrupted=True,
     )
-    return replace(best.model, provenance=provenance)
+    return replace(best.model, provenance=provenance, evidence=None)
 
 
 def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
@@ -234,8 +263,15 @@ def _warnings(
 
 
 def _doubts(records: Sequence[Record]) -> list[str]:
-    """Say what of the records is unlike a stack's: unit, time, sign."""
-    return [s for doubt in (doubtful_unit, doubtful_time, doubtful_sign) if (s := doubt(records))]
+    """Say what of the records is unlike a stack's: unit, voltage, time, sign."""
+    doubts = (
+        doubtful_unit,
+        doubtful_voltage,
+        doubtful_time,
+        doubtful_sign,
+        doubtful_quantity,
+    )
+    return [s for doubt in doubts if (s := doubt(records))]
 
 
 def _disagreement(searched: Search) -> list[str]:

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import Component
+from psa_casadi.component import Component, Expression
 from psa_casadi.errors import InputError
+from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.structure import Structure, structure_of
 from psa_casadi.variables import (
     Input,
@@ -23,7 +24,11 @@ __all__ = ["Model", "Structure", "compose"]
 
 @dataclass(frozen=True, repr=False)
 class Model:
-    """A composed model with parameter values (SI units), their origin, and who publishes it."""
+    """A composed model with parameter values (SI units), their origin, and who publishes it.
+
+    `evidence` speaks of these components with these values: a model with others has none, but the
+    plant that an export takes out of it.
+    """
 
     structure: Structure
     values: Mapping[str, float]
@@ -31,6 +36,7 @@ class Model:
     description: str = ""
     provenance: Provenance = field(default_factory=Provenance)
     publication: Publication = field(default_factory=Publication)
+    evidence: Evidence | None = None
 
     def __repr__(self) -> str:
         """Return name and composition in one line."""
@@ -60,7 +66,7 @@ class Model:
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the parameter vector."""
-        return tuple(p.name for p in self.structure.parameters)
+        return self.structure.parameter_names
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -79,6 +85,27 @@ class Model:
                 return parameter
         raise InputError([f"The model has no parameter '{name}'; it has {self.parameter_names}."])
 
+    def casadi(self) -> dict[str, Expression]:
+        """Return the equations as CasADi names them: t, x, u, p, ode and y, columns of SX symbols.
+
+        Rows are in the order of `state_names`, `input_names`, `parameter_names` and `output_names`,
+        in SI units; `parameter_vector()` holds the values of p.
+
+            dae = model.casadi()
+            f = casadi.Function("f", [dae[k] for k in "xup"], [dae["ode"], dae["y"]])
+
+        Raises:
+            InputError: the model has states that change at sample instants only, which no such
+                equations hold.
+        """
+        s = self.structure
+        if s.sampled:
+            raise InputError(
+                f"The model '{self.name}' has states that change at sample instants only"
+                f" ({', '.join(self.sampled_names)}); leave its sampled components out."
+            )
+        return {"t": s.time, "x": s.x, "u": s.u, "p": s.p, "ode": s.xdot, "y": s.y}
+
     def parameter_vector(self) -> npt.NDArray[np.float64]:
         """Return the values as a vector, shape (np,)."""
         return np.array([self.values[n] for n in self.parameter_names])
@@ -95,6 +122,8 @@ class Model:
         """Return the model with some values replaced, each checked against its bounds."""
         merged = {**self.values, **{k: float(v) for k, v in values.items()}}
         _check_values(self.structure, merged)
+        if merged != self.values:
+            changes.setdefault("evidence", None)
         # `changes` are fields of the model by name, which a type checker cannot match
         return replace(self, values=merged, **changes)  # type: ignore[arg-type]
 
@@ -107,7 +136,10 @@ class Model:
         values = {p.name: self.values.get(p.name, p.value) for p in structure.parameters}
         there = {v.name for v in _starting(structure)}
         kept = {n: v for n, v in self.own_starts().items() if n in there}
-        return replace(self, structure=structure, values=values).with_starts(kept)
+        same = _in_plant(self.components) == _in_plant(structure.components)
+        evidence = self.evidence.of_parameters(values) if self.evidence and same else None
+        changed = replace(self, structure=structure, values=values, evidence=evidence)
+        return changed.with_starts(kept)
 
     def own_starts(self) -> dict[str, float]:
         """Return the starts of states and inputs that are not those their components declare."""
@@ -165,6 +197,10 @@ class Model:
     def plant(self) -> "Model":
         """Return the model without sensor and environment: what an exported plant contains."""
         return self.without(c.name for c in self.components if not c.in_plant)
+
+
+def _in_plant(components: Iterable[Component]) -> tuple[Component, ...]:
+    return tuple(c for c in components if c.in_plant)
 
 
 def _starting(of: Structure | Component) -> tuple[State | Input, ...]:

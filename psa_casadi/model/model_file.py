@@ -12,6 +12,7 @@ from psa_casadi.effects.patches import PATCHES
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.evidence_file import evidence_content, read_evidence
 from psa_casadi.model.model_file_checks import FORMAT, check_content, first_ones, name_of
 from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.strict_json import json_text, parse_json, read_json_text, shown
@@ -61,6 +62,7 @@ def dumps(model: Model) -> str:
         "notes": list(origin.notes),
         "identified_from": [{"record": n, "sha256": h} for n, h in origin.identified_from],
         "package_version": origin.package_version,
+        **({"evidence": evidence_content(model.evidence)} if model.evidence else {}),
     }
     try:
         return json_text(content)
@@ -106,7 +108,11 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
         raise InputError(said) from error
     ordered = {p.name: given[p.name] for p in model.structure.parameters}
     published = Publication(**content.get("publication", {}))
-    return model.with_values({}, provenance=_provenance(content, ordered), publication=published)
+    told = content.get("evidence")
+    evidence = None if told is None else read_evidence(told, model.values, source)
+    return model.with_values(
+        {}, provenance=_provenance(content, ordered), publication=published, evidence=evidence
+    )
 
 
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:

@@ -54,6 +54,11 @@ class Structure:
     next: Mapping[str, Expression]
     znext: Expression
 
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order of their vector: asked for in every run."""
+        return tuple(p.name for p in self.parameters)
+
     @property
     def arguments(self) -> list[Expression]:
         """The symbols that the equations are functions of: time, x, u, p, and z if there is one."""

@@ -79,6 +79,10 @@ def _averages(record: Record, q: int) -> Record:
         load_force=averaged(record.load_force),
         current=averaged(record.current),
         temperature=averaged(record.temperature),
+        monitor_voltage=averaged(record.monitor_voltage),
+        charge=averaged(record.charge),
+        displacement_2=averaged(record.displacement_2),
+        strain=averaged(record.strain),
     )
 
 

@@ -7,24 +7,37 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.checks import Located, check_complete, check_finite, check_time
 from psa_casadi.units import FloatArray
 
-_OPTIONAL = ("displacement", "load_force", "current", "temperature")
+#: Columns beside time and voltage that a record may have.
+_OPTIONAL = (
+    "displacement", "load_force", "current", "temperature", "monitor_voltage", "charge",
+    "displacement_2", "strain",
+)  # fmt: skip
+#: Columns whose absence is hashed too: those of the first version, so that its hashes stay.
+_HASHED = ("time", "voltage", "displacement", "load_force", "current", "temperature")
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Record:
     """Samples of one experiment in SI units; the arrays have shape (n,) and cannot be changed.
 
+        Record(name="loop", time=t, voltage=v, displacement=1e-6 * x_um)
+
     `time` [s] increases strictly and need not be uniform; between samples `voltage` [V] is linear.
     `displacement` is in metres, or in `displacement_unit` "counts" where the sensor's scale is
-    unknown; nan marks a missing sample. `load_force` [N], `current` [A] and `temperature` [K] are
-    None where they were not recorded. `sha256` is that of the file at `source`, or of the arrays
+    unknown; nan marks a missing sample. `load_force` [N], `current` [A], `temperature` [K],
+    `monitor_voltage` [V], `charge` [C], `displacement_2` [m] and `strain` [1] are None where they
+    were not recorded. `sha256` is that of the file at `source`, or of the arrays
     where there is no file.
 
     Raises:
-        InputError: an array is not one-dimensional or its length differs from that of `time`.
+        InputError: an array is not one-dimensional or its length differs from that of `time`; the
+            time stands still or goes back, or a number is missing, not finite or beyond 1e100.
+
+    Units that no stack has (micrometres given as metres) are told by `identify` and `diagnose`.
     """
 
     name: str
@@ -37,6 +50,10 @@ class Record:
     sha256: str = ""
     source: str = ""
     displacement_unit: Literal["m", "counts"] = "m"
+    monitor_voltage: FloatArray | None = None
+    charge: FloatArray | None = None
+    displacement_2: FloatArray | None = None
+    strain: FloatArray | None = None
 
     def __post_init__(self) -> None:
         problems = []
@@ -53,8 +70,24 @@ class Record:
                 )
         if problems:
             raise InputError(problems)
+        self._check()
         if not self.sha256:
             object.__setattr__(self, "sha256", self._hash())
+
+    def _check(self) -> None:
+        """Refuse numbers that no experiment gives, as of a file."""
+        problems = Problems()
+        numbers = np.arange(self.n, dtype=np.int64)
+        unreported = np.zeros(self.n, dtype=np.bool_)
+        for column in ("time", "voltage", *_OPTIONAL):
+            values = getattr(self, column)
+            if values is None:
+                continue
+            where = f"record '{self.name}'"
+            located = Located(where, column, values, numbers, unreported, "sample")
+            checks = {"time": check_time, "displacement": check_finite}
+            checks.get(column, check_complete)(located, problems)
+        problems.raise_if_any()
 
     def __repr__(self) -> str:
         """Return name, size and range in one line."""
@@ -125,7 +158,8 @@ class Record:
         digest = hashlib.sha256()
         for column in ("time", "voltage", *_OPTIONAL):
             array = getattr(self, column)
-            digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
+            if array is not None or column in _HASHED:
+                digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
         return digest.hexdigest()
 
 

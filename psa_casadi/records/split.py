@@ -22,13 +22,26 @@ _REACHED = 2e-3
 _SHOWN = 0.05
 
 
+@dataclass(frozen=True)
+class Level:
+    """The noise level that weights a further column of the records in a fit, in its SI unit."""
+
+    column: str
+    value: float
+
+
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A record with the samples that count for a fit (`used`) and those held out for judging it."""
+    """A record with the samples that count for a fit (`used`) and those held out for judging it.
+
+    `further` are the columns beside the displacement that are fitted as well; the same in all
+    experiments of a fit, whether a record has them or not.
+    """
 
     record: Record
     used: BoolArray
     held_out: BoolArray
+    further: tuple[Level, ...] = ()
 
     @property
     def held_out_whole(self) -> bool:

@@ -30,12 +30,14 @@ def plot(result: Diagnosis | Identification | Trajectory) -> Figure:
     return _FIGURES[type(result)](result)
 
 
-def page(result: Diagnosis | Identification, path: str | os.PathLike[str]) -> None:
+def page(
+    result: Diagnosis | Identification, path: str | os.PathLike[str], small: bool = False
+) -> None:
     """Write the page of a result, one HTML file. Raises InputError when that cannot be."""
     if isinstance(result, Diagnosis):
-        write_report(result, path)
+        write_report(result, path, small=small)
     else:
-        write_fit_report(result, path)
+        write_fit_report(result, path, small=small)
 
 
 def line(result: Diagnosis | Identification | Trajectory) -> str:

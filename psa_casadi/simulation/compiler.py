@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy.lib.introspect
 
 from psa_casadi.cache import VARIABLE, cached, writable_room
+from psa_casadi.children import run_child
 from psa_casadi.errors import MachineError
-from psa_casadi.scratch import run_child
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
@@ -119,13 +119,14 @@ def run_compiler(command: Sequence[str], directory: Path) -> None:
         raise MachineError(
             f"The C compiler {command[0]} cannot be started ({error.strerror}); {_CURE}"
         ) from error
+    complaint = done.stderr.decode(errors="replace")
     full = os.strerror(errno.ENOSPC)
-    if done.returncode and full in done.stderr:
+    if done.returncode and full in complaint:
         raise OSError(errno.ENOSPC, full, str(directory))
     if done.returncode:
         raise MachineError(
             f"The C compiler failed ({' '.join(command[:3])} ...){_how(done.returncode)}:\n"
-            f"{done.stderr[-4000:]}\n{_CURE[0].upper()}{_CURE[1:]}"
+            f"{complaint[-4000:]}\n{_CURE[0].upper()}{_CURE[1:]}"
         )
 
 

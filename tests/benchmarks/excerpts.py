@@ -68,7 +68,12 @@ def pieces(records: Sequence[Record], count: int) -> list[Record]:
         name = f"{whole.name} {first}:{first + length}:{keep}, x {scale:g}, v {sign:+g}"
         shown = np.asarray(part.displacement)
         found.append(
-            Record(name, part.time[::keep], sign * part.voltage[::keep], scale * shown[::keep])
+            Record(
+                name=name,
+                time=part.time[::keep],
+                voltage=sign * part.voltage[::keep],
+                displacement=scale * shown[::keep],
+            )
         )
     return found
 

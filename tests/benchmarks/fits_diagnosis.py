@@ -193,7 +193,9 @@ def long_record(samples: int) -> Record:
     wave = concatenate(parts, _SAMPLE_TIME)
     x = simulate(model, wave.time, wave.voltage).displacement
     noise = _NOISE * np.ptp(x) * rng.standard_normal(x.size)
-    return Record(f"{x.size} samples", wave.time, wave.voltage, x + noise)
+    return Record(
+        name=f"{x.size} samples", time=wave.time, voltage=wave.voltage, displacement=x + noise
+    )
 
 
 def _long(samples: int, progress: Progress) -> tuple[Spent, Spent]:

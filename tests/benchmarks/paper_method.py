@@ -98,7 +98,9 @@ def step_record(values: Mapping[str, float], window: float) -> Record:
     x = reference.simulate(values, lambda _: top, time, rtol=_RTOL).displacement
     voltage = np.concatenate([[0.0], np.full(_SAMPLES, top)])
     instants = np.concatenate([[0.0], time + _JUMP])
-    return Record("step", instants, voltage, np.concatenate([[0.0], x]))
+    return Record(
+        name="step", time=instants, voltage=voltage, displacement=np.concatenate([[0.0], x])
+    )
 
 
 def by_moments(record: Record) -> FloatArray:
@@ -153,7 +155,12 @@ def _cases(
 def _noisy(record: Record, noise: float, seed: int) -> Record:
     x = np.asarray(record.displacement)
     draw = np.random.default_rng(seed).standard_normal(record.n)
-    return Record(record.name, record.time, record.voltage, x + noise * x[-1] * draw)
+    return Record(
+        name=record.name,
+        time=record.time,
+        voltage=record.voltage,
+        displacement=x + noise * x[-1] * draw,
+    )
 
 
 def _table(cases: Sequence[Case]) -> Table:
@@ -174,7 +181,9 @@ def _loops() -> Table:
     """Return the errors of A, delta, n, beta + gamma and gamma - beta with two readings of k."""
     values = _values("P-885.51", {})
     time, voltage = loop_voltage(values, 1.0, 1.0)
-    clean = Record("loop", time, voltage, response(values, time, voltage))
+    clean = Record(
+        name="loop", time=time, voltage=voltage, displacement=response(values, time, voltage)
+    )
     step = find_steps([step_record(_values("P-885.51", {"R_s": 8e-3}), WINDOW)])[0]
     compliance = static_compliance(values)
     rows = []

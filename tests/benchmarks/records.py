@@ -100,7 +100,10 @@ def _items(values: Values) -> tuple[tuple[str, float], ...]:
 def _fast_set(items: tuple[tuple[str, float], ...]) -> tuple[Record, ...]:
     values = dict(items)
     fast = {"step": step_voltage(values), "multisine": multisine_voltage(values, seed=1)}
-    return tuple(Record(n, t, v, response(values, t, v)) for n, (t, v) in fast.items())
+    return tuple(
+        Record(name=n, time=t, voltage=v, displacement=response(values, t, v))
+        for n, (t, v) in fast.items()
+    )
 
 
 @lru_cache(maxsize=16)
@@ -110,7 +113,14 @@ def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[Record, ...]:
         for frequency in LOOP_FREQUENCIES:
             name = f"loop {100 * amplitude:.0f} % {frequency:g} Hz"
             t, v = loop_voltage(values, amplitude, frequency)
-            found.append(Record(name, t, v, loop_response(values, amplitude, frequency, t)))
+            found.append(
+                Record(
+                    name=name,
+                    time=t,
+                    voltage=v,
+                    displacement=loop_response(values, amplitude, frequency, t),
+                )
+            )
     return tuple(found)
 
 
@@ -119,7 +129,12 @@ def with_noise(records: Sequence[Record], share: float, seed: int) -> list[Recor
     level = share * max(r.range_m for r in records)
     draw = np.random.default_rng(seed)
     return [
-        Record(r.name, r.time, r.voltage, r.displacement + level * draw.standard_normal(r.n))
+        Record(
+            name=r.name,
+            time=r.time,
+            voltage=r.voltage,
+            displacement=r.displacement + level * draw.standard_normal(r.n),
+        )
         for r in records
         if r.displacement is not None
     ]

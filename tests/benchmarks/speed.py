@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from psa_casadi.components import BASE
-from psa_casadi.identification.fitting import fit as fitting
+from psa_casadi.identification.fitting import minimum as fitting
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
@@ -58,7 +58,9 @@ def _record(samples: int) -> Record:
     voltage[:4] = 0.0  # at rest at first, which both take for granted
     x = simulate(_stack(), time_points, voltage).displacement
     noise = _NOISE * np.ptp(x) * np.random.default_rng(1).standard_normal(samples)
-    return Record(f"{samples} samples", time_points, voltage, x + noise)
+    return Record(
+        name=f"{samples} samples", time=time_points, voltage=voltage, displacement=x + noise
+    )
 
 
 def _wrong() -> dict[str, float]:

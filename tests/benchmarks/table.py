@@ -84,7 +84,7 @@ BENCHES: dict[str, Bench] = {
         _later(
             "work_precision",
             "fmu",
-            "error against work: the FMU's own solver beside CVode, Radau and LSODA",
+            "error against work: the FMU's solver beside CVode, Radau, LSODA; cost of a fixed step",
         ),
         _later(
             "coupling",

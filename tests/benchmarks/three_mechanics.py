@@ -130,7 +130,9 @@ def matches(
         loaded = plant_response(plant, p, time, none, push)
         for model, name in NAMES.items():
             progress(f"{name} fitted to the step of the {NAMES[plant]}")
-            best = _best_fit(model, p, Record("step", time, top, x), starts)
+            best = _best_fit(
+                model, p, Record(name="step", time=time, voltage=top, displacement=x), starts
+            )
             run = simulate(best.model, time, none, load_force=push, from_rest_at_zero=True)
             y, q = run.displacement, best.model.values
             mass = (q["m"] if "m" in q else q["m_P"] + q["m_B"]) * y[-1] / (loaded[-1] * p["m"])

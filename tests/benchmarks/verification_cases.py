@@ -128,7 +128,7 @@ def _compare(kind: str, stack: str, model: Model, record: Record) -> Comparison:
 def _with_noise(record: Record, noise: np.random.Generator) -> Record:
     level = NOISE * record.range_m
     noisy = measured(record) + level * noise.standard_normal(record.n)
-    return Record(record.name, record.time, record.voltage, noisy)
+    return Record(name=record.name, time=record.time, voltage=record.voltage, displacement=noisy)
 
 
 def _step(p: Values, share: float) -> Record:
@@ -137,7 +137,12 @@ def _step(p: Values, share: float) -> Record:
     time = time_grid(length, length / _STEP_SAMPLES)
     voltage = np.full(time.shape, share * p["u_rated"])
     voltage[0] = 0.0
-    return Record(f"step to {100 * share:.0f} %", time, voltage, response(p, time, voltage))
+    return Record(
+        name=f"step to {100 * share:.0f} %",
+        time=time,
+        voltage=voltage,
+        displacement=response(p, time, voltage),
+    )
 
 
 def _loop(p: Values, share: float, frequency: float) -> Record:
@@ -169,5 +174,8 @@ def _smooth(p: Values, name: str, time: FloatArray, voltage: Signal) -> Record:
     """Return the reference's response from rest to a voltage without kinks."""
     samples = np.array([voltage(float(t)) for t in time])
     return Record(
-        name, time, samples, reference.simulate(p, voltage, time, rtol=_RTOL).displacement
+        name=name,
+        time=time,
+        voltage=samples,
+        displacement=reference.simulate(p, voltage, time, rtol=_RTOL).displacement,
     )

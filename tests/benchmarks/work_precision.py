@@ -24,6 +24,7 @@ from psa_casadi.records import multisine, time_grid
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.step_cost import cost_table
 from tests.benchmarks.work_precision_figure import picture
 from tests.benchmarks.work_precision_methods import METHODS, OURS, Case, Method
 
@@ -64,7 +65,8 @@ def run(progress: Progress, quick: bool) -> Outcome:
             found = _runs(case, path, tolerances, truth, progress, 1 if quick else 3)
         tables.append(_table(case, found, float(doubt)))
         runs += found
-    return Outcome((*tables, _summary(runs)), partial(picture, runs))
+    cost = cost_table(progress, quick=quick)
+    return Outcome((*tables, _summary(runs), cost), partial(picture, runs))
 
 
 def cases(quick: bool) -> tuple[Case, Case]:

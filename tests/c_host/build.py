@@ -41,8 +41,16 @@ _FOLDER = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
 
 #: Where the packages of the system put what is not in PATH.
 _ELSEWHERE = {"wine64": "/usr/lib/wine/wine64"}
-#: GNU libc for aarch64, as Debian's libc6-arm64-cross has it.
-_ARM_LIBRARIES = "/usr/aarch64-linux-gnu"
+#: What runs the programs of another Linux, and its GNU libc, as Debian's packages libc6-*-cross
+#: have it.
+_EMULATORS = {
+    "aarch64-linux": ("qemu-aarch64", "/usr/aarch64-linux-gnu"),
+    "riscv64-linux": ("qemu-riscv64", "/usr/riscv64-linux-gnu"),
+    "aarch32-linux": ("qemu-arm", "/usr/arm-linux-gnueabihf"),
+    "x86-linux": ("qemu-i386", "/usr/i686-linux-gnu"),
+}
+#: All platforms that an emulator runs here.
+EMULATED = (*_EMULATORS, "x86_64-windows")
 
 
 def tool(*names: str) -> str:
@@ -141,11 +149,12 @@ def native() -> Runner:
 
 def emulated(name: str) -> Runner:
     """Return the way to run the programs of another platform; skips where there is none."""
-    if name == "aarch64-linux":
-        qemu = tool("qemu-aarch64")
-        if not (Path(_ARM_LIBRARIES) / "lib" / "libc.so.6").exists():
-            _missing(f"{_ARM_LIBRARIES} has no C library for qemu-aarch64", ["qemu-aarch64"])
-        return Runner(PLATFORMS[name], (qemu, "-L", _ARM_LIBRARIES))
+    if name in _EMULATORS:
+        emulator, libraries = _EMULATORS[name]
+        found = tool(emulator)
+        if not (Path(libraries) / "lib" / "libc.so.6").exists():
+            _missing(f"{libraries} has no C library for {emulator}", [emulator])
+        return Runner(PLATFORMS[name], (found, "-L", libraries))
     prefix = str(Path(_FOLDER.name) / "wine")
     quiet = {"WINEPREFIX": prefix, "WINEDEBUG": "-all", "WINEDLLOVERRIDES": "mscoree,mshtml="}
     return Runner(PLATFORMS[name], (tool("wine64", "wine"),), tuple(quiet.items()))

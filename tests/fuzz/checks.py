@@ -38,7 +38,7 @@ def _check(data: bytes, folder: Path) -> Iterator[Found]:
     """Let the command check an FMU: it ends in order and passes none that differs."""
     path = folder / "x.fmu"
     path.write_bytes(data)
-    ended = psa(["check", path], folder, limit_s=_LIMIT_S)
+    ended = psa(["check", path, *_LIMITED], folder, limit_s=_LIMIT_S)
     yield from misbehaved(ended, (0, 1, 2), "psa check")
     yield from left_files(folder, "psa check")
     if ended.code == 0 and (what := _difference(path)):
@@ -95,6 +95,8 @@ _HARM = {
 _HARMLESS = ("quiet", "flood", "stay", "chdir")  # the FMU works in spite of them
 _PLACES = ("load", "instantiate", "step")
 _LIMIT_S = 300.0
+#: Each check of a command ends well within that.
+_LIMITED = ("--timeout", "20")
 
 
 def _harm(rng: Random) -> bytes:
@@ -137,7 +139,7 @@ def _check_harm(data: bytes, folder: Path) -> Iterator[Found]:
     path = folder / "harm.fmu"
     path.write_bytes(harmful(**case))
     what = f"psa check of an FMU that does '{case['harm']}' at {case['at']}"
-    ended = psa(["check", path], folder, limit_s=_LIMIT_S)
+    ended = psa(["check", path, *_LIMITED], folder, limit_s=_LIMIT_S)
     yield from misbehaved(ended, (0, 1, 2), what)
     yield from left_files(folder, what)
     if ended.code == 0 and case["harm"] not in _HARMLESS:

@@ -15,7 +15,18 @@ from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.design.tracking.targets import read_target
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.fmu.archive import DESCRIPTIONS
+from psa_casadi.export.fmu.evidence_files import evidence_texts
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.evidence import (
+    Covariance,
+    ErrorBudget,
+    ErrorShare,
+    Evidence,
+    HeldOut,
+    RecordRun,
+    ReferenceRun,
+    SeenRange,
+)
 from psa_casadi.model.model_file import dumps, load_model, save_model
 from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
@@ -44,6 +55,7 @@ def model_trees() -> tuple[Any, ...]:
     models = [
         base,
         base.with_values({}, provenance=origin),
+        base.with_values({}, provenance=origin, evidence=_evidence(base)),
         compose(SIMPLIFIED),
         compose((*BASE, *EFFECTS.values()), gains),
         *(base.with_effect(e) for e in EFFECTS.values()),
@@ -53,6 +65,36 @@ def model_trees() -> tuple[Any, ...]:
     ]
     found = [json.loads(dumps(m)) for m in models]
     return (*found, {"format": "psa_casadi.diagnosis/1", "verdict": "adequate", "causes": []})
+
+
+def _evidence(model: Model) -> Evidence:
+    """Return evidence with every part that it may have, in three samples."""
+    run = RecordRun(
+        "a.csv",
+        "0" * 64,
+        dict.fromkeys(model.state_names, 0.0),
+        1e-7,
+        60,
+        1,
+        2e-8,
+        3e-8,
+        ((9, 20),),
+    )
+    share = ErrorShare("slow_creep", 0.9, Interval(0.8, 1.0))
+    return Evidence(
+        by="psa diagnose",
+        fitted_m=2e-8,
+        seen=SeenRange(Interval(0.0, 80.0), 5e3, 0.6, Interval(290.0, 300.0)),
+        covariance=Covariance(("A", "tau"), ((1e-4, 1e-9), (1e-9, 1e-8))),
+        runs=(run,),
+        reference=ReferenceRun(
+            "a.csv", (0.0, 0.1, 0.2), {"voltage": (0.0, 50.0, 10.0)}, (1e-7, None, 3e-6)
+        ),
+        held_out=HeldOut(3e-8, Interval(2e-8, 4e-8), 9e-8, 0.2, 0),
+        budget=ErrorBudget(1e-7, 2e-8, 1e-8, 0.1, (share,), share),
+        outside=("offset_drift",),
+        unnamed=("a static curve",),
+    )
 
 
 def _model(rng: Random) -> bytes:
@@ -65,7 +107,7 @@ def _load(data: bytes, folder: Path) -> Iterator[Found]:
     model = load_model(first)
     save_model(model, second)
     again = load_model(second)
-    for what in ("values", "provenance", "name", "description", "components"):
+    for what in ("values", "provenance", "evidence", "name", "description", "components"):
         if getattr(again, what) != getattr(model, what):
             yield Found(FALSE_PASS, f"a model that was loaded is saved with other {what}")
     if again.own_starts() != model.own_starts():
@@ -74,6 +116,7 @@ def _load(data: bytes, folder: Path) -> Iterator[Found]:
         yield Found(FALSE_PASS, "a model that was loaded is saved in another way the second time")
     if zlib.crc32(data) % _DESCRIBED == 0:
         yield from _undescribed(model)
+        yield from _unfiled(model.plant())
 
 
 def _undescribed(model: Model) -> Iterator[Found]:
@@ -89,6 +132,20 @@ def _undescribed(model: Model) -> Iterator[Found]:
             values = [float(e.get(attribute, "0").split()[0]) for e in root.iter()]
             if not np.isfinite(values).all():
                 yield Found(FALSE_PASS, f"the description for FMI {fmi} has a bad {attribute}")
+
+
+def _unfiled(model: Model) -> Iterator[Found]:
+    """Yield what is wrong with the files of a model's evidence in an FMU."""
+    for name, text in evidence_texts(model, 2).items():
+        if not name.endswith((".ssv", ".srmd", ".exp")):
+            continue
+        try:
+            root = ET.fromstring(text.encode("utf-8"))
+        except (ET.ParseError, UnicodeEncodeError) as error:
+            yield Found(FALSE_PASS, f"{name} is no XML: '{error}'")
+            continue
+        if not all(np.isfinite(float(e.get("value", "0"))) for e in root.iter()):
+            yield Found(FALSE_PASS, f"{name} has a value that is no number")
 
 
 @cache

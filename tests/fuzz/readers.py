@@ -100,7 +100,8 @@ def _parquet(rng: Random) -> bytes:
     return damaged_bytes(data, rng)
 
 
-def _read(name: str, data: bytes, folder: Path) -> Iterator[Found]:
+def read(name: str, data: bytes, folder: Path) -> Iterator[Found]:
+    """Read a record and yield what is unsound in it."""
     path = folder / name
     path.write_bytes(data)
     yield from unsound(read_record(path))
@@ -159,11 +160,11 @@ def _mapped(data: bytes, folder: Path) -> Iterator[Found]:
 
 
 TARGETS = (
-    Target("records-csv", ROOM, ".csv", _csv, partial(_read, "r.csv"), 4.0),
-    Target("records-mat", ROOM, ".mat", _mat, partial(_read, "r.mat"), 3.0, prepare=mat_files),
-    Target("records-hdf5", ROOM, ".mat", _hdf5, partial(_read, "r.mat"), 1.5,
+    Target("records-csv", ROOM, ".csv", _csv, partial(read, "r.csv"), 4.0),
+    Target("records-mat", ROOM, ".mat", _mat, partial(read, "r.mat"), 3.0, prepare=mat_files),
+    Target("records-hdf5", ROOM, ".mat", _hdf5, partial(read, "r.mat"), 1.5,
            prepare=hdf5_files),
-    Target("records-parquet", ROOM, ".parquet", _parquet, partial(_read, "r.parquet"), 1.5,
+    Target("records-parquet", ROOM, ".parquet", _parquet, partial(read, "r.parquet"), 1.5,
            prepare=parquet_files),
     Target("column-maps", ROOM, ".txt", _map_text, _parse_map, 0.5),
     Target("mapped-records", ROOM, ".txt", _map_text, _mapped, 0.5),

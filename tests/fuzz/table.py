@@ -13,6 +13,7 @@ from tests.fuzz import (
     checks,
     environments,
     kills,
+    laboratory,
     models,
     readers,
 )
@@ -21,7 +22,18 @@ from tests.fuzz.target import KINDS, Target
 
 TARGETS: dict[str, Target] = {
     target.name: target
-    for module in (readers, models, binaries, archives, checks, blobs, kills, environments, cache)
+    for module in (
+        readers,
+        laboratory,
+        models,
+        binaries,
+        archives,
+        checks,
+        blobs,
+        kills,
+        environments,
+        cache,
+    )
     for target in module.TARGETS
 }
 

@@ -49,7 +49,9 @@ def usual_records(limits: Limits, steepest: float) -> dict[str, Record]:
         "triangle": triangle(moving, limits.low, limits.high, frequency),
     }
     rest = np.full(len(time) - len(moving), limits.low)
-    return {n: Record(n, time, np.concatenate([rest, v])) for n, v in shapes.items()}
+    return {
+        n: Record(name=n, time=time, voltage=np.concatenate([rest, v])) for n, v in shapes.items()
+    }
 
 
 def separating_experiment(

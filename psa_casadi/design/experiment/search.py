@@ -114,7 +114,9 @@ def _drawn(
 def _in_full(wave: Waveform, p: FloatArray, limits: Limits) -> Record:
     """Return the record of a waveform on all of its samples."""
     time = limits.grid()
-    return Record("designed", time, np.clip(wave.voltage(p, time), limits.low, limits.high))
+    return Record(
+        name="designed", time=time, voltage=np.clip(wave.voltage(p, time), limits.low, limits.high)
+    )
 
 
 def coarse(record: Record, samples: int) -> Record:
@@ -123,7 +125,7 @@ def coarse(record: Record, samples: int) -> Record:
         return record
     spacing = record.sample_time * record.n / samples
     time: FloatArray = spacing * np.arange(samples, dtype=np.float64)
-    return Record(record.name, time, np.interp(time, record.time, record.voltage))
+    return Record(name=record.name, time=time, voltage=np.interp(time, record.time, record.voltage))
 
 
 class _Problem:
@@ -138,7 +140,7 @@ class _Problem:
     def record(self, wave: Waveform, p: FloatArray) -> Record:
         """Return the planned record on the grid."""
         voltage = np.clip(wave.voltage(p, self._time), self._limits.low, self._limits.high)
-        return Record(wave.kind, self._time, voltage)
+        return Record(name=wave.kind, time=self._time, voltage=voltage)
 
     def point(self, wave: Waveform, p: FloatArray) -> Point:
         """Return the criterion at p; a poor value where the models cannot follow."""

@@ -56,7 +56,7 @@ class Separation:
 
     def __post_init__(self) -> None:
         if len(self.rivals) < 2:
-            raise InputError("One effect cannot be told from itself; name two or more.")
+            raise InputError("One effect cannot be separated from itself; name two or more.")
 
     def at(self, record: Record) -> Point:
         """Return the value and a function of the voltage with its gradient."""

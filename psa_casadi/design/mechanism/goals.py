@@ -56,7 +56,9 @@ def check_goals(
     """Raise an InputError that names every goal and limit that makes no sense."""
     problems = Problems()
     if poles and (damping is not None or width is not None):
-        problems.add("Poles are wanted beside a damping or a bandwidth; leave one of them out.")
+        problems.add(
+            "Poles are wanted together with a damping or a bandwidth; leave one of them out."
+        )
     if not poles and damping is None and width is None:
         problems.add("Nothing is wanted; give a damping ratio, a bandwidth in Hz, or poles.")
     if damping is not None and not 0.0 < damping <= 1.0:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from psa_casadi.diagnosis.held_out.confirmation import too_few_held_out
 from psa_casadi.records.split import Experiment
 from psa_casadi.records.stretches import Kind, counts
 
@@ -14,16 +15,18 @@ _SAMPLES, _SPAN = 0.02, 0.01
 def coverage_notes(experiments: Sequence[Experiment]) -> tuple[str, ...]:
     """Return what the held-out figure does not rest on, in sentences; none where all is shown.
 
-    It extrapolates where held-out samples have kinds of stretch that no fitted sample shows, and
-    where their voltage goes beyond the fitted one. It says nothing of kinds that are not held out.
+    There may be too few of them. It extrapolates where held-out samples have kinds of stretch that
+    no fitted sample shows, and where their voltage goes beyond the fitted one. It says nothing of
+    kinds that are not held out.
     """
     records = [e.record for e in experiments]
     voltage = np.concatenate([r.voltage for r in records])
     span = float(np.ptp(voltage))
     fitted = counts(records, [e.used for e in experiments], span)
     held = counts(records, [e.held_out for e in experiments], span)
-    if not fitted or not held:
-        return ()
+    few = too_few_held_out(experiments)
+    if not fitted or few:
+        return (f"{few[0].upper()}{few[1:]}: the held-out error says little.",) if few else ()
     notes = []
     share, kinds = _without_like(held, fitted)
     if share > _SAMPLES:

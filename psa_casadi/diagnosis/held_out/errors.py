@@ -8,7 +8,10 @@ import numpy.typing as npt
 from scipy import special
 
 from psa_casadi.diagnosis.noise.colour import rms
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.further import predicted_further
 from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -53,6 +56,24 @@ def held_out_residuals(
 def held_out_rms(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> float:
     """Return the root mean square over all held-out samples [m]."""
     return rms(np.concatenate(held_out_residuals(experiments, predicted)))
+
+
+def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Return the root mean square errors of the further columns over all held-out samples.
+
+    In their SI units; those of the fitted samples where none is held out. Raises PsaError.
+    """
+    found = []
+    theta = shared_starts(fit.model, fit.unknowns, fit.theta, experiments)[0]
+    for f in fit.further:
+        shown = predicted_further(fit.model, experiments, fit.unknowns, theta, f, way=fit.way)
+        parts = [
+            (getattr(experiments[k].record, f.column) - x)[experiments[k].held_out]
+            for k, x in shown.items()
+        ]
+        held = np.concatenate(parts)
+        found.append(rms(held) if held.size else f.rms)
+    return tuple(found)
 
 
 def whole_residuals(

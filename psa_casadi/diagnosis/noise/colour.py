@@ -25,12 +25,14 @@ class Colour:
     """Noise e_k = a_1 e_(k-1) + ... + w_k, with w white of standard deviation `level` [m].
 
     `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
-    records' numbers of samples.
+    records' numbers of samples. `further` are the colours of the columns beside the displacement,
+    each with a level in its own unit.
     """
 
     autoregression: tuple[FloatArray, ...]
     level: float
     lengths: tuple[int, ...]
+    further: tuple["Colour", ...] = ()
 
     @property
     def inflation(self) -> float:
@@ -62,6 +64,19 @@ class Colour:
                 own[: a.size] = part[: a.size] / np.sqrt(_power(a))
             first += length
         return white
+
+    def whiten_all(self, signal: FloatArray, further: Sequence[FloatArray]) -> FloatArray:
+        """Filter a signal of the displacement and those of the further columns, and stack them.
+
+        A further one counts over its noise level, in metres of that of the displacement.
+        """
+        if not further:
+            return self.whiten(signal)
+        beside = [
+            self.level / own.level * own.whiten(part)
+            for own, part in zip(self.further, further, strict=True)
+        ]
+        return np.concatenate([self.whiten(signal), *beside])
 
 
 def colour_of(

@@ -36,5 +36,5 @@ def without_stuck_readings(
         record = e.record
         if given is not None and bad.any():
             record = replace(record, displacement=np.where(bad, np.nan, given))
-        kept.append(Experiment(record, e.used & ~bad, e.held_out & ~bad))
+        kept.append(replace(e, record=record, used=e.used & ~bad, held_out=e.held_out & ~bad))
     return tuple(kept), count

@@ -181,7 +181,9 @@ def _telling(effect: Component, play: _Play) -> tuple[View, FloatArray, FloatArr
     d = play.changed - play.base
     if SPECTRAL_PEAKS in effect.probe.values():
         return _spectrum(play.time, d), np.zeros(0), np.zeros(0)
-    record = Record("signature", play.time, play.voltage, play.changed)
+    record = Record(
+        name="signature", time=play.time, voltage=play.voltage, displacement=play.changed
+    )
     rows = [time_axis(record), *axes(record, play.base, drive_of(record))]
     # two amplitudes at two rates make no curve
     rows = [row for row in rows if not row.name.startswith(("amplitude", "frequency"))]

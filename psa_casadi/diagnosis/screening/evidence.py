@@ -1,11 +1,12 @@
 """How much the data speak for one more effect: Laplace's approximation of the Bayes factor.
 
-    ln B = n/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
+    ln B = (n - k)/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
 
-S are sums of squares of the whitened residuals, the noise level being the data's own; H is the
-information on the unknowns that the effect adds, those of the model before projected out, and P
-their prior standard deviations. An unknown that the data do not tell costs nothing, a sharp one
-costs what its prior range is wider than its interval (MacKay, Neural Computation 4 (1992), 415).
+S are sums of squares of n whitened residuals, of which k unknowns of the model before have taken
+their part, the noise level being the data's own; H is the information on the unknowns that the
+effect adds, those of the model before projected out, and P their prior standard deviations. An
+unknown that the data do not tell costs nothing, a sharp one costs what its prior range is wider
+than its interval (MacKay, Neural Computation 4 (1992), 415).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.colour import Colour
-from psa_casadi.diagnosis.screening.screen import Score, Screening
+from psa_casadi.diagnosis.screening.screen import Score, Screening, whitened_residuals
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
@@ -23,13 +24,19 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def evidence(before: Fit, after: Fit, colour: Colour) -> float:
-    """Return ln B of a fit with one more effect over the fit without it."""
-    n = len(before.residuals)
-    sums = [float(np.sum(colour.whiten(f.residuals) ** 2)) for f in (before, after)]
-    gained = 0.5 * n * float(np.log(sums[0] / max(sums[1], 1e-300)))
-    added = _added(before, after)
-    level = float(np.sqrt(sums[1] / n))
-    jacobian = colour.whiten(after.jacobian) / max(level, 1e-300)
+    """Return ln B of a fit with one more effect over the fit without it.
+
+    The log-likelihoods of displacement and further columns add up, each with its own noise level.
+    """
+    share = _freedom(before) / len(before.residuals)
+    gained = share * _gained(before.residuals, after.residuals, colour)
+    jacobians = []
+    level = _level(after.residuals, colour, 0.0)
+    jacobians.append(colour.whiten(after.jacobian) / max(level, 1e-300))
+    for own, f in zip(colour.further, after.further, strict=True):
+        jacobians.append(own.whiten(f.jacobian) / _level(f.residuals, own, f.straight))
+    gained += sum(further_gains(before, after, colour).values())
+    added, jacobian = _added(before, after), np.concatenate(jacobians)
     kept = [k for k in range(after.unknowns.size) if k not in added]
     new, old = jacobian[:, added], jacobian[:, kept]
     free = new - old @ np.linalg.lstsq(old, new, rcond=1e-10)[0]
@@ -39,18 +46,39 @@ def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     return gained - 0.5 * float(penalty)
 
 
+def further_gains(before: Fit, after: Fit, colour: Colour) -> dict[str, float]:
+    """Return what every further column adds to the log-likelihood of a fit over another one."""
+    rows = zip(colour.further, before.further, after.further, strict=True)
+    return {
+        new.column: _gained(old.residuals, new.residuals, own, new.straight)
+        for own, old, new in rows
+    }
+
+
+def _gained(before: FloatArray, after: FloatArray, colour: Colour, straight: float = 0.0) -> float:
+    """Return n/2 ln(S_before / S_after), each with what the sensor's form may cost."""
+    levels = [_level(r, colour, straight) for r in (before, after)]
+    return len(after) * float(np.log(max(levels[0], 1e-300) / max(levels[1], 1e-300)))
+
+
+def _level(residual: FloatArray, colour: Colour, straight: float) -> float:
+    """Return the rms of a whitened residual, at least that of what is `straight`."""
+    return float(np.hypot(np.sqrt(np.mean(colour.whiten(residual) ** 2)), straight))
+
+
 def estimated(before: Fit, screening: Screening) -> dict[str, float]:
     """Return every effect's ln B as its trial directions tell it, without a full fit.
 
     Linear in the gain g with prior N(0, s^2), s = `LINEAR_PRIOR` ordinary sizes, and estimated to
-    sigma: ln B = n/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged over
-    the probe values, each as likely as the others.
+    sigma: ln B = (n - k)/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged
+    over the probe values, each as likely as the others.
     """
     found: dict[str, list[float]] = {}
-    total = float(np.sum(screening.colour.whiten(before.residuals) ** 2))
+    white = whitened_residuals(before, screening.colour)
+    total = float(np.sum(white**2))
     for score in screening.scores:
         share = min(score.decrease * screening.colour.level**2 / max(total, 1e-300), 1.0 - 1e-9)
-        gained = -0.5 * len(before.residuals) * float(np.log1p(-share))
+        gained = -0.5 * (len(white) - before.unknowns.size) * float(np.log1p(-share))
         found.setdefault(score.direction.effect.name, []).append(_linear(score, gained))
     return {name: float(np.logaddexp.reduce(v) - np.log(len(v))) for name, v in found.items()}
 
@@ -101,6 +129,11 @@ def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, .
         chosen.append(name)
         total += p
     return tuple(chosen)
+
+
+def _freedom(fit: Fit) -> int:
+    """Return the number of residuals less that of the unknowns: what is left to tell the noise."""
+    return max(len(fit.residuals) - fit.unknowns.size, 0)
 
 
 def _linear(score: Score, gained: float) -> float:

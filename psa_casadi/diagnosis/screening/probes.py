@@ -16,13 +16,15 @@ from psa_casadi.component import (
 )
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured, predict_record
+from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column
+from psa_casadi.identification.fitting.prediction import measured, predict_record, trace_record
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import among_harmonics
 from psa_casadi.records.quality.filtering import peaks as highest_peaks
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import memory_names
+from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -41,7 +43,8 @@ class Direction:
 
     `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
     times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
-    history. `one_sided` says that only positive multiples make sense.
+    history. `one_sided` says that only positive multiples make sense. `further` are the same
+    changes of the further columns, in their units, without what their offsets can follow.
     """
 
     effect: Component
@@ -51,6 +54,7 @@ class Direction:
     column: FloatArray
     one_sided: bool
     finite: bool
+    further: tuple[FloatArray, ...] = ()
 
 
 def directions(
@@ -192,11 +196,13 @@ def _directions_at(
         for step in steps:
             try:
                 column = _column(fit, experiments, model, gain, memory, step, scale)
+                further = _beside(fit, experiments, model, gain, memory, step, scale)
             except PsaError:
                 continue
-            if np.all(np.isfinite(column)) and np.any(column):
+            every = np.concatenate([column, *further])
+            if np.all(np.isfinite(every)) and np.any(every):
                 yield Direction(
-                    effect, values, memory, step or scale, column, one_sided, bool(step)
+                    effect, values, memory, step or scale, column, one_sided, bool(step), further
                 )
 
 
@@ -233,16 +239,50 @@ def _column(
     first = 0
     for e, start in zip(experiments, memory, strict=True):
         states = dict.fromkeys(names, 0.0) | start
-        y, by_gain, _ = predict_record(
-            changed, e.record, states, [gain], stop=e.stop, rtol=fit.way.rtol if step else _RTOL
-        )
+        rtol = fit.way.rtol if step else _RTOL
+        found = trace_record(
+            changed, e.record, states, () if step else (gain,),
+            stop=e.stop, way=Way(rtol, rtol), by_start=False,
+        )  # fmt: skip
         used = e.used[: e.stop]
         count = int(used.sum())
         if step:
             index = len(parts)
             prediction = measured(e.record)[: e.stop][used] - fit.residuals[first : first + count]
-            parts.append(y[used] + fit.offset(index) - prediction)
+            parts.append(found.output[used] + fit.offset(index) - prediction)
         else:
-            parts.append(by_gain[used, 0] * scale)
+            parts.append(found.sensitivity[used, 0] * scale)
         first += count
     return np.concatenate(parts)
+
+
+def _beside(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    model: Model,
+    gain: str,
+    memory: tuple[dict[str, float], ...],
+    step: float,
+    scale: float,
+) -> tuple[FloatArray, ...]:
+    """Return what an effect changes in every further column, beyond offsets and factors."""
+    changed = model.with_values({gain: step}) if step else model
+    names = memory_names(model.structure)
+    rtol = fit.way.rtol if step else _RTOL
+
+    def change(f: Further, k: int) -> FloatArray:
+        e, states = experiments[k], dict.fromkeys(names, 0.0) | memory[k]
+        total = -measured_in(e, f.column) if step else np.zeros(int(e.used.sum()))
+        for factor, output in zip(f.factors, COLUMNS[f.column].outputs, strict=True):
+            y, by_gain, _ = predict_record(
+                changed, e.record, states, [gain], stop=e.stop, rtol=rtol, output=output
+            )
+            total = total + factor * (y if step else by_gain[:, 0] * scale)[e.used[: e.stop]]
+        return total
+
+    found = []
+    for f in fit.further:
+        each = [change(f, k) for k in with_column(experiments, f.column)]
+        left = f.left_of(np.concatenate(each))
+        found.append(left + f.residuals if step else left)
+    return tuple(found)

@@ -6,7 +6,7 @@ drawn from Gaussian noise along the actual directions (family-wise; Davies 1987,
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -78,10 +78,13 @@ def screen(
     if colour is None:
         every = independent(np.hstack([basis, without(columns, basis)]))
         colour = colour_of(without(fit.residuals, every), lengths, known, every)
-    white_basis = independent(colour.whiten(fit.jacobian))
-    residual = without(colour.whiten(fit.residuals), white_basis)
-    white = without(colour.whiten(columns), white_basis)
-    raw = np.linalg.norm(colour.whiten(columns), axis=0)
+    beside = further_columns(fit, trials)
+    colour = replace(colour, further=_further_colours(fit, beside))
+    white_basis = independent(whitened_jacobian(fit, colour))
+    residual = without(whitened_residuals(fit, colour), white_basis)
+    whole = colour.whiten_all(columns, beside)
+    white = without(whole, white_basis)
+    raw = np.linalg.norm(whole, axis=0)
     norm = np.linalg.norm(white, axis=0)
     usable = norm > 1e-6 * raw
     norm = np.where(usable, norm, 1.0)
@@ -100,6 +103,34 @@ def screen(
         )
     scores.sort(key=lambda s: -s.decrease)
     return Screening(tuple(scores), _threshold(unit), colour)
+
+
+def whitened_residuals(fit: Fit, colour: Colour) -> FloatArray:
+    """Return the whitened residuals (samples,), those of the further columns below."""
+    return colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])
+
+
+def whitened_jacobian(fit: Fit, colour: Colour) -> FloatArray:
+    """Return the whitened derivatives by theta (samples, size), the further columns' below."""
+    return colour.whiten_all(fit.jacobian, [f.jacobian for f in fit.further])
+
+
+def further_columns(fit: Fit, trials: Sequence[Direction]) -> list[FloatArray]:
+    """Return for every further column what the directions change in it (samples, directions)."""
+    return [
+        np.hstack([np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)])
+        for k, f in enumerate(fit.further)
+    ]
+
+
+def _further_colours(fit: Fit, columns: Sequence[FloatArray]) -> tuple[Colour, ...]:
+    """Return the colour of what neither the fit nor a direction explains of the further columns."""
+    found = []
+    for f, own in zip(fit.further, columns, strict=True):
+        basis = independent(f.jacobian)
+        every = independent(np.hstack([f.basis, basis, without(own, basis)]))
+        found.append(colour_of(without(f.residuals, every), f.lengths, None, every))
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)

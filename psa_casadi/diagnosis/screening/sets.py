@@ -14,7 +14,13 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.probes import Direction
-from psa_casadi.diagnosis.screening.screen import independent, without
+from psa_casadi.diagnosis.screening.screen import (
+    further_columns,
+    independent,
+    whitened_jacobian,
+    whitened_residuals,
+    without,
+)
 from psa_casadi.identification.fitting.fit import Fit
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,9 +58,10 @@ def best_sets(
     The fitted parameters are free to follow. Gains have the sign that makes sense. Of sets that are
     the same but for effects that are `alike` only the best one is returned.
     """
-    basis = independent(colour.whiten(fit.jacobian))
-    residual = without(colour.whiten(fit.residuals), basis)
-    columns = colour.whiten(np.column_stack([d.column for d in trials]))
+    basis = independent(whitened_jacobian(fit, colour))
+    residual = without(whitened_residuals(fit, colour), basis)
+    main = np.column_stack([d.column for d in trials])
+    columns = colour.whiten_all(main, further_columns(fit, trials))
     free = without(columns, basis)
     norm = np.linalg.norm(free, axis=0)
     usable = np.flatnonzero(norm > _NEW * np.linalg.norm(columns, axis=0))

@@ -7,6 +7,8 @@ the base again from where the cause has led); with one cause in another's place.
 one of them is better; where much is left, from another base and with all effects.
 """
 
+import numpy as np
+
 from psa_casadi.diagnosis.base_fit.ringing import ringing
 from psa_casadi.diagnosis.base_fit.variants import (
     SEEN,
@@ -42,8 +44,8 @@ _EXPANSIONS, _VISITS = 5, 24
 #: Neighbours whose residual is within this factor of the noise, or that remove this share of the
 #: excess power, need no fits afresh; of a first and a further cause so many get some.
 _SETTLED, _NEARLY, _AFRESH, _AFRESH_FURTHER = 1.02, 0.95, 4, 2
-#: So many neighbours are fitted to the end.
-_FINALISTS = 3
+#: So many neighbours are fitted first, and so many to the end.
+_PACE, _FINALISTS = 2, 3
 
 
 def best_first(base: Fit, task: Task) -> Searched:
@@ -165,9 +167,13 @@ class _Search:
         leading = [s for s in view.leading() if self.known.different(s[0].direction.effect, h)]
         names = [scores[0].direction.effect.name for scores in leading]
         self.tell(h, f"fitting {', '.join(names)}")
-        for found in side_by_side(lambda s: with_cause(h, experiments, s), leading):
+        for found in side_by_side(lambda s: with_cause(h, experiments, s), leading[:_PACE]):
             self.known.note(found)
         self.known.remember(h, *names)
+        best = max(self.known.children(h), key=lambda c: c.removes(h), default=None)
+        goal = self.known.near(h, best) if best is not None else np.inf
+        for found in side_by_side(lambda s: with_cause(h, experiments, s, goal), leading[_PACE:]):
+            self.known.note(found)
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
         self.known.finish([c for c in self.known.leaders(h) if not c.final][:_FINALISTS])
@@ -239,7 +245,8 @@ class _Search:
             for cause in h.causes:
                 if not cause.more_of:
                     task.progress(f"without {cause.name}")
-                    self.known.note(without(h, cause, task.experiments))
+                    less = self.known.get(h.names - {cause.name})
+                    self.known.note(without(h, cause, task.experiments, less))
         before = self.known.get(h.names_upto(len(h.causes) - 1))
         if "resonances" in task.method.without or before is None or has_series(h):
             return

@@ -31,7 +31,7 @@ def exchange(h: Hypothesis, known: Known, task: Task) -> None:
         for copy in _copies(h, less, known, task):
             name = copy.direction.effect.name
             task.progress(f"{name}, which could copy {cause.name}")
-            known.note(like(h, less, copy, task.experiments))
+            known.note(like(h, less, copy, task.experiments, known.near(less, h)))
             known.remember(less, name)
 
 
@@ -59,12 +59,13 @@ def _put_in_place(
 
     To the end where that comes near.
     """
-    rival = with_cause(less, task.experiments, starts)
+    goal = known.near(less, h)
+    rival = with_cause(less, task.experiments, starts, goal)
     known.note(rival)
     if rival is None:
         return
     effect = _effect(starts)
-    known.note(in_place(h, less, h.fit, rival.fit, effect, task.experiments))
+    known.note(in_place(h, less, h.fit, rival.fit, effect, task.experiments, goal))
     known.remember(less, effect.name)
     best = known.get(rival.names)
     if best is not None and known.scale.evidence(best) > known.scale.evidence(h) - NEAR:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.screening.screen import Copy, Score
 from psa_casadi.diagnosis.screening.sets import Together
@@ -11,6 +13,7 @@ from psa_casadi.diagnosis.search.quick_fits import (
     QUICK,
     Start,
     continued,
+    cost_beside,
     fit_from,
     fit_with_all,
     quick_fit,
@@ -31,17 +34,23 @@ _POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
 
 
 def with_cause(
-    before: Hypothesis, experiments: Sequence[Experiment], scores: Sequence[Score]
+    before: Hypothesis,
+    experiments: Sequence[Experiment],
+    scores: Sequence[Score],
+    goal: float = np.inf,
 ) -> Hypothesis | None:
-    """Fit quickly with one more cause from its best directions; None if every fit fails."""
+    """Fit quickly with one more cause from its best directions; None if every fit fails.
+
+    A fit whose cost will stay above the `goal` ends early, here and below.
+    """
     effect = scores[0].direction.effect
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
-    quick = quick_fit(before.fit, experiments, effect, starts, {})
+    quick = quick_fit(before.fit, experiments, effect, starts, {}, goal=goal)
     return hypothesis((*before.causes, effect), quick, experiments)
 
 
 def with_causes(
-    before: Hypothesis, experiments: Sequence[Experiment], start: Together
+    before: Hypothesis, experiments: Sequence[Experiment], start: Together, goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit quickly with several more causes at once; None if that fails."""
     added = [
@@ -52,7 +61,7 @@ def with_causes(
         {k: v for d in start.directions for k, v in d.memory[r].items()} | own
         for r, own in enumerate(before.fit.starts())
     )
-    quick = fit_with_all(before.fit, experiments, added, memory, {}, _AFRESH)
+    quick = fit_with_all(before.fit, experiments, added, memory, {}, _AFRESH, goal)
     causes = (*before.causes, *(d.effect for d in start.directions))
     return hypothesis(causes, quick, experiments)
 
@@ -67,7 +76,9 @@ def afresh(
     """
     effect = first.causes[-1]
     fits = _from_ordinary(before.fit, experiments, effect, first.fit.model.values)
-    return hypothesis(first.causes, _best_continued(fits, experiments, _CONTINUED), experiments)
+    goal = cost_beside(first.fit, before.fit, experiments)
+    final = _best_continued(fits, experiments, _CONTINUED, goal)
+    return hypothesis(first.causes, final, experiments)
 
 
 def any_afresh(
@@ -92,6 +103,7 @@ def in_place(
     own: Fit,
     effect: Component,
     experiments: Sequence[Experiment],
+    goal: float = np.inf,
 ) -> Hypothesis | None:
     """Fit an effect beside the causes of `less`, where the `whole` has another one.
 
@@ -104,7 +116,7 @@ def in_place(
         values[effect.gain or ""],
         tuple({**s, **r} for s, r in zip(own.starts(), reached.starts(), strict=True)),
     )
-    return _exchanged(whole, less, effect, start, reached, experiments)
+    return _exchanged(whole, less, effect, start, reached, experiments, goal)
 
 
 def like(
@@ -112,6 +124,7 @@ def like(
     less: Hypothesis,
     copy: Copy,
     experiments: Sequence[Experiment],
+    goal: float = np.inf,
 ) -> Hypothesis | None:
     """Fit an effect that could copy a cause of the `whole`, from where that has led the base.
 
@@ -121,7 +134,7 @@ def like(
     effect, direction = copy.direction.effect, copy.direction
     usable = copy.gain > 0 or not direction.one_sided
     start = (direction.values, copy.gain if usable else direction.unit_gain, direction.memory)
-    return _exchanged(whole, less, effect, start, whole.fit, experiments)
+    return _exchanged(whole, less, effect, start, whole.fit, experiments, goal)
 
 
 def _exchanged(
@@ -131,23 +144,31 @@ def _exchanged(
     start: Start,
     reached: Fit,
     experiments: Sequence[Experiment],
+    goal: float,
 ) -> Hypothesis | None:
     """Fit an effect where the `whole` has the cause that `less` lacks, the rest as `reached`."""
     values = reached.model.values
     base = {n: values[n] for n in less.fit.unknowns.names if n in values}
     causes = tuple(effect if c not in less.causes else c for c in whole.causes)
-    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE)
+    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE, goal)
     return hypothesis(causes, quick, experiments)
 
 
 def without(
-    whole: Hypothesis, cause: Component, experiments: Sequence[Experiment]
+    whole: Hypothesis,
+    cause: Component,
+    experiments: Sequence[Experiment],
+    known: Hypothesis | None = None,
 ) -> Hypothesis | None:
-    """Fit without a cause from where the whole has led; None where that cannot be simulated."""
+    """Fit without a cause from where the whole has led; None where that cannot be simulated.
+
+    It ends early where it will leave more than what is `known` without the cause.
+    """
+    least = known.fit.rms if known is not None else np.inf
     model = whole.fit.model.without([cause.name])
     names = [n for n in whole.fit.unknowns.names if n in model.values]
     try:
-        found = refit(replace(whole.fit, model=model), experiments, names)
+        found = refit(replace(whole.fit, model=model), experiments, names, least=least)
     except PsaError:
         return None
     causes = [c for c in whole.causes if c is not cause]
@@ -200,18 +221,18 @@ def _from_ordinary(
 
 
 def _best_continued(
-    fits: Sequence[Fit], experiments: Sequence[Experiment], count: int
+    fits: Sequence[Fit], experiments: Sequence[Experiment], count: int, goal: float = np.inf
 ) -> Fit | None:
-    """Go on with the best so many fits; return the best then."""
+    """Go on with the best so many fits, unless they stay above the goal; return the best then."""
 
     def further(quick: Fit) -> Fit:
         try:
             rtol = quick_rtol(quick.sigma, experiments)
-            return continued(quick, experiments, rtol, 1e-3, _AFRESH)
+            return continued(quick, experiments, rtol, 1e-3, _AFRESH, goal)
         except PsaError:
             return quick
 
-    best = sorted(fits, key=lambda f: f.cost)[:count]
+    best = list({f.cost: f for f in sorted(fits, key=lambda f: f.cost)}.values())[:count]
     return min([*fits, *side_by_side(further, best)], key=lambda f: f.cost, default=None)
 
 

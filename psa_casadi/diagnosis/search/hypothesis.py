@@ -1,13 +1,14 @@
 """A hypothesis: a model with a set of causes, fitted; and the one score that all are compared by.
 
     score = ln B - price * causes
-    ln B  = n/2 ln(S_0 / S) - 1/2 ln det(1 + P H P)
+    ln B  = (n - k)/2 ln(S_0 / S) - 1/2 ln det(1 + P H P)
 
-Laplace's approximation of the Bayes factor over the plain base fit. S and S_0 are sums of squares
-of the whitened residuals, the noise level being the data's own; H is the information on the
-unknowns that the base has not, those it has projected out, and P their prior standard deviations.
-An unknown that the data do not tell costs nothing, a sharp one costs what its prior range is wider
-than its interval (MacKay, Neural Computation 4 (1992), 415). The price is the prior of a cause.
+Laplace's approximation of the Bayes factor over the plain base fit, of k unknowns. S and S_0 are
+sums of squares of n whitened residuals, the noise level being the data's own; H is the information
+on the unknowns that the base has not, those it has projected out, and P their prior standard
+deviations. An unknown that the data do not tell costs nothing, a sharp one costs what its prior
+range is wider than its interval (MacKay, Neural Computation 4 (1992), 415). The price is the prior
+of a cause.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.held_out.errors import held_out_rms, whole_residuals
+from psa_casadi.diagnosis.held_out.errors import held_out_further, held_out_rms, whole_residuals
 from psa_casadi.diagnosis.noise.colour import Colour, rms
 from psa_casadi.diagnosis.screening.evidence import evidence
 from psa_casadi.errors import PsaError
@@ -34,7 +35,8 @@ class Hypothesis:
 
     `causes` are in the order in which the search found them; `predicted` [m] are the predictions of
     whole records, `holdout_rms` and `whole_rms` [m] the errors in held-out and in all samples;
-    `final` says that the fit went on to its end.
+    `final` says that the fit went on to its end. `held_further` are the errors of the further
+    columns in held-out samples, in their units.
     """
 
     causes: tuple[Component, ...]
@@ -43,6 +45,7 @@ class Hypothesis:
     holdout_rms: float
     whole_rms: float
     final: bool = False
+    held_further: tuple[float, ...] = ()
 
     @property
     def names(self) -> frozenset[str]:
@@ -59,8 +62,16 @@ class Hypothesis:
         return self.fit.rms**2
 
     def removes(self, before: "Hypothesis") -> float:
-        """Power [m^2] that it takes from the residual of another one."""
-        return before.power - self.power
+        """Power [m^2] that it takes from the residual of another one.
+
+        What it takes from a further column counts over that column's level, as of the displacement.
+        """
+        level, count = rms(np.array(before.fit.sigma)), max(len(before.fit.residuals), 1)
+        beside = sum(
+            len(old.residuals) / count * (old.rms**2 - new.rms**2) * (level / old.level) ** 2
+            for old, new in zip(before.fit.further, self.fit.further, strict=True)
+        )
+        return before.power - self.power + beside
 
     def share(self, before: "Hypothesis", root: "Hypothesis") -> float:
         """What it takes from another one's error over whole records, over what that one takes."""
@@ -81,11 +92,12 @@ def hypothesis(
         return None
     try:
         predicted = tuple(fit.predicted(experiments))
+        beside = held_out_further(fit, experiments)
     except PsaError:
         return None
     held = held_out_rms(experiments, predicted)
     whole = rms(np.concatenate(whole_residuals(experiments, predicted)))
-    return Hypothesis(tuple(causes), fit, predicted, held, whole, final=final)
+    return Hypothesis(tuple(causes), fit, predicted, held, whole, final, beside)
 
 
 def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:

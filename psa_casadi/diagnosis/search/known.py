@@ -11,6 +11,7 @@ from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.search.fits import to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of
+from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import confirmed, in_character, shows_memory
 from psa_casadi.diagnosis.task import Task
@@ -158,6 +159,16 @@ class Known:
         gains = [self.scale.evidence(c) - own for c in children]
         least = min(SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
         return [c for c, gained in zip(children, gains, strict=True) if gained > least]
+
+    def near(self, h: Hypothesis, best: Hypothesis) -> float:
+        """Return the cost, as `h` is weighted, above which a fit does not come near another one.
+
+        Its evidence beside `h` would be below `SHARE` of that one's, and by `NEAR` nats.
+        """
+        count, reached = len(h.fit.residuals), cost_beside(best.fit, h.fit, self.task.experiments)
+        gained = 0.5 * count * float(np.log(h.fit.cost / reached))
+        least = min(SHARE * gained, gained - NEAR)
+        return h.fit.cost * float(np.exp(-2.0 * least / count))
 
     def remember(self, h: Hypothesis, *names: str) -> None:
         """Keep that these effects were fitted beside a hypothesis."""

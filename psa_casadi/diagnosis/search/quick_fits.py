@@ -7,6 +7,7 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
 from psa_casadi.identification.search.refitting import quick_rtol
 from psa_casadi.records.split import Experiment
 
@@ -24,18 +25,23 @@ def quick_fit(
     starts: Sequence[Start],
     reset: dict[str, float],
     evaluations: int = QUICK,
+    goal: float = np.inf,
 ) -> Fit | None:
     """A few iterations from every start; the best of them.
 
-    Where none comes below the fit without the effect, some more from there, with the gain at 0: the
-    loop may be such that no other start of the gain fits to it.
+    A start ends early where its cost will stay above the `goal`, that of the fit without the effect
+    or that of another start. Where none comes below that without the effect, some more from there,
+    with the gain at 0: the loop may be such that no other start of the gain fits to it.
     """
-    fits = [fit_from(before, experiments, effect, start, reset, evaluations) for start in starts]
-    found = [f for f in fits if f is not None]
+    found: list[Fit] = []
+    for start in starts:
+        least = min([goal, before.cost, *(f.cost for f in found)])
+        own = fit_from(before, experiments, effect, start, reset, evaluations, least)
+        found += [own] if own is not None else []
     if not any(f.cost < before.cost for f in found):
         states = tuple(before.starts())
         nested = (starts[0][0], 0.0, states)
-        last = fit_from(before, experiments, effect, nested, {}, 3 * QUICK)
+        last = fit_from(before, experiments, effect, nested, {}, 3 * QUICK, goal)
         found += [last] if last is not None else []
     return min(found, key=lambda f: f.cost) if found else None
 
@@ -47,11 +53,12 @@ def fit_from(
     start: Start,
     reset: dict[str, float],
     evaluations: int,
+    goal: float = np.inf,
 ) -> Fit | None:
     """Fit with one more effect from a start, the other values `reset`; None if that fails."""
     values, gain, memory = start
     added = [(effect, values, gain)]
-    return fit_with_all(before, experiments, added, memory, reset, evaluations)
+    return fit_with_all(before, experiments, added, memory, reset, evaluations, goal)
 
 
 def fit_with_all(
@@ -61,10 +68,12 @@ def fit_with_all(
     memory: tuple[dict[str, float], ...],
     reset: dict[str, float],
     evaluations: int,
+    goal: float = np.inf,
 ) -> Fit | None:
     """Fit with more effects, each from its values and its gain; None if that fails.
 
-    A series of modes that is there already stays as it is until the last evaluations.
+    A series of modes that is there already stays as it is until the last evaluations. A fit whose
+    cost will stay above the `goal` ends early.
     """
     held = series_parameters(before)
     names = [n for n in before.unknowns.names if n not in held]
@@ -87,6 +96,7 @@ def fit_with_all(
                 evaluations=evaluations,
                 tolerance=1e-3,
                 rtol=rtol,
+                goal=np.inf if held else goal,
             )
             return continued(found, experiments, rtol, 1e-3, _FREED) if held else found
         except PsaError:
@@ -105,8 +115,12 @@ def continued(
     rtol: float,
     tolerance: float,
     evaluations: int,
+    goal: float = np.inf,
 ) -> Fit:
-    """Go on with a fit from where it stopped, with all that is free. Raises PsaError."""
+    """Go on with a fit from where it stopped, with all that is free. Raises PsaError.
+
+    It ends early where its cost will stay above the `goal`.
+    """
     names = current.unknowns.names
     return fit(
         current.model,
@@ -117,4 +131,16 @@ def continued(
         evaluations=evaluations,
         tolerance=tolerance,
         rtol=rtol,
+        goal=goal,
+        radius=float(np.clip(current.radius, LEAST_RADIUS, FIRST_RADIUS)),
     )
+
+
+def cost_beside(other: Fit, of: Fit, experiments: Sequence[Experiment]) -> float:
+    """Return the sum of squares that another fit leaves, weighted by the noise levels of a fit.
+
+    Of the displacement and of further columns.
+    """
+    parts = [*zip(other.residuals_of(experiments), of.sigma, strict=True)]
+    parts += [(f.residuals, g.level) for f, g in zip(other.further, of.further, strict=True)]
+    return sum(float(np.sum((part / level) ** 2)) for part, level in parts)

@@ -3,6 +3,7 @@
 from psa_casadi.diagnosis.screening.sets import best_sets
 from psa_casadi.diagnosis.search.fits import with_causes
 from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -29,5 +30,6 @@ def fit_sets(known: Known, task: Task) -> None:
     starts = [s for s in ranked if s.names not in known.found][:_SETS]
     said = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes at once: fitting {said}")
-    for found in side_by_side(lambda s: with_causes(root, task.experiments, s), starts):
+    goal = cost_beside(known.best().fit, root.fit, task.experiments)
+    for found in side_by_side(lambda s: with_causes(root, task.experiments, s, goal), starts):
         known.note(found)

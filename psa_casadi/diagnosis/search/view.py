@@ -1,12 +1,12 @@
 """What a fitted hypothesis still shows: the screening of further effects, the residual's test."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.colour import noise_rms, residual_colour
+from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, residual_colour
 from psa_casadi.diagnosis.noise.floor import knowable_of, known_colour
 from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
 from psa_casadi.diagnosis.screening.evidence import estimated
@@ -14,7 +14,10 @@ from psa_casadi.diagnosis.screening.probes import Direction, directions
 from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.task import Task
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.further import with_column
+from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
 
 #: An effect whose screening score is below this share of the best one is not fitted; so many of
@@ -119,7 +122,30 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
         knowable=knowable_of(fit, experiments),
         even=bool(of.causes),
     )
+    test = _with_further(test, fit, experiments, screening.colour, even=bool(of.causes))
     return View(of, tuple(kept), screening, test)
+
+
+def _with_further(
+    test: Omnibus, fit: Fit, experiments: Sequence[Experiment], colour: Colour, *, even: bool
+) -> Omnibus:
+    """Return the test of the residual, or that of a further column where only this one alarms."""
+    for f, own in zip(fit.further, colour.further, strict=True):
+        if test.alarm:
+            break
+        parts = [experiments[k] for k in with_column(experiments, f.column)]
+        voltage, time = (
+            np.concatenate([getattr(e.record, name)[e.used] for e in parts])
+            for name in ("voltage", "time")
+        )
+        noise = noise_rms(f.residuals, own)
+        found = omnibus(f.residuals, voltage, time, own, noise, knowable=f.straight, even=even)
+        p = min(1.0, found.p_value * (1 + len(fit.further)))
+        if found.alarm and p < thresholds().alarm:
+            where = f"Of {f.column}: {found.where[:1].lower()}{found.where[1:]}"
+            size = max(test.size, 2.0 * test.knowable)
+            test = replace(test, p_value=p, excess=found.excess, where=where, size=size)
+    return test
 
 
 def _form(score: Score) -> dict[str, float]:

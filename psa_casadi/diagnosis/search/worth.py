@@ -44,6 +44,11 @@ def confirmed(
     samples = np.count_nonzero(held) / colour.inflation
     after = max(of.holdout_rms, 1e-300)
     gained = samples * float(np.log(max(before.holdout_rms, 1e-300) / after))
+    beside = zip(of.fit.further, colour.further, before.held_further, of.held_further, strict=True)
+    for f, own, old, new in beside:
+        count = np.count_nonzero(held) / own.inflation
+        ratio = np.hypot(old, f.straight) / max(float(np.hypot(new, f.straight)), 1e-300)
+        gained += count * float(np.log(ratio))
     if not alarm:
         return bool(gained > thresholds().held_out)
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2

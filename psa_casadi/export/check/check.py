@@ -2,17 +2,19 @@
 
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fmpy.validation import validate_fmu
 
 from psa_casadi.component import Component
+from psa_casadi.components.validity import OUTPUT as VALIDITY
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import (
     inconsistent_units,
+    misplaced_binaries,
     missing_functions,
     missing_notices,
     needless_symbols,
@@ -20,6 +22,7 @@ from psa_casadi.export.check.description import (
     published_as,
     undefined_units,
 )
+from psa_casadi.export.check.evidence import Repeated, repeated, wrong_evidence
 from psa_casadi.export.check.origin import (
     not_compared,
     unreproducible_parts,
@@ -29,12 +32,15 @@ from psa_casadi.export.check.origin import (
 from psa_casadi.export.check.process import started
 from psa_casadi.export.check.rows import CheckRow, count
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
-from psa_casadi.export.check.termination import cleaned_up
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
+from psa_casadi.export.fmu.fixed import fixed_step_of
+from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
+from psa_casadi.records.record import Record
+from psa_casadi.scratch import requests_to_end_answered
 from psa_casadi.strict_json import read_json_text
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
@@ -66,6 +72,8 @@ def check_fmu(
     *,
     timeout: float = TIMEOUT,
     memory: int = MEMORY,
+    evidence: bool = False,
+    records: Sequence[Record] = (),
 ) -> CheckReport:
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
@@ -74,26 +82,41 @@ def check_fmu(
     are left out if the FMU leaves them out. A check that breaks down is a row that did not pass;
     the others still run, except those that need an instance if there is none.
 
+    With `evidence` the run of the model's evidence is played again, and so are those of `records`
+    that stand behind it: is the error what the model states?
+
     This runs the code of the FMU, in a process of its own: `timeout` [s] is what each check
     may take, `memory` [bytes] what it may take beside Python's own, on Linux. However it ends,
     its rows are kept, and the check that ran did not pass. It is no sandbox: files and network are
     open to the code. An archive that would leave its folder, has links, is damaged or a bomb is not
     unpacked, and nothing of it runs.
 
-    Raises InputError if the file is no FMU.
+    Raises InputError if the file is no FMU, or one with a fixed step.
     """
     path = Path(path)
     rows = _archive_rows(path)
     if not all(row.passed for row in rows):
         return CheckReport(path, tuple(rows), compared=False)
     chosen: list[Model] = [model] if model else []
-    with cleaned_up(), Archive(path) as archive:
+    with requests_to_end_answered(), Archive(path) as archive:
+        step = fixed_step_of(archive.directory)
+        if step is not None:
+            raise InputError(
+                f"{path}: this FMU takes fixed steps of {step:g} s; `psa check` knows FMUs with the"
+                " adaptive solver only. Its error was measured at export, and its description tells"
+                " it."
+            )
         carried = (archive.directory / MODEL_ENTRY).is_file()
         with started(_INTEGRATOR if model or carried else ()) as process:
             rows += _described(archive, chosen, tuple(effects))
             truth = truth_of(chosen[0], archive.version) if chosen else None
+            again = Repeated((), ())
+            if evidence or records:
+                again = repeated(archive, chosen[0] if chosen else None, records)
+            rows += again.rows
             key, limits = secrets.token_bytes(32), Limits(timeout, memory)
-            rows += process.rows(Task(path, archive.directory, truth, key, limits))
+            task = Task(path, archive.directory, truth, key, limits, again.playbacks)
+            rows += process.rows(task)
     compared = any(row.name == "equations" for row in rows)
     return CheckReport(path, tuple(rows), compared=compared)
 
@@ -131,6 +154,8 @@ def _described(
         chosen[:] = [_as_exported(archive, chosen[0])]
         for name, compared in _ORIGIN.items():
             yield count(name, compared, archive, chosen[0])
+        if chosen[0].evidence is not None:
+            yield count("evidence inside", wrong_evidence, archive, chosen[0])
         yield _reproducible(archive, chosen[0])
 
 
@@ -158,9 +183,15 @@ def _read_model(
 
 
 def _as_exported(archive: Archive, model: Model) -> Model:
-    """Return the model as the exporter took it: whole, or without sensor and environment."""
+    """Return the model as the exporter took it: whole, or without sensor and environment.
+
+    And with the output that tells how far a run is outside of what the records have shown.
+    """
     whole = set(model.output_names) <= set(archive.names("output"))
-    return published_as(archive, model if whole else model.plant())
+    exported = model if whole else model.plant()
+    if VALIDITY in archive.names("output") and exported.evidence is not None:
+        exported = with_validity(exported)
+    return published_as(archive, exported)
 
 
 #: What the runs of a model need, imported ahead.
@@ -171,6 +202,7 @@ _DESCRIBED: dict[str, Callable[[Archive], Iterable[str]]] = {
     "functions present": missing_functions,
     "no other symbols": needless_symbols,
     "GNU libc 2.17": new_libraries,
+    "binaries in their folders": misplaced_binaries,
     "licence inside": missing_notices,
 }
 _ORIGIN: dict[str, Callable[[Archive, Model], Iterable[str]]] = {

@@ -5,14 +5,13 @@ It reads a task from stdin and writes records to what was its stdout; what the f
 goes to stderr. Its memory and time are limited, and it ends when the process that started it does.
 """
 
-import ctypes
 import faulthandler
 import importlib
 import os
 import pickle
-import signal
 import sys
 
+from psa_casadi.children import end_with_parent
 from psa_casadi.export.check.measured import measured
 from psa_casadi.export.check.memory import limit_data
 from psa_casadi.export.check.records import Writer
@@ -20,15 +19,13 @@ from psa_casadi.export.check.task import Task
 
 #: How much longer than the limit of a check it lives [s] if nobody ends it.
 _GRACE = 30.0
-_PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
     """Run the checks of one task."""
     records = os.dup(1)
     os.dup2(2, 1)
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    end_with_parent()
     for name in sys.argv[1:]:
         importlib.import_module(name)
     task: Task = pickle.load(sys.stdin.buffer)
@@ -38,7 +35,7 @@ def main() -> None:
     limit_data(task.limits.memory)
     writer = Writer(records, task.key)
     try:
-        for record in measured(task.path, task.unpacked, task.truth):
+        for record in measured(task):
             faulthandler.dump_traceback_later(task.limits.timeout + _GRACE, exit=True)
             writer.write(record)
     except MemoryError:

@@ -13,8 +13,9 @@ from psa_casadi.export.common.publication import (
     copyright_line,
     terms_of_code,
 )
+from psa_casadi.export.fmu.platforms import PLATFORMS
 from psa_casadi.export.importer.archive import FUNCTIONS, Archive
-from psa_casadi.export.importer.binary_file import read_binary
+from psa_casadi.export.importer.binary_file import Binary, read_binary
 from psa_casadi.export.importer.calls import MODEL_EXCHANGE
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.model.compose import Model
@@ -22,8 +23,9 @@ from psa_casadi.simulation.compiler import INSTALL_ZIG
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Publication
 
-#: The newest version of the GNU C library that a binary may need.
+#: The newest version of the GNU C library that a binary may need: of 2012, or the platform's first.
 _NEWEST_LIBC = (2, 17)
+_FIRST_LIBC = {"riscv64-linux": (2, 27)}
 _BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
@@ -93,28 +95,37 @@ def wrong_nominals(fmu: Fmu) -> Iterator[str]:
 
 def missing_functions(archive: Archive) -> Iterator[str]:
     """Every function of the standard is in every binary, as importers look them all up."""
-    for place, _, exports in _exports(archive):
-        for name in _functions(archive) - exports:
+    for place, binary in _binaries(archive):
+        for name in _functions(archive) - binary.exports:
             yield f"{name} is missing in {place}"
 
 
 def needless_symbols(archive: Archive) -> Iterator[str]:
     """Nothing but the functions of the standard is exported: two FMUs in a process stay apart."""
-    for place, _, exports in _exports(archive):
-        for name in exports - _functions(archive):
+    for place, binary in _binaries(archive):
+        for name in binary.exports - _functions(archive):
             yield f"{name} is exported by {place}"
 
 
 def new_libraries(archive: Archive) -> Iterator[str]:
-    """No Linux binary needs a GNU C library newer than 2.17 (of 2012)."""
-    for place, needs, _ in _exports(archive):
-        for need in sorted(n for n in needs if n.startswith("GLIBC_")):
+    """No Linux binary needs a GNU C library newer than 2.17 (of 2012), or 2.27 on RISC-V."""
+    for place, binary in _binaries(archive):
+        newest = _FIRST_LIBC.get(binary.platform, _NEWEST_LIBC)
+        for need in sorted(n for n in binary.needs if n.startswith("GLIBC_")):
             version = need.removeprefix("GLIBC_").split(".")
-            if not all(p.isdigit() for p in version) or tuple(map(int, version)) > _NEWEST_LIBC:
+            if not all(p.isdigit() for p in version) or tuple(map(int, version)) > newest:
                 yield (
                     f"{place} needs {need}, which older systems lack; for one that loads on them"
                     f" run `{INSTALL_ZIG}` and export it again"
                 )
+
+
+def misplaced_binaries(archive: Archive) -> Iterator[str]:
+    """Every binary is for the platform of its folder; importers load it by the folder alone."""
+    for place, binary in _binaries(archive):
+        known = PLATFORMS.get(binary.platform)
+        if (known.binaries(archive.version) if known else binary.platform) != place:
+            yield f"{place} holds a binary for {binary.platform}, which does not load there"
 
 
 def missing_notices(archive: Archive) -> Iterator[str]:
@@ -149,12 +160,11 @@ def _functions(archive: Archive) -> frozenset[str]:
     return frozenset(archive.prefix + name for name in FUNCTIONS[archive.version])
 
 
-def _exports(archive: Archive) -> Iterator[tuple[str, frozenset[str], frozenset[str]]]:
-    """Yield folder, needs and exports of every binary; an archive without any is an error."""
+def _binaries(archive: Archive) -> Iterator[tuple[str, Binary]]:
+    """Yield folder and binary, one after the other; an archive without any is an error."""
     count = 0
     for path in archive.binaries():
-        found = read_binary(path)
-        yield path.parent.name, found.needs, found.exports
+        yield path.parent.name, read_binary(path)
         count += 1
     if not count:
         raise InputError("The FMU has no binary; export it with --platforms host or all.")

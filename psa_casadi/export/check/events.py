@@ -23,7 +23,7 @@ _SAME = 1e-7
 _LEAVE = 0.3
 _POINTS = 4
 #: Inputs at which an indicator is looked at, in nominal values.
-_SIZES = (1.0, -1.0, 10.0, -10.0, 100.0, -100.0)
+_SIZES = (0.1, -0.1, 1.0, -1.0, 10.0, -10.0, 100.0, -100.0)
 #: Of indicators, as shares of the largest value of the switch: error, and margin.
 _EXACT, _MARGIN = 1e-9, 1e-2
 
@@ -31,10 +31,10 @@ _EXACT, _MARGIN = 1e-9, 1e-2
 def event_indicators(fmu: Fmu) -> Iterator[str]:
     """As many as announced, equal to their variables, alive, and turned round by an event.
 
-    One that follows an input at rest has both signs as the inputs go either way, up to many times
-    their nominals. One that follows states, held values, parameters or time need not have both
-    within reach; it must move with one of them. After an event none is negative, for an importer
-    then waits for the next change of sign.
+    One that follows an input at rest has both signs as the inputs go either way, from a tenth to
+    many times their nominals. One that follows states, held values, parameters or time need not
+    have both within reach; it must move with one of them. After an event none is negative, for an
+    importer then waits for the next change of sign.
     """
     names, count = fmu.indicators(), fmu.indicator_count()
     if count != len(names):

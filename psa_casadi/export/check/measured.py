@@ -13,6 +13,8 @@ from psa_casadi.export.check.events import (
     intermediate_update,
     wrong_indicators,
 )
+from psa_casadi.export.check.input_line import input_line_error
+from psa_casadi.export.check.playback import played_again
 from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, figure, stopped
 from psa_casadi.export.check.structure import (
     adjoint_error,
@@ -21,31 +23,34 @@ from psa_casadi.export.check.structure import (
     incomplete_dependencies,
     wrong_start,
 )
+from psa_casadi.export.check.task import Task
 from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 
 _DIRECTIONAL_LIMIT = 1e-5
 _ADJOINT_LIMIT = 1e-10
 _EQUATION_LIMIT = 1e-9
+_LINE_LIMIT = 0.05
 
 #: The name of a check that begins now, or the row of the one that began last.
 Progress = Iterator[str | CheckRow]
 
 
-def measured(path: Path, unpacked: Path, truth: Truth | None) -> Progress:
-    """Yield names and rows of the checks of an FMU that was unpacked; `path` is for messages.
+def measured(task: Task) -> Progress:
+    """Yield names and rows of the checks of an FMU that was unpacked.
 
     Without a model there is no truth, and nothing is compared with it.
     """
     loaded: list[Fmu] = []
     yield "binary loads"
-    yield count("binary loads", _load, path, unpacked, loaded)
+    yield count("binary loads", _load, task.path, task.unpacked, loaded)
     for fmu in loaded:
         with fmu:
-            yield from _of_instances(fmu, truth)
+            yield from _of_instances(fmu, task)
 
 
-def _of_instances(fmu: Fmu, truth: Truth | None) -> Progress:
+def _of_instances(fmu: Fmu, task: Task) -> Progress:
     made: list[CheckRow] = []
     for name, kind in _INTERFACES.items():
         yield name
@@ -61,8 +66,17 @@ def _of_instances(fmu: Fmu, truth: Truth | None) -> Progress:
     if fmu.version == 3:
         yield "adjoint derivatives"
         yield figure("adjoint derivatives", _ADJOINT_LIMIT, adjoint_error, fmu)
-    if truth:
-        yield from _of_model(fmu, truth)
+    if INPUT_LINE.name in fmu.references:
+        yield "line of the input"
+        yield figure("line of the input", _LINE_LIMIT, input_line_error, fmu)
+    if task.truth:
+        yield from _of_model(fmu, task.truth)
+    for playback in task.playbacks:
+        yield playback.name
+        try:
+            yield played_again(fmu, playback)
+        except BREAKDOWNS as error:
+            yield stopped(playback.name, f"the run stopped: {error}")
 
 
 def _of_model(fmu: Fmu, truth: Truth) -> Progress:

@@ -4,8 +4,6 @@ import os
 import pickle
 import queue
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -13,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import IO
 
+from psa_casadi.children import Child, close_pipes, kill_group, started_python
 from psa_casadi.errors import PsaError
 from psa_casadi.export.check.memory import nearly_full
 from psa_casadi.export.check.records import CLOSED, Reader, SpoiltError
@@ -20,6 +19,8 @@ from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.export.check.task import Task
 from psa_casadi.scratch import temporary_folder
 
+#: The module that runs there.
+_CHILD = "psa_casadi.export.check.child"
 #: The row that is there only if the process ends badly outside of any check.
 OUTSIDE = "process ends"
 #: How often its memory is looked at [s], and from which share of the limit it counts as reached.
@@ -35,7 +36,7 @@ _CHUNK, _MOST_BYTES, _KEPT = 1 << 16, 1 << 24, 2048
 class Process:
     """A process that waits for its task; `said` is the end of what it printed."""
 
-    process: subprocess.Popen[bytes]
+    process: Child
     said: bytes = b""
     _chunks: queue.Queue[bytes] = field(default_factory=queue.Queue)
     _threads: list[threading.Thread] = field(default_factory=list)
@@ -151,16 +152,13 @@ class Process:
         for thread in self._threads:  # a process that left the group may hold a pipe open
             thread.join(_LAST_WORDS)
         if not any(thread.is_alive() for thread in self._threads):
-            for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-                with suppress(OSError):
-                    _pipe(pipe).close()
+            close_pipes(self.process)
 
     def _end_group(self) -> None:
         """End what the process started, once: its number may be another's afterwards."""
-        if sys.platform != "win32" and not self._group_ended:
+        if not self._group_ended:
             self._group_ended = True
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.process.pid, signal.SIGKILL)
+            kill_group(self.process)
 
 
 @contextmanager
@@ -169,28 +167,16 @@ def started(modules: Iterable[str] = ()) -> Iterator[Process]:
 
     It starts, and imports `modules` of use, while the caller goes on. It works in a folder of its
     own, for what an FMU writes.
-    Raises PsaError if it cannot be started.
+    Raises MachineError if it cannot be started.
     """
     with temporary_folder() as folder:
-        paths = os.pathsep.join(os.path.abspath(p) for p in sys.path)
         temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
-        command = [sys.executable, "-P", "-m", "psa_casadi.export.check.child", *modules]
-        try:
-            process = subprocess.Popen(
-                command, cwd=folder, env={**os.environ, "PYTHONPATH": paths, **temporary},
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                bufsize=0, start_new_session=True,
-            )  # fmt: skip
-        except OSError as error:
-            raise PsaError(
-                f"A second Python for the code of the FMU cannot be started ({error}); see that"
-                f" {sys.executable or 'the interpreter'} can be run."
-            ) from error
-        child = Process(process)
-        try:
-            yield child
-        finally:
-            child.end()
+        with started_python(_CHILD, *modules, directory=folder, **temporary) as own:
+            process = Process(own)
+            try:
+                yield process
+            finally:
+                process.end()
 
 
 def _pipe(stream: IO[bytes] | None) -> IO[bytes]:

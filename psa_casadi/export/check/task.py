@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from psa_casadi.export.check.playback import Playback
 from psa_casadi.export.check.truth import Truth
 
 #: What foreign code may take unless told otherwise [s], [bytes].
@@ -24,7 +25,7 @@ class Limits:
 class Task:
     """An FMU by its path (for messages) and the folder into which it was unpacked.
 
-    `key` signs the records; `truth` is what to compare with.
+    `key` signs the records; `truth` is what to compare with, `playbacks` are runs to repeat.
     """
 
     path: Path
@@ -32,3 +33,4 @@ class Task:
     truth: Truth | None
     key: bytes
     limits: Limits
+    playbacks: tuple[Playback, ...] = ()

@@ -8,16 +8,32 @@ from pathlib import Path
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
+from psa_casadi.export.common.posterior import SAMPLES
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
+from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
 from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.fmu.evidence_files import META_DATA, PAGE, EvidenceFiles, evidence_files
+from psa_casadi.export.fmu.fixed import (
+    FIXED_ENTRY,
+    fixed_description,
+    fixed_entry,
+    fixed_sources,
+    use_of,
+)
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
 from psa_casadi.export.fmu.reference_results import reference_entries
-from psa_casadi.export.fmu.sources import compiled_files, export_token, source_files
+from psa_casadi.export.fmu.sources import (
+    compiled_files,
+    export_token,
+    source_files,
+    token_of,
+)
 from psa_casadi.export.fmu.terminals import terminal_entries
+from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, foreign_components
@@ -38,6 +54,9 @@ def export_fmu(
     include_sensor: bool = False,
     platforms: Sequence[str] = ("host",),
     fmi: int = 2,
+    parameter_sets: int = SAMPLES,
+    validity_output: bool = False,
+    step: float | None = None,
 ) -> Path:
     """Write a model as an FMU (co-simulation and model exchange) and return its path.
 
@@ -46,8 +65,17 @@ def export_fmu(
     model's name. `platforms` are names of `PLATFORMS`, "host" or "all". The same model gives the
     same bytes. The file is written whole or not at all.
 
-    Raises InputError for an impossible name, an unknown platform or version, or a model without
-    states, and MachineError if a compiler fails.
+    A model with evidence (identified or diagnosed) takes it along: a page, meta data, a run to
+    repeat, and `parameter_sets` random sets of its parameters within their uncertainty, beside
+    their mean and sigma points (0: none of them). `validity_output` adds the output
+    `outside_validity`, which tells how far a run has left what the records have shown.
+
+    With a `step` [s] the FMU is for co-simulation only and takes steps of this fixed length and of
+    constant cost, as `export_c` writes them: communication steps are multiples of it and parameters
+    are constants. The description tells the error that was measured.
+
+    Raises InputError for an impossible name, an unknown platform or version, a model without
+    states, or one that does not fit a fixed step, and MachineError if a compiler fails.
     """
     identifier = name or model.name
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
@@ -58,10 +86,24 @@ def export_fmu(
         raise InputError(f"FMI {fmi} is not known; choose 2 (FMI 2.0) or 3 (FMI 3.0).")
     targets = chosen_platforms(platforms)
     exported = model if include_sensor else model.plant()
-    token = export_token(exported, identifier, fmi)
-    texts = source_files(exported, identifier, token, fmi)
-    xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
-    entries = {"modelDescription.xml": xml.encode("utf-8"), **_companions(exported, fmi)}
+    if validity_output:
+        exported = with_validity(exported)
+    fixed = None
+    if step is None:
+        token = export_token(exported, identifier, fmi)
+        texts = source_files(exported, identifier, token, fmi)
+        xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+    else:
+        fixed = fixed_step(exported, name=identifier, step=step)
+        bare = fixed_sources(source_files(exported, identifier, "", fmi), fixed)
+        token = token_of(exported, identifier, bare, fmi)
+        texts = fixed_sources(source_files(exported, identifier, token, fmi), fixed)
+        ordinary = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
+        xml = fixed_description(ordinary, fixed)
+    entries = {
+        "modelDescription.xml": xml.encode("utf-8"),
+        **_companions(exported, fmi, parameter_sets, fixed),
+    }
     entries |= {f"sources/{n}": t.encode("utf-8") for n, t in texts.items()}
     for target in targets:
         folder = target.binaries(fmi)
@@ -73,16 +115,25 @@ def export_fmu(
     return Path(path)
 
 
-def _companions(model: Model, fmi: int) -> dict[str, bytes]:
+def _companions(model: Model, fmi: int, samples: int, fixed: FixedStep | None) -> dict[str, bytes]:
     """Return what is beside description, sources and binaries: for people and for other tools.
 
-    A model that cannot be simulated with its own values is exported without a reference run.
+    A model that cannot be simulated with its own values is exported without a reference run, and so
+    is one with a fixed step, which takes neither the run's parameters nor any step of its rows.
     """
+    evidence = EvidenceFiles()
     try:
-        entries, step = reference_entries(model), held_step(model)
+        evidence = evidence_files(model, samples)
+        entries, step = reference_entries(model, evidence.related), held_step(model)
     except SimulationError:
         entries, step = {}, None
-    page = documentation(model, reference_run=bool(entries), step=step)
+    if fixed is not None:
+        entries = {FIXED_ENTRY: fixed_entry(fixed)}
+        page = documentation(model, reference_run=False, step=step, use=use_of(fixed))
+    else:
+        more = {n: evidence.related[n].meaning for n in (PAGE, META_DATA) if n in evidence.related}
+        page = documentation(model, reference_run=bool(entries), step=step, more=more)
+        entries |= evidence.entries
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
     entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])

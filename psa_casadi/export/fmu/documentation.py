@@ -3,11 +3,11 @@
 import html
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from psa_casadi.characters import check_text
+from psa_casadi.export.common.html_page import page, table_of
 from psa_casadi.export.common.icon import ICONS, drawing_of, svg
 from psa_casadi.export.common.markup import force_scale, generation_tool, time_scale, what_it_is
 from psa_casadi.export.common.publication import LICENSE_ENTRY
@@ -19,18 +19,6 @@ from psa_casadi.model.stacks import STACKS, Figure
 from psa_casadi.units import convert
 
 ENTRY = "documentation/index.html"
-
-_STYLE = """\
-:root { color-scheme: light dark; }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-h1 svg { width: 3rem; height: 3rem; vertical-align: middle; margin-right: .6rem; }
-table { border-collapse: collapse; display: block; overflow-x: auto; }
-th, td { text-align: left; vertical-align: top; padding: .25rem .8rem .25rem 0; }
-tr { border-bottom: 1px solid #8884; }
-td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-code { font-size: .95em; }
-p.note { border-left: .25rem solid #e69f00; padding-left: .8rem; }
-"""
 
 _USE = """\
 Co-simulation integrates with an error-controlled, L-stable method to the tolerance that the
@@ -83,11 +71,20 @@ common: enter event mode at a jump, or leave the option at 0. Between 0 and 1 th
 slope counts. Model exchange knows no steps and ignores the option."""
 
 
-def documentation(model: Model, *, reference_run: bool = True, step: HeldStep | None = None) -> str:
+def documentation(
+    model: Model,
+    *,
+    reference_run: bool = True,
+    step: HeldStep | None = None,
+    more: Mapping[str, str] | None = None,
+    use: str = _USE,
+) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
     `reference_run` says whether the archive holds one, with its notes; `step` is the communication
-    step that was measured on it. Raises InputError for a character that HTML cannot carry.
+    step that was measured on it. `more` are further files to name: what they are, by their place.
+    `use` tells how the FMU integrates.
+    Raises InputError for a character that HTML cannot carry.
     """
     table = variable_table(model)
     name = html.escape(model.name)
@@ -100,7 +97,7 @@ def documentation(model: Model, *, reference_run: bool = True, step: HeldStep | 
         *(f"<p>{html.escape(note)}</p>" for note in model.provenance.notes),
         _publication(model),
         "<h2>Use</h2>",
-        f"<p>{_USE}</p>",
+        f"<p>{html.escape(use)}</p>",
         f"<p>{_INPUTS}</p>" if model.input_names else "",
         _sampling(model, table),
         _step(step),
@@ -112,13 +109,10 @@ def documentation(model: Model, *, reference_run: bool = True, step: HeldStep | 
         "<h2>Parameters</h2>",
         _parameters(model, table),
         "<h2>Files</h2>",
-        _files(reference_run),
+        _files(reference_run, more or {}),
         f"<p>Written by {html.escape(generation_tool())}.</p>",
     ]
-    head = f'<meta charset="utf-8"><title>{name}</title><style>\n{_STYLE}</style>'
-    body = "\n".join(p for p in parts if p)
-    check_text(body, "The page on the model")
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
+    return page(model.name, parts, "The page on the model")
 
 
 def _publication(model: Model) -> str:
@@ -126,17 +120,6 @@ def _publication(model: Model) -> str:
     said = (f"{name}: {text}" for name, text in model.publication.stated.items())
     line = "; ".join(html.escape(text) for text in said)
     return f"<p>{line}</p>" if line else ""
-
-
-def _rows(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """Return a table of texts, escaped; columns of `numbers` are aligned to the right."""
-    top = "".join(f"<th>{html.escape(h)}</th>" for h in heads)
-    lines = [f"<tr>{top}</tr>"]
-    for row in rows:
-        openings = ['<td class="number">' if i in numbers else "<td>" for i in range(len(row))]
-        cells = [f"{o}{html.escape(c)}</td>" for o, c in zip(openings, row, strict=True)]
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    return "<table>\n" + "\n".join(lines) + "\n</table>"
 
 
 def _shown(value: float | None, variable: Variable, digits: int = 6) -> str:
@@ -208,16 +191,16 @@ def _interface(model: Model, table: Sequence[Variable]) -> list[str]:
         ]  # fmt: skip
         if rows:
             heads = ("name", "unit", "usual size", "at the start", "")
-            parts += [f"<h2>{title}</h2>", _rows(heads, rows, (2, 3))]
+            parts += [f"<h2>{title}</h2>", table_of(heads, rows, (2, 3))]
     indicators = [(v.name, v.description) for v in table if v.kind == "indicator"]
     if indicators:
-        parts += ["<h2>Event indicators</h2>", _rows(("name", ""), indicators)]
+        parts += ["<h2>Event indicators</h2>", table_of(("name", ""), indicators)]
     return parts
 
 
 def _equations(model: Model) -> str:
     rows = [(c.name, c.description, c.equation_text, c.source) for c in model.components]
-    return _rows(("component", "what it is", "equation", "source"), rows)
+    return table_of(("component", "what it is", "equation", "source"), rows)
 
 
 def _figures(model: Model) -> dict[str, Figure]:
@@ -243,10 +226,10 @@ def _parameters(model: Model, table: Sequence[Variable]) -> str:
     heads = ("name", "value", "95 % interval", "allowed", "meaning", "source of the value")
     kept = [i for i, _ in enumerate(heads) if i < 2 or any(r[i] for r in rows)]
     chosen = [[r[i] for i in kept] for r in rows]
-    return _rows([heads[i] for i in kept], chosen, (1,))
+    return table_of([heads[i] for i in kept], chosen, (1,))
 
 
-def _files(reference_run: bool) -> str:
+def _files(reference_run: bool, more: Mapping[str, str]) -> str:
     entries = [
         ("sources/README.txt", "how to compile the sources: one line, no other library"),
         (LICENSE_ENTRY, "the terms of the model, and the notices of the C code"),
@@ -256,6 +239,7 @@ def _files(reference_run: bool) -> str:
             (NOTES, "a run to try an importer on, with the outputs to expect"),
             (f"{FOLDER}/parameters.ssv", "the parameter values as a parameter set (SSP 1.0)"),
         ]
+    entries += more.items()
     items = (
         f'<li><a href="../{place}"><code>{place}</code></a>: {meaning}</li>'
         for place, meaning in entries

@@ -25,9 +25,13 @@ from psa_casadi.simulation.compiler import (
 class Platform:
     """A platform: target of the `ziglang` compiler, FMI folder, suffix and flags of the library.
 
-    `name` is FMI 3's platform tuple and its folder; `folder` is the one of FMI 2.
+    `name` is FMI 3's platform tuple and its folder; `folder` is the one of FMI 2, which has names
+    for x86 alone and takes the tuples of FMI 3 for the others (FMI 2.0.4, section 2.3).
     Old systems are asked for, so that the binary loads everywhere: GNU libc 2.17 (of 2012) on
-    Linux, and macOS 11 (of 2020), the first for both processors.
+    Linux, 2.27 on RISC-V, the first one there, and macOS 11 (of 2020), the first for both
+    processors. 32-bit ARM is what Debian's and Ubuntu's armhf run on: ARMv7 with 16 registers for
+    doubles, in which they are handed over. 32-bit x86 has SSE2, so that doubles are rounded as
+    everywhere else.
     """
 
     name: str
@@ -42,12 +46,16 @@ class Platform:
 
 
 _PIC = ("-fPIC", "-Wl,-s")
+_ARMHF = (*_PIC, "-mcpu=generic+v7a+vfp3d16-d32-neon")
 
 PLATFORMS: dict[str, Platform] = {
     p.name: p
     for p in (
         Platform("x86_64-linux", "x86_64-linux-gnu.2.17", "linux64", ".so", _PIC),
         Platform("aarch64-linux", "aarch64-linux-gnu.2.17", "aarch64-linux", ".so", _PIC),
+        Platform("riscv64-linux", "riscv64-linux-gnu.2.27", "riscv64-linux", ".so", _PIC),
+        Platform("aarch32-linux", "arm-linux-gnueabihf.2.17", "aarch32-linux", ".so", _ARMHF),
+        Platform("x86-linux", "x86-linux-gnu.2.17", "linux32", ".so", (*_PIC, "-mcpu=pentium4")),
         Platform("x86_64-windows", "x86_64-windows-gnu", "win64", ".dll", ("-Wl,-s",)),
         Platform("x86-windows", "x86-windows-gnu", "win32", ".dll", ("-Wl,-s",)),
         Platform("x86_64-darwin", "x86_64-macos.11.0", "darwin64", ".dylib", ("-fPIC",)),

@@ -7,7 +7,8 @@ the Modelica Association that it refers to.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -27,7 +28,7 @@ INPUTS, OUTPUTS, PARAMETERS, EXPERIMENTS = "in.csv", "ref.csv", "parameters.ssv"
 
 #: Relative tolerance that the experiment asks for, and the one the outputs were computed to.
 TOLERANCE = 1e-6
-_OWN_TOLERANCE = 1e-12
+OWN_TOLERANCE = 1e-12
 _NAMESPACE = "http://fmi-standard.org/fmi-ls-manifest"
 _SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
 _STEPS_PER_SEGMENT = 100
@@ -50,25 +51,35 @@ kinks.
 """
 
 
-def reference_entries(model: Model) -> dict[str, bytes]:
+@dataclass(frozen=True)
+class Related:
+    """What the manifest says of a file in the archive: MIME type, role and meaning."""
+
+    kind: str
+    role: str
+    meaning: str
+
+
+def reference_entries(model: Model, more: Mapping[str, Related] | None = None) -> dict[str, bytes]:
     """Return the files of the reference run by their place in the archive.
 
-    Raises SimulationError if the model cannot be simulated with its own values.
+    The manifest lists the files `more` too, which it does not make. Raises SimulationError if the
+    model cannot be simulated with its own values.
     """
     times, inputs = reference_inputs(model)
     start = np.array([s.start for s in model.structure.states])
-    outputs = _rounded(run(model, times, inputs, start, rtol=_OWN_TOLERANCE).y)
+    outputs = rounded(run(model, times, inputs, start, rtol=OWN_TOLERANCE).y)
     texts = {
-        INPUTS: _table(("time", *model.input_names), times, inputs),
-        OUTPUTS: _table(("time", *model.output_names), times, outputs),
+        INPUTS: csv_table(("time", *model.input_names), times, inputs),
+        OUTPUTS: csv_table(("time", *model.output_names), times, outputs),
         PARAMETERS: parameter_set(model),
-        EXPERIMENTS: _experiments(model, times),
+        EXPERIMENTS: experiments("smoke test", [_experiment(model, times)]),
     }
     notes = _NOTES.format(
         name=model.name, segment=_segment(model), stop=times[-1], step=times[1], inputs=INPUTS,
-        outputs=OUTPUTS, parameters=PARAMETERS, own=_OWN_TOLERANCE, digits=_DIGITS,
+        outputs=OUTPUTS, parameters=PARAMETERS, own=OWN_TOLERANCE, digits=_DIGITS,
     )  # fmt: skip
-    texts["fmi-ls-manifest.xml"] = _manifest()
+    texts["fmi-ls-manifest.xml"] = _manifest(more or {})
     entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
     return {**entries, NOTES: notes.encode("utf-8")}
 
@@ -92,10 +103,10 @@ def reference_inputs(model: Model) -> tuple[FloatArray, FloatArray]:
         shape = np.concatenate([[0.0], np.roll(_SHAPE[1:], 2 * i)])
         size = nominal_value(declared.nominal, model.values) * (0.1 if declared.start else 1.0)
         columns.append(declared.start + size * np.interp(places, range(len(_SHAPE)), shape))
-    return times, _rounded(np.array(columns).T.reshape(count + 1, -1))
+    return times, rounded(np.array(columns).T.reshape(count + 1, -1))
 
 
-def _rounded(columns: FloatArray) -> FloatArray:
+def rounded(columns: FloatArray) -> FloatArray:
     """Return columns (n, k) with `_DIGITS` digits of each one's largest value.
 
     Digits below that differ from machine to machine.
@@ -106,7 +117,7 @@ def _rounded(columns: FloatArray) -> FloatArray:
     return np.array(rows).reshape(columns.shape)
 
 
-def _table(names: Sequence[str], times: FloatArray, columns: FloatArray) -> str:
+def csv_table(names: Sequence[str], times: FloatArray, columns: FloatArray) -> str:
     """Return a CSV table with a header."""
     rows = [",".join(names)]
     for time, values in zip(times, columns, strict=True):
@@ -114,44 +125,70 @@ def _table(names: Sequence[str], times: FloatArray, columns: FloatArray) -> str:
     return "\n".join([*rows, ""])
 
 
-def _experiments(model: Model, times: FloatArray) -> str:
-    root = ET.Element("Experiments", {"name": "smoke test"})
-    attributes = {
-        "name": "segments",
-        "description": f"straight segments of every input of {model.name}",
-        "startTime": "0.0",
-        "stopTime": number(times[-1]),
-        "tolerance": number(TOLERANCE),
-        "stepSize": number(times[1]),
-    }
-    experiment = ET.SubElement(root, "Experiment", attributes)
-    for tag, source in (("Parameters", PARAMETERS), ("Stimuli", INPUTS), ("References", OUTPUTS)):
-        ET.SubElement(experiment, tag, {"source": source})
+@dataclass(frozen=True)
+class Experiment:
+    """One experiment: its name and meaning, its times (n,) [s], and files by what they are.
+
+    The files are those of "Parameters", "Stimuli" and "References", in this order.
+    """
+
+    name: str
+    description: str
+    times: FloatArray
+    files: Mapping[str, str]
+
+
+def _experiment(model: Model, times: FloatArray) -> Experiment:
+    files = {"Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS}
+    said = f"straight segments of every input of {model.name}"
+    return Experiment("segments", said, times, files)
+
+
+def experiments(name: str, listed: Iterable[Experiment]) -> str:
+    """Return a file of experiments."""
+    root = ET.Element("Experiments", {"name": name})
+    for e in listed:
+        attributes = {
+            "name": e.name,
+            "description": e.description,
+            "startTime": number(e.times[0]),
+            "stopTime": number(e.times[-1]),
+            "tolerance": number(TOLERANCE),
+            "stepSize": number(e.times[1] - e.times[0]),
+        }
+        experiment = ET.SubElement(root, "Experiment", attributes)
+        for tag, source in e.files.items():
+            ET.SubElement(experiment, tag, {"source": source})
     return xml_text(root)
 
 
-#: MIME type, role and meaning of each file of the run.
+#: MIME types of the files.
+CSV, SSV, EXP = "text/csv", "application/x-ssp-parameter-set", "application/x-ma-hs-experiments"
+
+#: What the manifest says of each file of the run.
 _RELATED = {
-    PARAMETERS: ("application/x-ssp-parameter-set", "parameter", "values of all parameters"),
-    EXPERIMENTS: (
-        "application/x-ma-hs-experiments",
-        "experiment/smoke-test",
-        "a run over straight segments of every input",
+    f"{FOLDER}/{PARAMETERS}": Related(SSV, "parameter", "values of all parameters"),
+    f"{FOLDER}/{EXPERIMENTS}": Related(
+        EXP, "experiment/smoke-test", "a run over straight segments of every input"
     ),
-    INPUTS: ("text/csv", "other", "inputs of the smoke test"),
-    OUTPUTS: ("text/csv", "result", "outputs of the smoke test"),
-    f"../../{NOTES}": ("text/plain", "document", "how the smoke test is meant"),
+    f"{FOLDER}/{INPUTS}": Related(CSV, "other", "inputs of the smoke test"),
+    f"{FOLDER}/{OUTPUTS}": Related(CSV, "result", "outputs of the smoke test"),
+    NOTES: Related("text/plain", "document", "how the smoke test is meant"),
 }
 
 
-def _manifest() -> str:
+def _manifest(more: Mapping[str, Related]) -> str:
     """Return fmi-ls-manifest.xml, which lists the files: their kind, role and meaning."""
     ET.register_namespace("fmi-ls", _NAMESPACE)
     said = "Layered Standard providing information on related files included in an FMU."
     name = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-beta.1", "description": said}
     attributes = {f"{{{_NAMESPACE}}}fmi-ls-{key}": value for key, value in name.items()}
     root = ET.Element("fmiReferences", attributes)
-    for source, (kind, role, meaning) in _RELATED.items():
-        attributes = {"type": kind, "source": source, "role": role, "description": meaning}
+    for place, file in {**_RELATED, **more}.items():
+        inside = place.startswith(f"{FOLDER}/")
+        source = place.removeprefix(f"{FOLDER}/") if inside else f"../../{place}"
+        attributes = {
+            "type": file.kind, "source": source, "role": file.role, "description": file.meaning,
+        }  # fmt: skip
         ET.SubElement(root, "Related", attributes)
     return xml_text(root)

@@ -18,6 +18,7 @@ from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
 from psa_casadi.export.common.variable_table import Variable, variable_table
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
+from psa_casadi.export.fmu.validity import seen_duration, seen_inputs
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import c_arguments, c_slopes, generate_c
@@ -27,7 +28,7 @@ from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
 LOGIC = (
     "derivatives.c", "instance.c", "instants.c", "linear.c", "log.c", "model_adjoint.c",
     "model_casadi.c", "model_directional.c", "sampling.c", "snapshot.c", "snapshot_fault.c",
-    "solver.c", "step_derivatives.c", "values.c",
+    "solver.c", "step_derivatives.c", "validity.c", "values.c",
     "fmi_data.h", "instance.h", "instants.h", "linear.h", "model.h", "solver.h",
 )  # fmt: skip
 #: The files of `fmu_src` that speak one version of FMI.
@@ -221,9 +222,20 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         _vector("psa_start_parameters", "PSA_HELD", held),
         _vector("psa_state_nominals", "PSA_NX", nominals or [1.0]),
         _vector("psa_switch_scales", "PSA_NZ", scales),
+        *_seen(model),
         "",
     ]
     return "\n".join(lines)
+
+
+def _seen(model: Model) -> list[str]:
+    """Return what the records behind the model have shown, for its log."""
+    rows = [", ".join(_number(v) for v in row) for row in [*seen_inputs(model), (0.0, 0.0, 0.0)]]
+    body = ", ".join(f"{{{row}}}" for row in rows)
+    return [
+        f"const psa_range psa_seen[PSA_NU + 1] = {{{body}}};",
+        f"const double psa_seen_duration = {_number(seen_duration(model))};",
+    ]
 
 
 def _build_description(identifier: str, names: Sequence[str]) -> str:

@@ -117,14 +117,14 @@ def _fast(rate: float, low: float, high: float) -> Iterator[Plan]:
     voltage = np.full(time.shape, low)
     voltage[STEP_SAMPLES // 100 : STEP_SAMPLES // 2] = high
     words = f"a step from {between} and back {sampled(STEP_SAMPLES / rate)}"
-    yield Plan("step", words, Record("step", time, voltage), rate)
+    yield Plan("step", words, Record(name="step", time=time, voltage=voltage), rate)
     length = MULTISINE_SAMPLES / rate
     time = time_grid(length, 1.0 / rate)
     tones = multisine(time, low, high, (2.0 / length, _BAND * rate), seed=1)
     voltage = low + (tones - low) * np.minimum(10.0 * time / length, 1.0)
     band = quantity(_BAND * rate, "Hz")
     words = f"a multisine from {between} up to {band} {sampled(length)}"
-    yield Plan("multisine", words, Record("multisine", time, voltage), rate)
+    yield Plan("multisine", words, Record(name="multisine", time=time, voltage=voltage), rate)
 
 
 def _loops(frequency: float, settling: float, low: float, high: float) -> Iterator[Plan]:
@@ -139,14 +139,24 @@ def _loops(frequency: float, settling: float, low: float, high: float) -> Iterat
             f"two loops (a sine) from {quantity(low, 'V')} to {quantity(top, 'V')} at"
             f" {quantity(f, 'Hz')}"
         )
-        yield Plan("loop", words, Record("loop", time, sine(time, low, top, f)), LOOP_SAMPLES * f)
+        yield Plan(
+            "loop",
+            words,
+            Record(name="loop", time=time, voltage=sine(time, low, top, f)),
+            LOOP_SAMPLES * f,
+        )
     time = time_grid(_CYCLES / frequency, 1.0 / (LOOP_SAMPLES * frequency))
     voltage = decaying_triangle(time, low, high, _CYCLES)
     words = (
         f"nested minor loops (a triangle of {_CYCLES} cycles from {quantity(low, 'V')} to"
         f" {quantity(high, 'V')} that closes in on the middle) at {quantity(frequency, 'Hz')}"
     )
-    yield Plan("minor loops", words, Record("loops", time, voltage), LOOP_SAMPLES * frequency)
+    yield Plan(
+        "minor loops",
+        words,
+        Record(name="loops", time=time, voltage=voltage),
+        LOOP_SAMPLES * frequency,
+    )
 
 
 def _hold(length: float, low: float, high: float) -> Plan:
@@ -157,4 +167,6 @@ def _hold(length: float, low: float, high: float) -> Plan:
         f"a step from {quantity(low, 'V')} to {quantity(high, 'V')} held for"
         f" {quantity(length, 's')}"
     )
-    return Plan("hold", words, Record("hold", time, voltage), HOLD_SAMPLES / length)
+    return Plan(
+        "hold", words, Record(name="hold", time=time, voltage=voltage), HOLD_SAMPLES / length
+    )

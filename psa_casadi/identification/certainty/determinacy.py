@@ -91,24 +91,33 @@ def determinacy(
     )
 
 
+def weighted_rows(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return Jacobian and residuals over their level, of every record and further column."""
+    parts = [fit.of_record(experiments, r) for r in range(len(fit.sigma))]
+    rows = [
+        (fit.jacobian[p] / s, fit.residuals[p] / s) for p, s in zip(parts, fit.sigma, strict=True)
+    ]
+    rows += [(f.jacobian / f.level, f.residuals / f.level) for f in fit.further]
+    return [row for row in rows if len(row[1])]
+
+
 def covariance_of(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray:
     """Return the covariance (size, size) of theta, for residuals that may be coloured.
 
     The sandwich H^-1 (sum_r J_r^T C_r J_r / w_r^4 + P) H^-1 with H = sum_r J_r^T J_r / w_r^2 + P:
-    w_r is the level that weighted record r, P the precision of the priors, C_r the Toeplitz matrix
-    of the residual's autocovariance in record r, which `autocovariance` estimates. White residuals
-    at the level w_r give H^-1. Source: White, Maximum likelihood estimation of misspecified models,
-    Econometrica 50 (1982), with the stationary colour of Newey and West (1987).
+    w_r is the level that weighted record r or a further column, P the precision of the priors, C_r
+    the Toeplitz matrix of the residual's autocovariance there, which `autocovariance` estimates.
+    White residuals at the level w_r give H^-1. Source: White, Maximum likelihood estimation of
+    misspecified models, Econometrica 50 (1982), with the stationary colour of Newey and West
+    (1987).
     """
     precision = np.diag(1.0 / fit.unknowns.prior**2)
     curvature, spread = precision.copy(), precision.copy()
-    for r, level in enumerate(fit.sigma):
-        part = fit.of_record(experiments, r)
-        scaled = fit.jacobian[part] / level
-        if not len(scaled):
-            continue
+    for scaled, residuals in weighted_rows(fit, experiments):
         curvature += scaled.T @ scaled
-        lags = autocovariance(fit.residuals[part] / level)
+        lags = autocovariance(residuals)
         if lags[0] > 2.0 * np.sum(lags) - lags[0]:
             lags = lags[:1]  # colour never makes intervals shorter than white residuals do
         spread += scaled.T @ convolved(scaled, np.concatenate([lags[:0:-1], lags]))

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError
-from psa_casadi.identification.certainty.determinacy import covariance_of
+from psa_casadi.identification.certainty.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.certainty.profile_fits import HeldFits, Point, Progress
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
@@ -123,16 +123,15 @@ def _spread(fit: Fit, experiments: Sequence[Experiment], name: str) -> tuple[flo
     gradient = np.zeros(unknowns.size)
     gradient[:count] = unknowns.slopes(fit.theta)[unknowns.names.index(name)]
     curvature = np.diag(1.0 / unknowns.prior**2)
-    variance = 0.0
-    for r, level in enumerate(fit.sigma):
-        part = fit.of_record(experiments, r)
-        scaled = fit.jacobian[part] / level
+    variance, samples = 0.0, 0
+    for scaled, residuals in weighted_rows(fit, experiments):
         curvature += scaled.T @ scaled
-        variance += float(np.sum((fit.residuals[part] / level) ** 2))
+        variance += float(np.sum(residuals**2))
+        samples += len(residuals)
     white = float(gradient @ np.linalg.pinv(curvature, hermitian=True) @ gradient)
     found = max(float(gradient @ covariance_of(fit, experiments) @ gradient), 1e-12 * white)
     # a parameter that the prior holds has no ratio of its own: the residuals' variance stands in
-    return float(np.sqrt(found)), max(found / white, variance / len(fit.residuals))
+    return float(np.sqrt(found)), max(found / white, variance / samples)
 
 
 def profile_sentences(p: Profile) -> tuple[str, ...]:

@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum, minimise
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.further import Further, further_of, scaled
+from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS
+from psa_casadi.identification.fitting.minimum import Effort, accurate_minimum
 from psa_casadi.identification.fitting.prediction import (
     Prediction,
     Simulated,
     measured,
     motions_of,
     predict,
-    simulated,
 )
 from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
-from psa_casadi.interruption import current_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError
@@ -29,10 +29,6 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Relative tolerance of a step in fits.
 FIT_RTOL = 1e-6
-#: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
-#: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
-#: then the stepper is taken.
-_OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,7 +40,9 @@ class Fit:
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
-    each record was run and how accurately; it is empty after an interrupt.
+    each record was run and how accurately; it is empty after an interrupt, and above the goal.
+    `radius` is that of the next step, `further` are the fits of the columns beside the
+    displacement.
     """
 
     model: Model
@@ -59,6 +57,8 @@ class Fit:
     evaluations: int
     way: Way
     simulated: tuple[Simulated, ...]
+    radius: float = FIRST_RADIUS
+    further: tuple[Further, ...] = ()
 
     def __repr__(self) -> str:
         """Return what was fitted and what it leaves, in one line."""
@@ -93,16 +93,21 @@ class Fit:
 
     def predicted(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict whole records [m], held-out samples included."""
-        return [p.displacement for p in self.predictions(experiments)]
+        return [p.displacement for p in self.predictions(experiments, differentiated=False)]
 
-    def predictions(self, experiments: Sequence[Experiment]) -> list[Prediction]:
-        """Predict whole records with their derivatives by theta.
+    def predictions(
+        self, experiments: Sequence[Experiment], *, differentiated: bool = True
+    ) -> list[Prediction]:
+        """Predict whole records with their derivatives by theta, if `differentiated`.
 
         A record that is held out as a whole begins as the fitted ones do (`shared_starts`); what
         finds its offset are the samples that it may use.
         """
         theta, shared = shared_starts(self.model, self.unknowns, self.theta, experiments)
-        full = predict(self.model, experiments, self.unknowns, theta, way=self.way, everything=True)
+        full = predict(
+            self.model, experiments, self.unknowns, theta,
+            way=self.way, everything=True, differentiated=differentiated,
+        )  # fmt: skip
         for k in shared:
             own, x = experiments[k], full[k].displacement
             offset = float(np.mean((measured(own.record) - x)[own.used]))
@@ -133,14 +138,16 @@ def fit(
     tolerance: float = 1e-5,
     rtol: float = FIT_RTOL,
     goal: float = np.inf,
+    radius: float = FIRST_RADIUS,
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
+    Of the displacement and of the experiments' `further` columns, each by its own level.
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
     those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
-    cost will stay above the `goal`. Raises InputError when no sample can be used, SimulationError
-    when the start cannot be simulated or its numbers overflow.
+    cost will stay above the `goal`; its first step is of the `radius`. Raises InputError when no
+    sample can be used, SimulationError when the start cannot be simulated or its numbers overflow.
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
@@ -154,10 +161,14 @@ def fit(
         [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
     )
     linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
-    effort = _Effort(tolerance, evaluations, goal, linear)
-    minimum, way, told = _minimum(model, experiments, unknowns, weights, theta, sigma, rtol, effort)
+    effort = Effort(tolerance, evaluations, goal, linear, radius)
+    minimum, way, told = accurate_minimum(
+        model, experiments, unknowns, weights, theta, sigma, rtol, effort
+    )
+    further = further_of(model, experiments, unknowns, minimum.theta, way=way)
+    found, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
-        model=model.with_values(unknowns.values(minimum.theta)),
+        model=found,
         unknowns=unknowns,
         theta=minimum.theta,
         residuals=-minimum.residual[: len(weights)] * weights,
@@ -169,101 +180,9 @@ def fit(
         evaluations=minimum.evaluations,
         way=way,
         simulated=tuple(told),
+        radius=minimum.radius,
+        further=further,
     )
-
-
-@dataclass(frozen=True)
-class _Effort:
-    """How far a minimum is sought: see `minimise`."""
-
-    tolerance: float
-    evaluations: int
-    goal: float
-    linear: tuple[int, ...]
-
-
-def _minimum(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    weights: FloatArray,
-    theta: FloatArray,
-    sigma: Sequence[float],
-    rtol: float,
-    effort: _Effort,
-) -> tuple[Minimum, Way, list[Simulated]]:
-    """Return the minimum, found by a simulation that is accurate there, and how that was done."""
-    allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
-    ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
-    ways.append(Way(rtol, 0.1 * rtol, stepped=True))
-    spent, before = 0, None
-    for way in ways:
-        evaluate = objective(model, experiments, unknowns, weights, way)
-        try:
-            found = minimise(
-                evaluate,
-                theta,
-                unknowns.bounds(),
-                tolerance=effort.tolerance,
-                evaluations=max(effort.evaluations - spent, 2),
-                goal=effort.goal,
-                linear=effort.linear,
-            )
-        except KeyboardInterrupt:
-            if before is None:  # nothing was evaluated yet
-                raise
-            current_work().stop()
-            minimum, rougher = before
-            ended = replace(minimum, evaluations=spent, interrupted=True, converged=False)
-            return ended, rougher, []
-        if found is None:
-            raise SimulationError(
-                "The model cannot be simulated at the start of the fit; start from other values."
-            )
-        minimum, theta = found, found.theta
-        before = minimum, way
-        spent += found.evaluations
-        if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
-            current_work().stop()
-            return replace(minimum, evaluations=spent), way, []
-        told = simulated(model, experiments, unknowns, theta, way=way)
-        if not any(t.error > a for t, a in zip(told, allowed, strict=True)):
-            break
-    return replace(minimum, evaluations=spent), way, told
-
-
-def _allowed(experiment: Experiment, sigma: float) -> float:
-    """Return the rms error [m] that a record's simulation may have."""
-    y = measured(experiment.record)[experiment.used]
-    return max(_OF_NOISE * sigma, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0)
-
-
-def objective(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    weights: FloatArray,
-    way: Way,
-) -> Evaluate:
-    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian."""
-    target = np.concatenate([measured(e.record)[e.used] for e in experiments])
-    used = [e.used[: e.stop] for e in experiments]
-    prior = 1.0 / unknowns.prior
-
-    def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        try:
-            parts = predict(model, experiments, unknowns, theta, way=way)
-        except PsaError:
-            return None
-        y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
-        j = np.vstack([p.jacobian[u] for p, u in zip(parts, used, strict=True)])
-        residual = np.concatenate([(y - target) / weights, theta * prior])
-        jacobian = np.vstack([j / weights[:, None], np.diag(prior)])
-        with np.errstate(over="ignore", invalid="ignore"):
-            finite = np.isfinite(residual @ residual + np.sum(jacobian**2))
-        return (residual, jacobian) if finite else None
-
-    return evaluate
 
 
 def _starting_point(

@@ -16,7 +16,8 @@ FloatArray = npt.NDArray[np.float64]
 #: theta -> (residual (m,), Jacobian (m, k)), or None where the model cannot be evaluated.
 Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 
-_FIRST_RADIUS = 1.0
+#: Of a fit that begins, and at least of one that goes on.
+FIRST_RADIUS, LEAST_RADIUS = 1.0, 0.1
 _SMALLEST_RADIUS = 1e-6
 _NEWTON_STEPS = 60
 #: Changes of the active set per coordinate; two or three are ordinary.
@@ -27,7 +28,8 @@ _ACTIVE_SETS = 20
 class Minimum:
     """Where the iteration ended, with residual and Jacobian there, and how it ended.
 
-    Neither `converged` nor `interrupted`: the evaluations were used up.
+    Neither `converged` nor `interrupted`: the evaluations were used up. `radius` is that of the
+    next step.
     """
 
     theta: FloatArray
@@ -37,6 +39,7 @@ class Minimum:
     converged: bool
     interrupted: bool
     evaluations: int
+    radius: float
 
 
 def minimise(
@@ -48,12 +51,13 @@ def minimise(
     evaluations: int,
     linear: Sequence[int] = (),
     goal: float = np.inf,
+    radius: float = FIRST_RADIUS,
 ) -> Minimum | None:
     """Minimise |r(theta)|^2 within bounds; None if the start cannot be evaluated.
 
     Each step minimises |r + J step|^2 within a radius (Levenberg's damping, found by bisection;
-    Moré 1978) and the bounds, and is accepted if the cost falls; the radius follows the ratio of
-    actual to predicted decrease.
+    Moré 1978) and the bounds, and is accepted if the cost falls; the radius, at first as given,
+    follows the ratio of actual to predicted decrease.
     Converged when two steps in a row lower the cost by less than `tolerance` of it, or no radius
     lowers it at all. A keyboard interrupt ends the iteration at the best point so far.
 
@@ -69,7 +73,7 @@ def minimise(
     if start is None:
         return None
     theta, residual, jacobian = _at_best(theta, start, columns)
-    cost, radius = float(residual @ residual), _FIRST_RADIUS
+    cost = float(residual @ residual)
     count, quiet, converged, interrupted = 1, 0, False, False
     while count < evaluations and not converged:
         gradient, normal = jacobian.T @ residual, jacobian.T @ jacobian
@@ -102,7 +106,7 @@ def minimise(
             if hopeless:
                 break
         converged = converged or radius < _SMALLEST_RADIUS
-    return Minimum(theta, residual, jacobian, cost, converged, interrupted, count)
+    return Minimum(theta, residual, jacobian, cost, converged, interrupted, count, radius)
 
 
 def _at_best(

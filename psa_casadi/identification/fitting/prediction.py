@@ -58,16 +58,29 @@ def predict_record(
     *,
     stop: int,
     rtol: float,
+    output: str = OUTPUT,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacement (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
+    """Return an output (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
 
     `start` holds deviations of the initial states from where the first inputs and their rates put
     them, in the states' units. Time counts from the record's first sample. `rtol` is the tolerance
     of a step.
     """
-    found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
+    way = Way(rtol, rtol)
+    found = trace_record(model, record, start, wanted, stop=stop, way=way, output=output)
     count = len(wanted)
     return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
+
+
+def record_start(model: Model, record: Record, start: Mapping[str, float]) -> FloatArray:
+    """Return the states (nx,) at a record's first sample; `start` as in `predict_record`."""
+    time, memories = record.time - record.time[0], memory_names(model.structure)
+    memory = {n: start.get(n, 0.0) for n in memories}
+    x0 = start_on(model, time, record_inputs(model, record, record.n), memory).x.copy()
+    for name, deviation in start.items():
+        if name not in memories:
+            x0[model.state_names.index(name)] += deviation
+    return x0
 
 
 def trace_record(
@@ -78,30 +91,37 @@ def trace_record(
     *,
     stop: int,
     way: Way,
+    by_start: bool = True,
+    output: str = OUTPUT,
 ) -> Traced:
-    """Return displacement (n,) and its derivatives by `wanted` and `start` (n, k + m)."""
+    """Return one output (n,) and its derivatives by `wanted` and `start` (n, k + m).
+
+    By `wanted` (n, k) alone if those `by_start` are not asked for.
+    """
     names = model.state_names
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
     memories = memory_names(model.structure)
     found = start_on(model, t, u, {n: start.get(n, 0.0) for n in memories})
     x0, searched = found.x.copy(), [names.index(n) for n in start]
-    by_start = np.zeros((len(names), len(start)))
+    moved = np.zeros((len(names), len(start)))
     for column, name in enumerate(start):
         if name in memories:
-            by_start[:, column] = found.by_memory[:, memories.index(name)]
+            moved[:, column] = found.by_memory[:, memories.index(name)]
         else:
             x0[searched[column]] += start[name]
-            by_start[searched[column], column] = 1.0
+            moved[searched[column], column] = 1.0
     columns = [model.parameter_names.index(n) for n in wanted]
-    s0 = np.hstack([found.by_parameter[:, columns], by_start])
-    unknowns: list[str | int] = [*wanted, *searched]
+    s0 = found.by_parameter[:, columns]
+    unknowns: list[str | int] = list(wanted)
+    if by_start:
+        s0, unknowns = np.hstack([s0, moved]), [*wanted, *searched]
     return trace(
         model,
         t,
         u,
         x0,
         way=way,
-        output=OUTPUT,
+        output=output,
         unknowns=unknowns,
         s0=s0,
         steps_limit=_STEPS,
@@ -140,6 +160,32 @@ def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
     }
 
 
+def traced_by_theta(
+    model: Model,
+    record: Record,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    index: int,
+    *,
+    stop: int,
+    way: Way,
+    slopes: FloatArray,
+    output: str = OUTPUT,
+) -> tuple[FloatArray, FloatArray, str]:
+    """Return an output (stop,) of one record, its derivative by theta, and the way it was run.
+
+    Without the sensor's offset. `slopes` are `unknowns.slopes(theta)`.
+    """
+    current = model.with_values(unknowns.values(theta))
+    start = unknowns.start(theta, index)
+    found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
+    count = len(unknowns.names)
+    start_slopes = unknowns.place_slopes(theta, index)[0]
+    by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
+    by_theta[:count, :count] = slopes
+    return found.output, found.sensitivity @ by_theta, found.way
+
+
 def predict(
     model: Model,
     experiments: Sequence[Experiment],
@@ -148,31 +194,30 @@ def predict(
     *,
     way: Way,
     everything: bool = False,
+    differentiated: bool = True,
 ) -> list[Prediction]:
     """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
 
-    Records are simulated side by side.
+    Records are simulated side by side; `differentiated` or not, in which case the Jacobian has no
+    columns.
     """
-    current = model.with_values(unknowns.values(theta))
     slopes = unknowns.slopes(theta)
 
     def one(index: int) -> Prediction:
         experiment = experiments[index]
         stop = experiment.record.n if everything else experiment.stop
-        found = trace_record(
-            current,
-            experiment.record,
-            unknowns.start(theta, index),
-            unknowns.names,
-            stop=stop,
-            way=way,
+        if not differentiated:
+            current, start = model.with_values(unknowns.values(theta)), unknowns.start(theta, index)
+            found = trace_record(
+                current, experiment.record, start, (), stop=stop, way=way, by_start=False
+            )
+            shown = found.output + unknowns.offset(theta, index)
+            return Prediction(shown, found.sensitivity, found.way)
+        x, jacobian, way_taken = traced_by_theta(
+            model, experiment.record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
         )
-        start_slopes, offset_slopes = unknowns.place_slopes(theta, index)
-        count = len(unknowns.names)
-        jacobian = found.sensitivity[:, count:] @ start_slopes
-        jacobian[:, :count] += found.sensitivity[:, :count] @ slopes
-        jacobian += offset_slopes
-        return Prediction(found.output + unknowns.offset(theta, index), jacobian, found.way)
+        jacobian += unknowns.place_slopes(theta, index)[1]
+        return Prediction(x + unknowns.offset(theta, index), jacobian, way_taken)
 
     return side_by_side(one, range(len(experiments)))
 
@@ -200,7 +245,9 @@ def simulated(
         experiment, start = experiments[index], unknowns.start(theta, index)
         used = experiment.used[: experiment.stop]
         plain, finer = (
-            trace_record(current, experiment.record, start, (), stop=experiment.stop, way=w)
+            trace_record(
+                current, experiment.record, start, (), stop=experiment.stop, way=w, by_start=False
+            )
             for w in (way, way.finer)
         )
         gap = (plain.output - finer.output)[used]

@@ -146,7 +146,7 @@ class Unknowns:
         deviations = theta[first : first + len(names)] * self.start_scale[record]
         found = dict(zip(names, deviations.tolist(), strict=True))
         if self._carries(record):
-            found[_CARRIED] *= self.values(theta)["A"] / self._a_ref
+            found[_CARRIED] *= self._amplitude(theta) / self._a_ref
         return found
 
     def place(
@@ -159,7 +159,7 @@ class Unknowns:
         first, last = self.first(record), self.first(record + 1) - 1
         found = {n: states.get(n, 0.0) for n in self.started[record]}
         if self._carries(record):
-            a = self.values(theta)["A"]
+            a = self._amplitude(theta)
             offset += self.compliance * (found[_CARRIED] - a * self.first_voltage[record])
             found[_CARRIED] *= self._a_ref / a
         theta[first:last] = np.array(list(found.values())) / self.start_scale[record]
@@ -173,7 +173,8 @@ class Unknowns:
         offset[last] = self.offset_scale
         if self.loop is not None and self._carries(record):
             row, count = self.started[record].index(_CARRIED), len(self.names)
-            a, by_a = self.values(theta)["A"], self.slopes(theta)[self.loop[1]]
+            a, by_a = self._amplitude(theta), np.zeros(count)
+            by_a[self.loop[1]] = -a * a / self._a_ref
             q = self.start(theta, record)[_CARRIED] / a
             start[row, first + row] *= a / self._a_ref
             start[row, :count] = q * by_a
@@ -184,6 +185,12 @@ class Unknowns:
     def _carries(self, record: int) -> bool:
         return self.loop is not None and _CARRIED in self.started[record]
 
+    def _amplitude(self, theta: FloatArray) -> float:
+        """Return the loop's A at theta, without all other values."""
+        k = self.loop[1] if self.loop is not None else 0
+        a = self.reference[k] / (1.0 + theta[k])
+        return float(min(max(a, self.low[k]), self.high[k]))
+
     @property
     def _a_ref(self) -> float:
         return float(self.reference[self.loop[1]]) if self.loop is not None else 1.0
@@ -192,7 +199,7 @@ class Unknowns:
         """Return the sensor's offset in one record [m]."""
         offset = float(theta[self.first(record + 1) - 1]) * self.offset_scale
         if self._carries(record):
-            bent = self.values(theta)["A"] * self.first_voltage[record]
+            bent = self._amplitude(theta) * self.first_voltage[record]
             offset -= self.compliance * (self.start(theta, record)[_CARRIED] - bent)
         return offset
 

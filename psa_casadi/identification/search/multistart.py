@@ -5,6 +5,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.search.force_start import retuned
@@ -22,6 +24,7 @@ from psa_casadi.identification.search.refitting import (
 from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.starting_points import resolved, starting_points
 from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
 
@@ -62,10 +65,17 @@ class Search:
     not_unique: tuple[str, ...]
 
 
-def free_parameters(model: Model) -> list[str]:
-    """Return the core parameters and those of the model's effects that records can tell."""
+def free_parameters(model: Model, records: Sequence[Record] = ()) -> list[str]:
+    """Return the core parameters and those of the model's effects that records can tell.
+
+    A measured load that changes tells the stiffness that it meets.
+    """
     effects = [n for c in model.effects for n in c.fitted]
-    return [n for n in CORE if n in model.values] + effects
+    loaded = "load_force" in model.input_names and any(
+        r.load_force is not None and np.ptp(r.load_force) > 0.0 for r in records
+    )
+    met = [n for n in ("k_B", "k") if loaded and n in model.values]
+    return [n for n in CORE if n in model.values] + met + effects
 
 
 @stage("base fit")
@@ -111,7 +121,7 @@ def _search(
     keep: Callable[[Fit], None],
 ) -> Search:
     """Search as `search` says; `keep` gets every fit that is better than those before it."""
-    core = free_parameters(model)
+    core = free_parameters(model, [e.record for e in experiments])
     fastest = min(e.record.sample_time for e in experiments)
     told = resolved(model, linear, fastest)
     starts = starting_points(model, linear, [e.record for e in experiments])

@@ -1,6 +1,7 @@
 """Continuing a fit: refits, noise levels, and whether two fits are equally good."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import high_frequency_noise
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, Level
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -20,6 +21,9 @@ POLISH = 100
 #: The stepper's loosest tolerance, and its tolerance over the noise's share of the range, in quick
 #: fits. Its error is some six times the tolerance, of the range.
 _QUICK_RTOL, _OF_NOISE = 1e-4, 0.02
+#: Rounds of fits with a further column's residual as its noise level; logarithms of levels that are
+#: the same differ by less.
+_LEVEL_ROUNDS, _SAME_LEVEL = 2, 0.02
 #: Fits whose costs differ by less, in units of the log-likelihood's double, are equally good.
 _EQUAL = 3.84
 #: ... or by less than this share of what the model's own error adds to the cost.
@@ -95,6 +99,24 @@ def refit(
         evaluations=POLISH,
         goal=now * (least / max(previous.rms, 1e-300)) ** 2,
     )
+
+
+def relevelled(best: Fit, experiments: Sequence[Experiment]) -> tuple[Fit, tuple[Experiment, ...]]:
+    """Fit again with what the fit leaves of every further column as that column's noise level.
+
+    As it is without such columns, and where a fit was interrupted.
+    """
+    now = tuple(experiments)
+    for _ in range(_LEVEL_ROUNDS if best.further else 0):
+        if best.interrupted:
+            break
+        levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in best.further)
+        pairs = zip(best.further, levels, strict=True)
+        if all(abs(float(np.log(f.level / q.value))) < _SAME_LEVEL for f, q in pairs):
+            break
+        now = tuple(replace(e, further=levels) for e in now)
+        best = refit_or_keep(best, now, best.unknowns.names, best.sigma)
+    return best, now
 
 
 def refit_or_keep(

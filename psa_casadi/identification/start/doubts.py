@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.start.readings import refuse_stuck
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 
@@ -19,10 +20,8 @@ _STROKES, _SPANS = (2e-7, 2e-3), (5.0, 2000.0)
 #: Displacements [m] and voltages [V] that a model can start from; time between samples [s].
 _USABLE_STROKES, _USABLE_SPANS = (1e-13, 0.1), (1e-3, 1e5)
 _SAMPLE_TIMES = (1e-8, 3600.0)
-#: Numbers whose squares would overflow; longest record [s].
-_LARGEST, _LONGEST = 1e30, 1e9
-#: Readings that a fit needs.
-_FEWEST = 16
+#: Longest record [s].
+_LONGEST = 1e9
 #: So few samples are stray where all others are this much closer together.
 _STRAY, _APART = 3, 30.0
 #: A voltage this many times as large as its changes is an offset, whatever its unit.
@@ -39,23 +38,6 @@ _VOLTAGES = {-3: "mV, not V", -6: "uV, not V", -9: "uV, not kV",
 _CONSTANT = (
     "The voltage is {:g} V throughout: a stack shows itself only where its voltage changes. Give a"
     " record in which it does, or name its column (--columns voltage=...)."
-)
-_STUCK = (
-    "But for stuck readings, the displacement is one value: the sensor is out of its range, or"
-    " another column holds its readings (--columns displacement=...)."
-)
-_FEW = (
-    "Only {} of {} readings of the displacement count, too few for a fit, which needs {}; record"
-    " again, with the sensor in its range throughout."
-)
-_STILL = (
-    "The displacement is {:.6g} m throughout: the sensor is out of its range or was not connected,"
-    " or another column holds its readings (--columns displacement=...)."
-)
-_TWO = (
-    "The displacement has two values only, {:.6g} and {:.6g} m: that is a switch, or a sensor whose"
-    " step is as large as the motion, and nothing of a stack can be identified from it. Record it"
-    " with a finer sensor, or name another column (--columns displacement=...)."
 )
 
 
@@ -98,37 +80,6 @@ def _voltage(span: float, top: float) -> str:
         f"The voltage changes by {span:.2g} V only: that drives no stack. Its unit is probably"
         " another, or the column holds something else"
     )
-
-
-def refuse_stuck(records: Sequence[Record]) -> None:
-    """Raise InputError where no displacement that counts changes."""
-    if not any(r.mask.any() and r.range_m > 0.0 for r in records):
-        raise InputError([_STUCK])
-
-
-def refuse_still(records: Sequence[Record]) -> None:
-    """Raise InputError where displacements, as they were read, have one or two values."""
-    for name, columns in (
-        ("displacement", [measured(r)[r.mask] for r in records]),
-        ("voltage", [r.voltage for r in records]),
-    ):
-        largest = max(float(np.max(np.abs(c), initial=0.0)) for c in columns)
-        if largest > _LARGEST:
-            raise InputError(
-                [f"The {name} reaches {largest:.2g}: that is no reading; correct the column."]
-            )
-    values = [np.unique(measured(r)[r.mask]) for r in records]
-    if all(v.size <= 1 for v in values):
-        raise InputError([_STILL.format(values[0][0])])
-    if all(v.size <= 2 for v in values):
-        raise InputError([_TWO.format(*max(values, key=np.ptp))])
-
-
-def refuse_few(given: Sequence[Record], kept: Sequence[Record], said: Sequence[str]) -> None:
-    """Raise InputError where masking left hardly a reading; `said` is what it was done for."""
-    before, after = (sum(int(r.mask.sum()) for r in records) for records in (given, kept))
-    if after < min(before, _FEWEST):
-        raise InputError([*said, _FEW.format(after, before, _FEWEST)])
 
 
 def stray(records: Sequence[Record]) -> list[str]:
@@ -198,6 +149,18 @@ def doubtful_unit(records: Sequence[Record]) -> str:
         f"The displacement changes by {slope:.1e} m per volt, {side} than piezoelectric stacks do"
         f" ({low:.0e} to {high:.0e} m/V): its unit, or that of the voltage, is probably another"
         f"{_suggestion(stroke, span)}."
+    )
+
+
+def doubtful_voltage(records: Sequence[Record]) -> str:
+    """Say that the voltage is higher than stacks bear, and its unit is in no doubt; else ""."""
+    top = max(float(np.max(np.abs(r.voltage))) for r in records)
+    if top <= _SPANS[1] or doubtful_unit(records):
+        return ""
+    return (
+        f"The voltage reaches {top:.5g} V, and no stack bears more than {_SPANS[1]:.0f} V: it"
+        " probably holds the counts of a converter, or an offset. Give it in volts; what depends on"
+        " the level of the voltage cannot be told so."
     )
 
 

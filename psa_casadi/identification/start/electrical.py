@@ -1,4 +1,4 @@
-"""The capacitance that a measured current tells, without the mechanics.
+"""The capacitance that a measured current or charge tells, without the mechanics.
 
     C_p u' = i,   i = (G v - u) / R_s,   G = 1
 
@@ -37,14 +37,15 @@ _NORMAL, _UNEVEN, _SAME = 1.96, 1e-2, 0.02
 
 @dataclass(frozen=True)
 class Capacitance:
-    """Capacitance [F] by a measured current, with its standard error.
+    """Capacitance [F] by a measured current, or charge, with its standard error.
 
-    `explained` is the share of the current's variance.
+    `explained` is the share of the `source`'s variance.
     """
 
     value: float
     error: float
     explained: float
+    source: str = "current"
 
     @property
     def interval(self) -> Interval:
@@ -61,14 +62,14 @@ class Capacitance:
         low, high = 1e6 * self.interval.low, 1e6 * self.interval.high
         kept = "" if self.is_that_of(value) else f" The model keeps the {1e6 * value:.4g} uF given."
         return (
-            f"The measured current tells C_p = {1e6 * self.value:.4g} uF ({low:.4g} to {high:.4g};"
-            " times the amplifier's gain, if the voltage is its input): it explains"
+            f"The measured {self.source} tells C_p = {1e6 * self.value:.4g} uF ({low:.4g} to"
+            f" {high:.4g}; times the amplifier's gain, if the voltage is its input): it explains"
             f" {100 * self.explained:.1f} % of it.{kept}"
         )
 
 
 def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
-    """Return what measured currents tell; None without one, or where they follow no capacitance.
+    """Return what measured currents tell, else charges; None where neither follows a capacitance.
 
     A current that is limited, leaks, has its sign turned, or belongs to another voltage is
     explained badly. Records with uneven time steps tell nothing.
@@ -77,7 +78,7 @@ def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
     shown = [np.asarray(r.current, dtype=np.float64) for r in own]
     total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in shown)
     if total == 0.0:
-        return None
+        return _by_charge(records)
     times = min(r.sample_time for r in own) * _TIMES
     for _ in range(_ROUNDS):
         left = [_solved(own, float(q))[1] for q in times]
@@ -89,6 +90,23 @@ def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
     if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
         return None
     return Capacitance(value, error, explained)
+
+
+def _by_charge(records: Sequence[Record]) -> Capacitance | None:
+    """Return the charge per volt, every record about its mean; None without a charge."""
+    given = [(r.voltage, np.asarray(r.charge)) for r in records if r.charge is not None]
+    pairs = [(v - np.mean(v), q - np.mean(q)) for v, q in given]
+    power = sum(float(v @ v) for v, _ in pairs)
+    total = sum(float(q @ q) for _, q in pairs)
+    if power == 0.0 or total == 0.0:
+        return None
+    value = sum(float(v @ q) for v, q in pairs) / power
+    rest = sum(float(np.sum((q - value * v) ** 2)) for v, q in pairs)
+    explained = 1.0 - rest / total
+    if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
+        return None
+    # what is left is a loop, not noise: its width does not average out
+    return Capacitance(value, float(np.sqrt(rest / power)), explained, "charge")
 
 
 def _even(record: Record) -> bool:

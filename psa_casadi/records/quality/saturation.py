@@ -16,6 +16,8 @@ BoolArray = NDArray[np.bool_]
 FEWEST, LONGEST = 8, 3
 #: The motion that a run hides must exceed this share of the range, and so often the noise.
 HIDDEN, LIMIT = 0.02, 8.0
+#: How many times what the voltage does a reading may move to an end and be no jump there.
+REACHED = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +33,9 @@ def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
     """Return the ends of a signal's range (n,) where the sensor was saturated.
 
     There the signal has one value, to the last digit, while the voltage moves the stack by what
-    other readings show: more than a turn does within the noise. Of a signal whose digits hide its
-    noise no end is told, because a drive that is saturated looks the same there.
+    other readings show: more than a turn does within the noise. It comes there as the stack moves;
+    what jumps there is a drop-out. Of a signal whose digits hide its noise no end is told, because
+    a drive that is saturated looks the same there.
     """
     span = float(np.ptp(y))
     at = {upper: np.abs(y - (y.max() if upper else y.min())) <= 1e-12 * span for upper in (0, 1)}
@@ -46,20 +49,33 @@ def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
     for upper, where in at.items():
         if where.sum() < FEWEST:
             continue
-        hidden = [
-            slope * float(np.ptp(voltage[start:stop]))
-            for start, stop in zip(*(e.tolist() for e in runs_of(where)), strict=True)
-            if stop - start >= LONGEST
-        ]
-        if max(hidden, default=0.0) > least:
+        runs = [(a, b) for a, b in zip(*(e.tolist() for e in runs_of(where)), strict=True)]
+        moved = slope * np.array(
+            [float(np.ptp(voltage[a:b])) * (b - a >= LONGEST) for a, b in runs]
+        )
+        into = np.array([_jump(y, a) - REACHED * slope * _jump(voltage, a) for a, _ in runs])
+        jumped = sum(b - a for (a, b), j in zip(runs, into, strict=True) if j > LIMIT * noise)
+        if np.max(moved) > least and 2 * jumped < where.sum():
             found.append(FlatEnd(float(y[where][0]), where, bool(upper)))
     return tuple(found)
 
 
+def _jump(signal: FloatArray, at: int) -> float:
+    """Return the size of the step to a sample, 0 to the first one."""
+    return abs(float(signal[at] - signal[at - 1])) if at > 0 else 0.0
+
+
 def _slope(y: FloatArray, voltage: FloatArray, inside: BoolArray) -> float:
-    """Return the size of the regression slope of the readings that are at neither end."""
+    """Return the size of the regression slope of the readings that are at neither end.
+
+    Every run of them has its own centre: between two of them the stack was at its end and has come
+    back on another branch.
+    """
     if inside.sum() < FEWEST:
         inside = np.ones(y.size, dtype=np.bool_)
-    v, x = (s[inside] - np.mean(s[inside]) for s in (voltage, y))
-    power = float(v @ v)
-    return abs(float(v @ x)) / power if power > 0.0 else 0.0
+    power = product = 0.0
+    for start, stop in zip(*(e.tolist() for e in runs_of(inside)), strict=True):
+        v, x = (s[start:stop] - np.mean(s[start:stop]) for s in (voltage, y))
+        power += float(v @ v)
+        product += float(v @ x)
+    return abs(product) / power if power > 0.0 else 0.0

@@ -106,7 +106,6 @@ def suspects(record: Record) -> Suspects:
     stuck |= missed_a_move(y, record.voltage[valid], quantum) & ~dropped
     stuck |= repeated_in_noise(y, record.voltage[valid], quantum) & ~dropped
     ends = flat_ends(y, record.voltage[valid]) if quantum is None else ()
-    ends = tuple(e for e in ends if np.mean(dropped[e.where]) < 0.5)  # a jump away is no end
     flat = np.any([np.zeros(valid.size, dtype=np.bool_), *(e.where for e in ends)], axis=0)
     stuck, dropped = stuck & ~flat, dropped & ~flat
     rest = ~(stuck | dropped)

@@ -29,6 +29,10 @@ COLUMNS: dict[str, Column] = {
         Column("load_force", ("force",), "load_force [N]"),
         Column("current", ("current",), "current [mA]"),
         Column("temperature", ("temperature",), "temperature [degC]"),
+        Column("monitor_voltage", ("voltage",), "monitor_voltage [V]"),
+        Column("charge", ("charge",), "charge [uC]"),
+        Column("displacement_2", ("length",), "displacement_2 [um]"),
+        Column("strain", ("ratio",), "strain [ppm]"),
     )
 }
 
@@ -53,7 +57,10 @@ class Source:
 ColumnMap = Mapping[str, Source]
 
 #: Where nobody names a unit, a column is taken to be in this one; a displacement never is.
-SI_UNITS = {"time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K"}
+SI_UNITS = {
+    "time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K",
+    "monitor_voltage": "V", "charge": "C", "strain": "1",
+}  # fmt: skip
 
 _HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 
@@ -75,9 +82,10 @@ def parse_header(
     counted = bool(wanted) and all(source.array in texts for source in wanted.values())
     if all(_is_number(text) for text in texts) and not counted:
         example = ",".join(COLUMNS[name].example for name in required)
+        numbered = {name: str(k) for k, name in enumerate(required, 1)}
         problems.add(
             f"{where}: found '{','.join(texts)[:60]}', expected a header; write a first line such "
-            f"as '{example}', or say which column is which: {ready_line(required)}"
+            f"as '{example}', or say which column is which: {ready_line(numbered)}"
         )
         return {}
     fields: dict[str, Field] = {}
@@ -86,7 +94,8 @@ def parse_header(
         match = _HEADER.fullmatch(text.strip())
         own = match["name"].strip() if match else text
         name = _column_of(own, text, wanted)
-        if match is None or name not in COLUMNS:
+        open_unit = match is not None and match["unit"] is None and name not in wanted
+        if match is None or name not in COLUMNS or (open_unit and name in required):
             strangers.append((index, text.strip()))
         elif name in fields:
             problems.add(
@@ -115,11 +124,11 @@ def _by_other_names(
     """Add the columns that go by a laboratory's name for them; return the cells that do not.
 
     What has a column's own name keeps it. Two cells for one column, or one without a unit, are told
-    with the line to type.
+    with the line to type, once for all of them.
     """
     known = [(index, text, understood(text)) for index, text in strangers]
     open_ones = [n for n in COLUMNS if n not in fields and n not in wanted]
-    left = [(index, text) for index, text, name in known if name is None]
+    unclear: dict[str, list[str]] = {}
     for column in open_ones:
         cells = [(i, t, n.unit) for i, t, n in known if n is not None and n.column == column]
         with_unit = [c for c in cells if c[2] is not None]
@@ -128,21 +137,37 @@ def _by_other_names(
             check_unit(COLUMNS[column], unit, f"{where}, column '{text}'", problems)
             fields[column] = Field(index, unit or "")
         elif cells and column in required:
-            texts = {column: cells[0][1]}
-            texts |= {n.column: t for _, t, n in known if n is not None and n.column != column}
-            why = "has no unit" if len(cells) == 1 else "may be more than one column"
-            problems.add(
-                f"{where}: '{column}' {why} ({', '.join(t for _, t, _ in cells)}); say which, and "
-                f"in which unit: {ready_line(required, texts)}"
-            )
+            unclear[column] = [text for _, text, _ in cells]
             fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
+    left = [(index, text) for index, text, name in known if name is None]
+    if unclear:
+        told = (
+            f"'{name}' {'has no unit' if len(own) == 1 else 'may be more than one column'}"
+            f" ({', '.join(own)})"
+            for name, own in unclear.items()
+        )
+        texts = {name: own[0] for name, own in unclear.items()}
+        others = (text for _, text in left if text)
+        texts |= {name: next(others, "") for name in required if name not in (*fields, *wanted)}
+        line = ready_line({name: texts[name] for name in required if texts.get(name)}, wanted)
+        examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
+        problems.add(
+            f"{where}: {', '.join(told)}; write {examples} in the header, or say which, and in"
+            f" which unit: {line}"
+        )
     return left
 
 
-def ready_line(required: Sequence[str], texts: Mapping[str, str] | None = None) -> str:
-    """Return the option that says which cell of the header is which column; units as usual."""
-    names = {name: (texts or {}).get(name, str(k)) for k, name in enumerate(required, 1)}
-    parts = (f"{name}={own}:{SI_UNITS.get(name, 'um')}" for name, own in names.items())
+def ready_line(cells: Mapping[str, str], wanted: ColumnMap | None = None) -> str:
+    """Return the option that says which cell of the header is which column; units as usual.
+
+    It holds what `wanted` says already.
+    """
+    parts = [
+        f"{name}={own.array}" + ("" if own.unit is None else f":{own.unit}")
+        for name, own in (wanted or {}).items()
+    ]
+    parts += [f"{name}={own}:{SI_UNITS.get(name, 'um')}" for name, own in cells.items()]
     return f"--columns {','.join(parts)} (with your units)."
 
 
@@ -211,7 +236,10 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
     except InputError as error:
         problems.add(f"{where}: {error}")
         return
-    if parsed.quantity not in column.quantities:
+    compound = not parsed.quantity and any(
+        parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in column.quantities
+    )
+    if parsed.quantity not in column.quantities and not compound:
         problems.add(
             f"{where}: the unit '{unit}' does not measure {column.quantities[0]}; correct it to "
             f"one of {accepted}."
@@ -231,6 +259,7 @@ def _report_missing(
         for name in strangers
         if (near := difflib.get_close_matches(_plain(name), absent, n=1, cutoff=0.8))
     }
+    missing = [name for name in absent if name in required and name not in meant]
     for name in absent:
         if name in meant:
             problems.add(
@@ -241,8 +270,17 @@ def _report_missing(
             found = ", ".join([*fields, *filter(None, strangers)]) or "nothing"
             problems.add(
                 f"{where}: the column '{name}' is missing (found: {found[:120]}); add it to the "
-                f"header as '{COLUMNS[name].example}'."
+                f"header as '{COLUMNS[name].example}'{_or_type(name, missing, strangers)}."
             )
+
+
+def _or_type(name: str, missing: Sequence[str], strangers: Sequence[str]) -> str:
+    """Return, behind the last missing column, the option that says which cells are meant."""
+    others = [s.strip() for s in strangers if s.strip() and not set(s) & set(",=:[]")]
+    if name != missing[-1] or len(others) < len(missing):
+        return " (or give --sample-time)" if name == "time" else ""
+    line = ready_line(dict(zip(missing, others, strict=False))).removesuffix(".")
+    return f", or say which column it is: {line}"
 
 
 def _is_number(text: str) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import Field
 from psa_casadi.records.read.file_bytes import check_size, read_bytes, unpacked
+from psa_casadi.records.read.instrument_text import instrument_lines
 from psa_casadi.records.read.layout import cells_of, layout
 from psa_casadi.units import FloatArray
 
@@ -77,16 +78,24 @@ def load_text(path: str | os.PathLike[str]) -> CsvText:
     lines_at_most = max(content.count(b"\n"), content.count(b"\r"))
     check_size(path, _LEAST_ON_A_LINE * lines_at_most, "its lines need")
     text = _decode(content, str(path)).replace("\r\n", "\n").replace("\r", "\n")
-    lines = text.split("\n")
+    lines = instrument_lines(str(path), text.split("\n"))
+    return laid_out(str(path), hashlib.sha256(data).hexdigest(), lines)
+
+
+def laid_out(path: str, digest: str, lines: Sequence[str]) -> CsvText:
+    """Return the lines of a table with the header split off; `digest` is that of the file.
+
+    Raises:
+        InputError: there are only comments.
+    """
     found = layout(lines)
     if found is None:
         raise InputError(f"{path}: holds no header and no data; export the record again.")
-    digest = hashlib.sha256(data).hexdigest()
     rows = lines[found.first :]
     if found.delimiter == " ":
         rows = [_SPACES.sub(" ", row.strip()) for row in rows]
     return CsvText(
-        str(path), digest, found.header, found.delimiter, tuple(rows), found.first + 1,
+        path, digest, found.header, found.delimiter, tuple(rows), found.first + 1,
         found.header_line + 1,
     )  # fmt: skip
 
@@ -99,6 +108,8 @@ def _decode(data: bytes, path: str) -> str:
             raise InputError(
                 f"{path}: begins as UTF-16 text and is none; save it as 'CSV UTF-8'."
             ) from None
+    if data[1:4:2] == b"\0\0" and len(data) % 2 == 0:  # Windows' text without a mark
+        return data.decode("utf-16-le", errors="replace")
     if b"\0" in data:
         raise InputError(
             f"{path}: is not text but a binary file; export the record as CSV and name that file."

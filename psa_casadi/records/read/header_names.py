@@ -18,12 +18,40 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "displacement": (
         "displacement", "x", "y", "d", "z", "disp", "position", "pos", "travel", "stroke",
         "elongation", "extension", "deflection", "sensor position", "measured position",
-        "current position", "actual position", "weg", "auslenkung",
+        "current position", "actual position", "real position", "weg", "auslenkung",
     ),
     "load_force": ("load_force", "load force", "force", "load", "f", "kraft"),
     "current": ("current", "i", "drive current", "strom"),
     "temperature": ("temperature", "temp", "temperatur"),
+    "monitor_voltage": (
+        "monitor_voltage", "monitor voltage", "voltage monitor", "monitor", "v_mon", "u_mon",
+        "vmon", "monitorspannung",
+    ),
+    "charge": ("charge", "q", "ladung"),
+    "displacement_2": (
+        "displacement_2", "displacement 2", "second displacement", "x2", "x_2", "y2",
+    ),
+    "strain": ("strain", "strain gauge", "dehnung"),
 }  # fmt: skip
+#: Units as instruments write them out, in lower case.
+UNIT_WORDS = {
+    "s": ("sec", "secs", "second", "seconds", "sekunden"),
+    "ms": ("msec", "millisecond", "milliseconds"),
+    "us": ("usec", "microsecond", "microseconds"),
+    "V": ("volt", "volts"),
+    "mV": ("millivolt", "millivolts"),
+    "m": ("meter", "meters", "metre", "metres"),
+    "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
+    "um": ("micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
+    "nm": ("nanometer", "nanometers", "nanometre", "nanometres"),
+    "N": ("newton", "newtons"),
+    "A": ("amp", "amps", "ampere", "amperes"),
+    "mA": ("milliamp", "milliamps"),
+    "degC": ("celsius", "deg c", "degrees celsius"),
+}
+_UNIT_OF = {word: unit for unit, words in UNIT_WORDS.items() for word in words}
+#: What names the place of a channel behind the quantity: `Current Position of axis 1`.
+_OF_A_PLACE = re.compile(r" of [\w ]*?(axis|chan|channel)\s*:?\s*\w+$")
 _COLUMN_OF = {alias: column for column, names in ALIASES.items() for alias in names}
 #: A name and its unit: in brackets of any form, after a slash, an underscore or a space.
 _FORMS = (
@@ -52,8 +80,9 @@ def understood(text: str) -> Name | None:
         if match is None:
             continue
         column = _COLUMN_OF.get(_plain(match["name"]))
-        if column is not None and is_unit(match["unit"]):
-            return Name(column, match["unit"].strip())
+        unit = unit_named(match["unit"])
+        if column is not None and unit is not None:
+            return Name(column, unit)
     return None
 
 
@@ -62,13 +91,14 @@ def columns_known(cells: Sequence[str]) -> int:
     return len({name.column for name in map(understood, cells) if name is not None})
 
 
-def is_unit(text: str) -> bool:
-    """Whether a text is a unit that is known here."""
+def unit_named(text: str) -> str | None:
+    """Return the unit that a text names, by its symbol or written out; None where it names none."""
+    unit = _UNIT_OF.get(text.strip().lower(), text.strip())
     try:
-        parse_unit(text.strip())
+        parse_unit(unit)
     except InputError:
-        return False
-    return bool(text.strip())
+        return None
+    return unit or None
 
 
 def units_row(cells: Sequence[str]) -> list[str] | None:
@@ -78,9 +108,12 @@ def units_row(cells: Sequence[str]) -> list[str] | None:
     """
     bare = [c.strip().strip("\"'").strip("[](){}").strip() for c in cells]
     filled = [c for c in bare if c]
-    found = len(filled) >= 2 and all(is_unit(c) and not _DIGITS.search(c[:1]) for c in filled)
-    return bare if found else None
+    units = [None if _DIGITS.search(c[:1]) else unit_named(c) for c in filled]
+    if len(filled) < 2 or None in units:
+        return None
+    return [(unit_named(c) or "") if c else "" for c in bare]
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"\s+", " ", name.strip().strip("\"'").strip().lower().replace("-", " "))
+    plain = re.sub(r"\s+", " ", name.strip().strip("\"'").strip().lower().replace("-", " "))
+    return _OF_A_PLACE.sub("", plain)

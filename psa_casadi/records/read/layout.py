@@ -32,20 +32,20 @@ def layout(lines: Sequence[str]) -> Layout | None:
     """Return where header and numbers are; None where there is nothing but comments.
 
     The header is the first line that names two columns of a record, in a comment too if numbers
-    follow; where none does, it is the first line that is no comment, and where that one holds
-    numbers there is no header. A row of units below is joined to the names.
+    follow; where none does, it is the line above the first numbers, else the first line that is no
+    comment, and where that one holds numbers there is no header. A row of units below is joined to
+    the names.
     """
     start = next((k for k, line in enumerate(lines) if _told(line)), None)
     if start is None:
         return None
     plain = _named(lines, [start])
     place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)))
-    delimiter = delimiter_of(lines[start if place is None else place].lstrip("#"))
     if place is None:
-        header = cells_of(lines[start], delimiter, spaced=True)
-        if len(header) > 1 and all(_NUMBER.fullmatch(c) for c in header):
-            return Layout((), delimiter, start, start)
-        return Layout(tuple(header), delimiter, start, start + 1)
+        if _all_numbers(lines[start]):
+            return Layout((), delimiter_of(lines[start]), start, start)
+        place = _above_numbers(lines, start)
+    delimiter = delimiter_of(lines[place].lstrip("#"))
     header = cells_of(lines[place].lstrip("# "), delimiter, spaced=True)
     below = place + 1
     if below < len(lines):
@@ -79,6 +79,24 @@ def delimiter_of(line: str) -> str:
 
 def _told(line: str) -> bool:
     return bool(line.strip()) and not line.startswith("#")
+
+
+def _all_numbers(line: str) -> bool:
+    cells = cells_of(line, delimiter_of(line))
+    return len(cells) > 1 and all(_NUMBER.fullmatch(c) for c in cells)
+
+
+def _above_numbers(lines: Sequence[str], start: int) -> int:
+    """Return the line of names, and of units below it, above the first numbers, else the first."""
+    numbers = (k for k in range(start, min(len(lines), _MOST_LINES)) if _all_numbers(lines[k]))
+    first = next(numbers, start)
+    cells = [
+        cells_of(line, delimiter_of(line)) for line in lines[max(start, first - 2) : first + 1]
+    ]
+    if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
+        return first - 2
+    alike = len(cells) > 1 and len(cells[-2]) == len(cells[-1])
+    return first - 1 if alike and not _NUMBER.fullmatch(cells[-2][0]) else start
 
 
 def _named(lines: Sequence[str], places: Sequence[int]) -> int | None:

@@ -2,17 +2,13 @@
 
 from collections.abc import Iterator, Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
 from psa_casadi.errors import InputError
+from psa_casadi.records.read.arrays import Numbers, series
 from psa_casadi.records.read.file_bytes import reason_of
 from psa_casadi.records.read.hdf5_process import arrays_apart
 from psa_casadi.records.read.mat_hdf5 import is_hdf5
 from psa_casadi.records.read.mat_level4 import level4_arrays
 from psa_casadi.records.read.mat_level5 import Tree, byte_order, level5_arrays
-
-Numbers = NDArray[np.generic]
 
 
 def load_arrays(path: str, data: bytes) -> Mapping[str, Numbers]:
@@ -49,13 +45,4 @@ def _series(name: str, value: Tree) -> Iterator[tuple[str, Numbers]]:
         for field, inner in value.items():
             yield from _series(f"{name}.{field}", inner)
     elif value is not None:
-        yield from _columns(name, np.squeeze(value) if value.size else value.ravel())
-
-
-def _columns(name: str, numbers: Numbers) -> Iterator[tuple[str, Numbers]]:
-    if numbers.ndim == 1:
-        yield name, numbers
-    elif numbers.ndim == 2:
-        upright = numbers if numbers.shape[0] >= numbers.shape[1] else numbers.T
-        for k in range(upright.shape[1]):
-            yield f"{name}.{k + 1}", upright[:, k]
+        yield from ((own, array.values) for own, array in series(name, value))

@@ -5,6 +5,7 @@ import io
 import math
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -33,55 +34,71 @@ def hdf5_arrays(path: str, data: bytes) -> dict[str, Tree]:
             other files.
         Exception: whatever h5py says of a damaged file.
     """
+    with opened(path, data) as file:
+        check_datasets(path, [item for _, item in datasets(file, set())])
+        return _tree(file)
+
+
+@contextmanager
+def opened(path: str, data: bytes) -> Iterator[Any]:
+    """Yield the HDF5 file that a content is. Raises InputError where h5py is not installed."""
     require_h5py(path)
     import h5py  # noqa: PLC0415 - an optional dependency, needed for these files only
 
     with h5py.File(io.BytesIO(data), "r") as file:
-        _check(path, list(_datasets(file, set())))
-        return _tree(file)
+        yield file
 
 
 def require_h5py(path: str) -> None:
     """Raise InputError where h5py is not installed, without loading it."""
     if importlib.util.find_spec("h5py") is None:
         raise InputError(
-            f"{path}: is a MATLAB file of version 7.3, and reading it needs h5py, which is not "
-            f"installed; run `pip install 'psa-casadi[matlab]'`, or save it with save(..., '-v7')."
+            f"{path}: is an HDF5 file (as MATLAB's of version 7.3 are), and reading it needs h5py,"
+            " which is not installed; run `pip install 'psa-casadi[matlab]'`, or save it in another"
+            " format: in MATLAB with save(..., '-v7')."
         )
 
 
-def _members(group: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the groups, and the vectors and matrices of numbers, that lie in a group itself."""
+def members(group: Any, *, tables: bool = False) -> Iterator[tuple[str, Any]]:
+    """Yield the groups, and the vectors and matrices of numbers, that lie in a group itself.
+
+    `tables` asks for datasets with fields as well (MATLAB's are complex numbers).
+    """
     import h5py  # noqa: PLC0415
 
     for name in group:
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
         item = group[name]
-        numbers = isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf"
-        if isinstance(item, h5py.Group) or (numbers and 1 <= sum(n != 1 for n in item.shape) <= 2):
+        if isinstance(item, h5py.Group):
             yield name, item
+        elif isinstance(item, h5py.Dataset) and item.shape is not None:
+            kinds = "biufV" if tables else "biuf"
+            if item.dtype.kind in kinds and 1 <= sum(n != 1 for n in item.shape) <= 2:
+                yield name, item
 
 
-def _datasets(group: Any, seen: set[int]) -> Iterator[Any]:
-    """Yield the datasets in a group and the groups below it, each group `seen` once."""
+def datasets(
+    group: Any, seen: set[int], place: tuple[str, ...] = (), *, tables: bool = False
+) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the datasets in a group and the groups below it with their places, each group once."""
     import h5py  # noqa: PLC0415
 
-    place = h5py.h5o.get_info(group.id).addr
-    if place in seen:
+    address = h5py.h5o.get_info(group.id).addr
+    if address in seen:
         raise ValueError(f"the group '{group.name}' is reached twice")
-    seen.add(place)
-    for _, item in _members(group):
+    seen.add(address)
+    for name, item in members(group, tables=tables):
         if isinstance(item, h5py.Group):
-            yield from _datasets(item, seen)
+            yield from datasets(item, seen, (*place, name), tables=tables)
         else:
-            yield item
+            yield (*place, name), item
 
 
-def _check(path: str, datasets: list[Any]) -> None:
+def check_datasets(path: str, found: list[Any]) -> None:
     """Refuse arrays that are too large, as stated or in their pieces, or lie in other files."""
-    check_size(path, sum(d.size * d.dtype.itemsize for d in datasets), "its arrays hold")
-    for d in datasets:
+    check_size(path, sum(d.size * d.dtype.itemsize for d in found), "its arrays hold")
+    for d in found:
         if d.external or d.is_virtual:
             raise InputError(
                 f"{path}: the array '{d.name}' lies in another file; save the values themselves."
@@ -97,7 +114,7 @@ def _check_pieces(dataset: Any, size: int) -> None:
     plan = dataset.id.get_create_plist()
     filters = [plan.get_filter(k)[0] for k in range(plan.get_nfilters())]
     if not _FILTERS.issuperset(filters) or len(set(filters)) < len(filters):
-        raise ValueError(f"the array '{dataset.name}' is packed in a way that MATLAB does not use")
+        raise ValueError(f"the array '{dataset.name}' is packed in another way than gzip")
     places: list[tuple[int, ...]] = []
     dataset.id.chunk_iter(lambda piece: places.append(piece.chunk_offset))
     for place in places if _DEFLATE in filters else ():
@@ -111,5 +128,5 @@ def _check_pieces(dataset: Any, size: int) -> None:
 def _tree(group: Any) -> dict[str, Tree]:
     return {
         name: np.asarray(item[()]).T if hasattr(item, "dtype") else _tree(item)
-        for name, item in _members(group)
+        for name, item in members(group)
     }

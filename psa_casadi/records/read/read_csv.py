@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from psa_casadi.errors import Problems
 from psa_casadi.records.read.columns import ColumnMap, parse_header
-from psa_casadi.records.read.csv_table import load_text, parse_numbers
+from psa_casadi.records.read.csv_table import CsvText, load_text, parse_numbers
 from psa_casadi.records.read.layout import cells_of
 from psa_casadi.records.read.samples import Samples
 
@@ -28,7 +28,13 @@ def read_csv(
     Raises:
         InputError: the file cannot be read, or is not text.
     """
-    text = load_text(path)
+    return columns_of(load_text(path), required, wanted, problems)
+
+
+def columns_of(
+    text: CsvText, required: Sequence[str], wanted: ColumnMap, problems: Problems
+) -> Samples | None:
+    """Return the columns of a table of text, or None where its header names none."""
     if not text.header and all(source.array.isdecimal() for source in wanted.values()) and wanted:
         text = text.numbered()
     header = text.header or cells_of(text.rows[0], text.delimiter)

@@ -1,10 +1,13 @@
 """Records from files: read, checked as a whole, converted to SI units.
 
-The format follows the ending: `.mat` (MATLAB), `.parquet` or `.pq`, and CSV for everything else.
+The format follows the ending: `.mat` (MATLAB), `.h5`, `.hdf5` or `.hdf`, `.tdms` (LabVIEW), `.npy`
+or `.npz` (NumPy), `.parquet` or `.pq`, `.xlsx` (Excel), and text for everything else: CSV, LabVIEW
+measurements (`.lvm`) and PI's data recorder are known by their content.
 """
 
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeGuard, cast
 
@@ -12,7 +15,7 @@ import numpy as np
 
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.checks import (
+from psa_casadi.records.checks import (
     Located,
     check_complete,
     check_displacement,
@@ -22,10 +25,11 @@ from psa_casadi.records.read.checks import (
 )
 from psa_casadi.records.read.column_map import parse_columns
 from psa_casadi.records.read.columns import ColumnMap
+from psa_casadi.records.read.read_arrays import LOADERS, read_arrays
 from psa_casadi.records.read.read_csv import read_csv
-from psa_casadi.records.read.read_mat import read_mat
 from psa_casadi.records.read.read_parquet import read_parquet
 from psa_casadi.records.read.read_table import Table, read_table
+from psa_casadi.records.read.read_xlsx import read_xlsx
 from psa_casadi.records.read.samples import Samples
 from psa_casadi.records.record import Record
 from psa_casadi.units import parse_unit, to_si
@@ -37,7 +41,13 @@ OneRecord = Record | AnyPath | Table
 Records = OneRecord | Iterable[OneRecord]
 
 #: What reads a file, by its ending; a file with another ending is CSV.
-READERS = {".mat": read_mat, ".parquet": read_parquet, ".pq": read_parquet}
+READERS = {
+    **dict.fromkeys(LOADERS, read_arrays),
+    ".parquet": read_parquet,
+    ".pq": read_parquet,
+    ".xlsx": read_xlsx,
+    ".xlsm": read_xlsx,
+}
 
 
 def read_record(
@@ -46,12 +56,14 @@ def read_record(
     need_displacement: bool = True,
     need_excitation: bool = False,
     columns: str | ColumnMap | None = None,
+    sample_time: float | None = None,
 ) -> Record:
-    """Return the record in one file: CSV, MATLAB or Parquet.
+    """Return the record in one file: text, Excel, MATLAB, HDF5, TDMS, NumPy or Parquet.
 
     `need_displacement` demands a displacement column with values, as a comparison does;
     `need_excitation` a voltage that changes, as a fit does. `columns` names the arrays of the file
     that are the columns, such as "time=t:ms,voltage=log.u,displacement=m.2:um" (`parse_columns`).
+    `sample_time` [s] gives the time of a file without one.
 
     Raises:
         InputError: every mistake found in the file, one sentence each: file, line, column, what was
@@ -59,9 +71,10 @@ def read_record(
     """
     problems = Problems()
     wanted = parse_columns(columns) if isinstance(columns, str) else columns or {}
-    required = ("time", "voltage", *(("displacement",) if need_displacement else ()))
+    required = _required(need_displacement, sample_time)
     reader = READERS.get(Path(path).suffix.lower(), read_csv)
     samples = reader(str(path), required, wanted, problems)
+    samples = _timed(samples, sample_time, problems)
     if samples is not None:
         _check(samples, problems, need_excitation=need_excitation)
     problems.raise_if_any()
@@ -76,6 +89,7 @@ def read_records(
     need_displacement: bool = True,
     need_excitation: bool = False,
     columns: str | ColumnMap | None = None,
+    sample_time: float | None = None,
 ) -> tuple[Record, ...]:
     """Return the records in several files, which are experiments on the same device.
 
@@ -92,6 +106,7 @@ def read_records(
                 need_displacement=need_displacement,
                 need_excitation=need_excitation,
                 columns=wanted,
+                sample_time=sample_time,
             )
             records.append(record)
         except InputError as error:
@@ -109,19 +124,22 @@ def record_from(
     name: str = "record",
     need_displacement: bool = True,
     columns: str | ColumnMap | None = None,
+    sample_time: float | None = None,
 ) -> Record:
     """Return the record in a data frame or a mapping of arrays, checked as a file is.
 
     Names carry units as a CSV header does: `{"time [s]": t, "voltage [V]": v, "displacement [um]":
-    x}`; or `columns` says which is which, as for `read_record`.
+    x}`; or `columns` says which is which, and `sample_time` [s] gives the time, as for
+    `read_record`.
 
     Raises:
         InputError: every mistake found, one sentence each.
     """
     problems = Problems()
     wanted = parse_columns(columns) if isinstance(columns, str) else columns or {}
-    required = ("time", "voltage", *(("displacement",) if need_displacement else ()))
+    required = _required(need_displacement, sample_time)
     samples = read_table(table, name, required, wanted, problems)
+    samples = _timed(samples, sample_time, problems)
     if samples is not None:
         _check(samples, problems, need_excitation=False)
     problems.raise_if_any()
@@ -169,6 +187,36 @@ def _is_table(given: object) -> TypeGuard[Table]:
     return isinstance(given, Mapping) or hasattr(given, "columns")
 
 
+def _required(need_displacement: bool, sample_time: float | None) -> tuple[str, ...]:
+    needed = {"time": sample_time is None, "voltage": True, "displacement": need_displacement}
+    return tuple(name for name, is_needed in needed.items() if is_needed)
+
+
+def _timed(
+    samples: Samples | None, sample_time: float | None, problems: Problems
+) -> Samples | None:
+    """Return the samples with the time that a sample time gives, where one was given."""
+    if samples is None or sample_time is None:
+        return samples
+    if not 0.0 < sample_time < 1e9:
+        problems.add(f"{samples.path}: the sample time {sample_time} s is no time; give seconds.")
+        return None
+    if "time" in samples.units:
+        problems.add(
+            f"{samples.path}: has a column 'time' of its own; leave --sample-time (sample_time) out"
+            " or rename the column."
+        )
+        return None
+    time = sample_time * np.arange(len(samples.values))
+    reported = np.zeros(len(time), dtype=np.bool_)
+    return replace(
+        samples,
+        units={"time": "s", **samples.units},
+        values=np.column_stack([time, samples.values]),
+        reported=np.column_stack([reported, samples.reported]),
+    )
+
+
 def _check(samples: Samples, problems: Problems, *, need_excitation: bool) -> None:
     check_length(samples.path, len(samples.lines), problems)
     for k, name in enumerate(samples.units):
@@ -209,6 +257,10 @@ def _record(samples: Samples, source: str | None = None) -> Record:
         load_force=columns.get("load_force"),
         current=columns.get("current"),
         temperature=columns.get("temperature"),
+        monitor_voltage=columns.get("monitor_voltage"),
+        charge=columns.get("charge"),
+        displacement_2=columns.get("displacement_2"),
+        strain=columns.get("strain"),
         sha256=samples.sha256,
         source=samples.path if source is None else source,
         displacement_unit="counts" if in_counts else "m",

@@ -53,7 +53,7 @@ def add_causes(page: Document, d: Diagnosis) -> None:
         )
         if cause.cannot_be_told_from:
             rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
-            page.paragraph(f"On these data it cannot be told from {rivals}.")
+            page.paragraph(f"These data cannot distinguish it from {rivals}.")
         for a in d.alternatives:
             if a.cause == cause.effect:
                 said = alternative_sentence(d, a)
@@ -93,7 +93,7 @@ def _of_the_data(d: Diagnosis, seen: Signature) -> Picture | None:
         return None
     other = data_view(d, *strongest[0])
     note = (
-        f"No record has {seen.telling.title.lower()} to compare; this is the view that says most."
+        f"No record has {seen.telling.title.lower()} to compare; this is the view that shows most."
     )
     return Picture(other.caption, other.plot, note) if other is not None else None
 

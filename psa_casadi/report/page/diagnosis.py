@@ -10,6 +10,7 @@ from psa_casadi.report.page.cause_part import add_causes, add_evidence
 from psa_casadi.report.page.document import Document, Picture
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
 from psa_casadi.report.page.record_part import add_records, points_each
+from psa_casadi.report.plots.figure import diagnosis_figure
 from psa_casadi.report.plots.residual_plots import time_plot
 from psa_casadi.report.words.phrases import (
     OWN_VOLTAGES,
@@ -20,6 +21,7 @@ from psa_casadi.report.words.phrases import (
     listing,
     micro,
     number,
+    one_unit,
     percent,
     rest_sentence,
     verdict_sentence,
@@ -29,6 +31,7 @@ from psa_casadi.report.words.series import Series, most_telling, series_of
 from psa_casadi.report.words.tables import (
     blind_table,
     candidate_table,
+    column_table,
     error_table,
     parameter_table,
     record_table,
@@ -36,25 +39,34 @@ from psa_casadi.report.words.tables import (
 
 
 def write_report(
-    diagnosis: Diagnosis, path: str | os.PathLike[str], *, origin: str = "measured"
+    diagnosis: Diagnosis,
+    path: str | os.PathLike[str],
+    *,
+    origin: str = "measured",
+    small: bool = False,
 ) -> None:
     """Write the page of a diagnosis, whole or not at all: the story first, then the details.
 
-    `origin`, "measured" or "synthetic", is what the page calls the records. Raises InputError when
-    `path` cannot be written to.
+    `origin`, "measured" or "synthetic", is what the page calls the records. A `small` page, below
+    1 MB, has one picture in place of the plots. Raises InputError when `path` cannot be written to.
     """
     d, series = diagnosis, series_of(diagnosis)
-    page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin))
-    page.paragraph(verdict_sentence(d), "verdict")
-    _picture(page, series, origin)
-    page.tiles(_tiles(d))
-    add_budget(page, d)
-    add_misfit(page, d)
-    add_evidence(page, d)
-    add_causes(page, d)
-    _gain(page, d)
-    _rest(page, d)
-    _details(page, d, series, origin)
+    page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin), small=small)
+    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
+    with one_unit(length_scale(d.base_errors.holdout_rms_m, counts=counts)):
+        page.paragraph(verdict_sentence(d), "verdict")
+        if small:
+            page.still(diagnosis_figure(d, origin=origin), "The diagnosis in one picture")
+        _picture(page, series, origin)
+        page.tiles(_tiles(d))
+        add_budget(page, d)
+        add_misfit(page, d)
+        add_evidence(page, d)
+        add_causes(page, d)
+        _columns(page, d)
+        _gain(page, d)
+        _rest(page, d)
+        _details(page, d, series, origin)
     atomic_write(path, page.text())
 
 
@@ -97,6 +109,13 @@ def _tiles(d: Diagnosis) -> list[tuple[str, str, str]]:
     return tiles
 
 
+def _columns(page: Document, d: Diagnosis) -> None:
+    if d.columns:
+        page.section("What the further columns decided")
+        page.bullets(c.sentence for c in d.columns)
+        page.table(column_table(d))
+
+
 def _gain(page: Document, d: Diagnosis) -> None:
     page.section("What is gained")
     sentence = gain_sentence(d) if added(d) else "nothing was added to the base model"
@@ -119,12 +138,13 @@ def _rest(page: Document, d: Diagnosis) -> None:
     page.section("Next experiment")
     page.paragraph(d.next_experiment.why)
     if d.next_experiment.voltage_csv:
-        page.paragraph(f"Voltage to play: {d.next_experiment.voltage_csv}")
+        page.paragraph(f"Voltage to apply: {d.next_experiment.voltage_csv}")
 
 
 def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str) -> None:
     page.section("Details: record by record")
-    add_records(page, series, [residual_figures(s, s.curves[-1]) for s in series], origin)
+    figures = [residual_figures(s, s.curves[-1]) for s in series]
+    add_records(page, series, figures, origin, above=most_telling(series).name)
     page.section("Every effect that was tried: figures")
     page.table(candidate_table(d))
     which = "extended" if added(d) else "base"

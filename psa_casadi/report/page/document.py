@@ -1,18 +1,25 @@
 """One self-contained HTML page: style, script, sections, tables and plots, nothing from the net."""
 
+import base64
+import io
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
 from typing import Any
 
+from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from psa_casadi.characters import plain
+from psa_casadi.command_line import typed
 from psa_casadi.report.plots.theme import DARK
 from psa_casadi.report.words.tables import Table
+from psa_casadi.version import __version__
 
 _FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
 _HASH = re.compile(r"[0-9a-f]{64}")
@@ -29,10 +36,13 @@ class Picture:
 
 
 class Document:
-    """Collects the parts of a page in their order and returns its text."""
+    """Collects the parts of a page in their order and returns its text.
 
-    def __init__(self, title: str, badges: Sequence[str]) -> None:
-        self._title = title
+    A `small` page leaves plots out, and with them the library that draws them; it has stills.
+    """
+
+    def __init__(self, title: str, badges: Sequence[str], *, small: bool = False) -> None:
+        self._title, self.small = title, small
         marks = "".join(
             f'<span class="badge {_text(b.split()[0])}">{_text(b)}</span>' for b in badges
         )
@@ -102,11 +112,23 @@ class Document:
 
     def picture(self, picture: Picture) -> None:
         """Add a plot over the whole width."""
-        self._parts.append(_figure(picture))
+        if not self.small:
+            self._parts.append(_figure(picture))
+
+    def still(self, figure: Figure, caption: str) -> None:
+        """Add a picture that matplotlib draws, over the whole width."""
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=100)
+        data = base64.b64encode(buffer.getvalue()).decode("ascii")
+        self._parts.append(
+            f'<figure><figcaption>{_text(caption)}</figcaption><img class="still"'
+            f' alt="{_text(caption)}" src="data:image/png;base64,{data}"></figure>'
+        )
 
     def pictures(self, pictures: Iterable[Picture]) -> None:
         """Add plots side by side, two in a row where there is room."""
-        self._parts.append(f'<div class="pair">{"".join(map(_figure, pictures))}</div>')
+        if not self.small:
+            self._parts.append(f'<div class="pair">{"".join(map(_figure, pictures))}</div>')
 
     def text(self) -> str:
         """Return the page."""
@@ -122,11 +144,23 @@ class Document:
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
             f"<title>{_text(self._title)}</title><style>{style}</style>"
-            f"<script>{get_plotlyjs()}</script></head>\n<body>\n"
+            + ("" if self.small else f"<script>{get_plotlyjs()}</script>")
+            + "</head>\n<body><main>\n"
             + "\n".join(body)
+            + f"\n<footer>{_text(_made())}</footer>"
             + f'\n<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
-            + f"\n<script>{script}</script>\n</body></html>\n"
+            + "\n</main>"
+            + ("" if self.small else f"<script>{script}</script>")
+            + "\n</body></html>\n"
         )
+
+
+def _made() -> str:
+    """Say when the page was written, by which version and command."""
+    stated = os.environ.get("SOURCE_DATE_EPOCH", "")
+    when = datetime.fromtimestamp(int(stated), UTC) if stated.isdecimal() else datetime.now(UTC)
+    command = f" Command: {typed.get()}" if typed.get() else ""
+    return f"Written {when:%Y-%m-%d %H:%M} UTC by psa_casadi {__version__}.{command}"
 
 
 def _text(words: str) -> str:

@@ -63,7 +63,7 @@ def write_experiment_page(
 ) -> None:
     """Write the page of a designed experiment; raises InputError where it cannot be written."""
     several = isinstance(design, Separated)
-    title = "Experiment that tells effects apart" if several else "Experiment for the parameters"
+    title = "Experiment that separates effects" if several else "Experiment for the parameters"
     responses = {n: r.predict(design.record, r.truth) for n, r in rivals.items()}
     write_design_page(
         path,
@@ -90,12 +90,13 @@ def again_sentence(design: Separated) -> str:
     """Say what would tell where one play of the record is not sure to."""
     if design.plays is None:
         return (
-            f"No record that was found is predicted to tell with {percent(ASKED)}, nor are"
-            f" {PLAYS[-1]} of them: within these limits the effects look alike. Widen the range of"
-            " voltages or the band, make the record longer, or lower the noise of the sensor."
+            f"No record was found that is predicted to decide with {percent(ASKED)}, not even one"
+            f" that is repeated {PLAYS[-1]} times: within these limits the effects look alike."
+            " Widen the range of voltages or the band, make the record longer, or lower the"
+            " noise of the sensor."
         )
     return (
-        f"One play is not sure to tell; {design.plays} plays, each from rest and recorded on its"
+        f"One run may not decide; {design.plays} runs, each from rest and recorded on its"
         f" own, are predicted to name the cause with {percent(ASKED)} or more."
     )
 
@@ -200,7 +201,7 @@ def voltage_picture(record: Record) -> Picture:
     plot.update_layout(showlegend=False)
     plot.update_xaxes(title="time [s]")
     plot.update_yaxes(title="voltage [V]")
-    return Picture("The voltage to play", styled(plot, 320))
+    return Picture("The voltage to apply", styled(plot, 320))
 
 
 def response_picture(record: Record, responses: Mapping[str, FloatArray]) -> Picture:

@@ -10,6 +10,7 @@ from psa_casadi.identification.certainty.profile import Profile, profile_sentenc
 from psa_casadi.identification.identify import Identification
 from psa_casadi.report.page.document import Document, Picture
 from psa_casadi.report.page.record_part import add_records
+from psa_casadi.report.plots.figure import fit_figure
 from psa_casadi.report.plots.finding_plots import correlation_plot, determinacy_plot
 from psa_casadi.report.plots.profile_plot import profile_plot
 from psa_casadi.report.words.fit_words import (
@@ -19,7 +20,7 @@ from psa_casadi.report.words.fit_words import (
     pairs_sentence,
 )
 from psa_casadi.report.words.grades import Grade, grades, named, strong_pairs
-from psa_casadi.report.words.phrases import Scale, number
+from psa_casadi.report.words.phrases import Scale, number, one_unit
 from psa_casadi.report.words.residuals import ResidualFigures, residual_figures
 from psa_casadi.report.words.series import Series, series_of_fit
 from psa_casadi.report.words.tables import (
@@ -36,15 +37,19 @@ def write_fit_report(
     *,
     origin: str = "measured",
     profiles: Sequence[Profile] = (),
+    small: bool = False,
 ) -> None:
     """Write the page of an identification, whole or not at all.
 
     It shows what the records determine, measured and model, and what the residual is.
     `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. Raises InputError when `path` cannot be written to.
+    beside the determinacy. A `small` page, below 1 MB, has one picture in place of the plots.
+    Raises InputError when `path` cannot be written to.
     """
     series = series_of_fit(found)
-    atomic_write(path, fit_page(found, series, origin=origin, profiles=profiles))
+    with one_unit(_scale(series)):
+        page = fit_page(found, series, origin=origin, profiles=profiles, small=small)
+    atomic_write(path, page)
 
 
 def fit_page(
@@ -53,14 +58,17 @@ def fit_page(
     *,
     origin: str = "measured",
     profiles: Sequence[Profile] = (),
+    small: bool = False,
 ) -> str:
     """Return the page; `series` are the records of the identification with the model's curve."""
     figures = [residual_figures(s, s.curves[0]) for s in series]
     graded = grades(found)
     count = len(series)
     records = f"{count} record{'s' if count > 1 else ''}"
-    page = Document("Identification of a stack", [f"{origin} data", records])
+    page = Document("Identification of a stack", [f"{origin} data", records], small=small)
     _verdict(page, found, figures, graded, origin, _scale(series))
+    if small:
+        page.still(fit_figure(found, origin=origin), "The fit in one picture")
     _determined(page, found, graded)
     if profiles:
         page.section("Profile likelihoods")

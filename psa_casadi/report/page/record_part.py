@@ -25,11 +25,17 @@ MOST_RECORDS = 16
 
 
 def add_records(
-    page: Document, series: Sequence[Series], figures: Sequence[ResidualFigures], origin: str
+    page: Document,
+    series: Sequence[Series],
+    figures: Sequence[ResidualFigures],
+    origin: str,
+    *,
+    above: str = "",
 ) -> None:
     """Add every record: time and residual, loop, window, and what the last curve leaves.
 
-    `figures` are those of the last curve's residual in each record.
+    `figures` are those of the last curve's residual in each record; `above` names the record whose
+    time and residual the page shows already.
     """
     shown = _worst(figures)
     if len(shown) < len(series):
@@ -39,7 +45,7 @@ def add_records(
             "note",
         )
     for k in shown:
-        _add(page, series[k], figures[k], origin, points_each(len(shown)))
+        _add(page, series[k], figures[k], origin, points_each(len(shown)), above)
 
 
 def points_each(records: int) -> int:
@@ -52,18 +58,23 @@ def _worst(figures: Sequence[ResidualFigures]) -> list[int]:
     return sorted(order[:MOST_RECORDS])
 
 
-def _add(page: Document, s: Series, figures: ResidualFigures, origin: str, limit: int) -> None:
+def _add(
+    page: Document, s: Series, figures: ResidualFigures, origin: str, limit: int, above: str
+) -> None:
     page.heading(f"{s.name} ({origin})")
     page.paragraph(residual_sentence(figures, s.curves[-1].label, s.time_scale))
     shaded = " Shaded: held out." if s.held_out.any() else ""
     noise = "Dashed: two standard deviations of the noise."
-    page.picture(
-        Picture(
-            f"Displacement, and residual: {origin} minus model",
-            time_plot(s, origin, limit),
-            f"{noise}{shaded}",
+    if s.name == above:
+        page.paragraph("Displacement and residual over time: at the top of the page.", "note")
+    else:
+        page.picture(
+            Picture(
+                f"Displacement, and residual: {origin} minus model",
+                time_plot(s, origin, limit),
+                f"{noise}{shaded}",
+            )
         )
-    )
     page.pictures(
         [
             Picture("Loop: displacement over voltage", loop_plot(s, origin, limit)),

@@ -6,8 +6,8 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.words.phrases import Scale, listing, number, plain
 from psa_casadi.report.words.tables import Table
 
-#: What is at the ports that these records cannot tell apart.
-_OPEN = "; these data cannot tell it from {}"
+#: Ports that these records cannot distinguish.
+_OPEN = "; these data cannot distinguish it from {}"
 
 
 def share_percent(share: float) -> str:

@@ -24,7 +24,7 @@ def determined_sentence(graded: tuple[Grade, ...]) -> str:
     """Say how many parameters the records determine, and name those they do not."""
     fitted = [g for g in graded if g.degree != "fixed"]
     if not fitted:
-        return "No intervals were estimated, so nothing is said of what these records determine."
+        return "No intervals were estimated, so it is not known what these records determine."
     good = len(named(graded, "determined"))
     count = "all" if good == len(fitted) else f"{good} of"
     parts = [f"The records determine {count} {len(fitted)} fitted parameters to 10 % or better"]
@@ -46,10 +46,10 @@ def error_bar_note(graded: tuple[Grade, ...]) -> str:
     note = "Dotted: 10 %, beyond it weak; dashed: 50 %, beyond it undetermined."
     if not by_change:
         return note
-    verb = "is" if len(by_change) == 1 else "are"
+    verb = "is" if len(by_change) == 1 else "of each is"
     return (
-        f"{note} {listing(by_change)} may be zero and {verb} taken relative to an ordinary change"
-        " instead of the value."
+        f"{note} {listing(by_change)} may be zero, so the error {verb} relative to an ordinary"
+        " change, not to the value."
     )
 
 
@@ -60,8 +60,8 @@ def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
     shown = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
     more = f", and {len(pairs) - 6} pairs more" if len(pairs) > 6 else ""
     return (
-        f"Known only together, a change of one being made good by the other: {', '.join(shown)}"
-        f"{more}."
+        "Known only together, since one can make up for a change of the other:"
+        f" {', '.join(shown)}{more}."
     )
 
 
@@ -84,7 +84,7 @@ def _whiteness(f: ResidualFigures, model: str, time: Scale) -> str:
 def _normality(f: ResidualFigures) -> str:
     figures = f"skewness {_signed(f.skewness)}, excess kurtosis {_signed(f.kurtosis)}"
     tail = f"{number(100.0 * f.beyond_three, 2)} % of the samples lie beyond three standard"
-    tail += " deviations, 0.27 % would if it were normal"
+    tail += " deviations, 0.27 % in a normal distribution"
     words = []
     if abs(f.skewness) > _SHAPE:
         words.append("longer upwards" if f.skewness > 0 else "longer downwards")

@@ -2,11 +2,13 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 from psa_casadi.diagnosis.residual.misfit import Misfit
-from psa_casadi.diagnosis.result import Alternative, Candidate, Cause, Diagnosis
+from psa_casadi.diagnosis.result import Alternative, Candidate, Cause, Decision, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.units import convert
 
@@ -37,7 +39,28 @@ class Scale:
         return f"{number(self.factor * metres, digits)} {self.unit}"
 
 
+_PAGE: ContextVar[Scale | None] = ContextVar("unit of a page", default=None)
+
+
+@contextmanager
+def one_unit(scale: Scale) -> Iterator[None]:
+    """Show all errors in one unit meanwhile, so that those of one page can be compared."""
+    before = _PAGE.set(scale)
+    try:
+        yield
+    finally:
+        _PAGE.reset(before)
+
+
 def length_scale(largest: float, *, counts: bool = False) -> Scale:
+    """Return the unit of a page's errors, else that in which `largest` [m] is a handy number."""
+    page = _PAGE.get()
+    if counts or page is None or page.unit == "counts":
+        return handy_scale(largest, counts=counts)
+    return page
+
+
+def handy_scale(largest: float, *, counts: bool = False) -> Scale:
     """Return the unit in which a length of size `largest` [m] is a handy number."""
     if counts:
         return Scale("counts", 1.0)
@@ -141,7 +164,7 @@ def added(d: Diagnosis) -> bool:
 
 #: What an interval of the gain from blocks of few records says.
 OWN_VOLTAGES = (
-    "The interval is taken over blocks of the held-out samples and speaks for these voltages only;"
+    "The interval is taken over blocks of the held-out samples and holds for these voltages only;"
     " for other voltages hold out four records or more (--holdout)."
 )
 
@@ -155,19 +178,30 @@ def gain_sentence(d: Diagnosis) -> str:
     return f"the held-out error falls by {gain:.0f} % (95 % interval {low:.0f} to {high:.0f} %)"
 
 
+_PLAIN = {
+    "adequate": "Nothing beyond the noise is missing from the base model",
+    "not_driven": "The displacement does not follow the voltage: nothing can be diagnosed",
+}
+
+
 def verdict_sentence(d: Diagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
+    if d.doubt:
+        seen = (
+            "Nothing beyond the noise is seen to be missing"
+            if d.verdict == "adequate"
+            else "Something is missing, and no cause is named"
+        )
+        return f"{seen}; {d.doubt}."
     error = (
         f"the base model's held-out error is {number(d.base_errors.holdout_nrmse_percent, 2)} %"
         " of the range"
     )
-    if d.verdict == "adequate":
-        return f"Nothing beyond the noise is missing from the base model; {error}."
-    if d.verdict == "not_driven":
-        return f"The displacement does not follow the voltage: nothing can be diagnosed; {error}."
+    if d.verdict in _PLAIN:
+        return f"{_PLAIN[d.verdict]}; {error}."
     if d.verdict == "unexplained" or not d.causes:
         return (
-            "Something is missing that no effect in the table explains, so no cause is named; "
+            "Something is missing, and no effect in the table explains it: no cause is named; "
             f"{_unnamed(d)}{error}."
         )
     causes = listing([_cause(c) for c in d.causes])
@@ -176,7 +210,7 @@ def verdict_sentence(d: Diagnosis) -> str:
         rivals = [plain(n) for n in (first.effect, *first.cannot_be_told_from)]
         together = listing([plain(c.effect) for c in d.causes])
         return (
-            f"Something is missing, and these data cannot tell whether it is"
+            f"Something is missing, and these data do not decide whether it is"
             f" {listing(rivals, 'or')}; with {together}, {gain_sentence(d)}."
         )
     are = "cause is" if len(d.causes) == 1 else "causes are"
@@ -210,6 +244,15 @@ def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
         f" displacement differs by up to {apart} ({number(a.plant_differs_percent, 2)} % of range),"
         " which these data do not decide"
     )
+
+
+def column_sentence(d: Diagnosis, c: Decision) -> str:
+    """Say what a further column decided, and what the models miss of it in held-out samples."""
+    if c.base_rms is None or c.noise is None or c.extended_rms is None:
+        return c.sentence
+    after = f", extended {number(c.extended_rms)}" if added(d) else ""
+    errors = f"base {number(c.base_rms)}{after}, noise {number(c.noise)}"
+    return f"{c.sentence} Held-out rms: {with_unit(errors, c.unit)}."
 
 
 def cause_size(d: Diagnosis, cause: Cause) -> str:

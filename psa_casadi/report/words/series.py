@@ -12,7 +12,7 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.phrases import Scale, added, length_scale
+from psa_casadi.report.words.phrases import Scale, added, handy_scale, length_scale
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
@@ -56,7 +56,7 @@ class Series:
     def scale(self) -> Scale:
         """The unit to show displacements in."""
         span = float(np.nanmax(self.measured) - np.nanmin(self.measured))
-        return length_scale(span, counts=self.counts)
+        return handy_scale(span, counts=self.counts)
 
     @property
     def time_scale(self) -> Scale:

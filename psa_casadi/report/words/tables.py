@@ -100,6 +100,17 @@ def error_table(d: Diagnosis, unit: str, factor: float) -> Table:
     return _table(("model", *head, "held-out rms [% of range]"), rows)
 
 
+def column_table(d: Diagnosis) -> Table:
+    """Return what base and extended model miss of every further column, beside its noise."""
+    rows = []
+    for c in d.columns:
+        errors = (c.noise, c.base_rms, c.extended_rms if added(d) else None)
+        shown = ("" if e is None else number(e) for e in errors)
+        rows.append((c.column, c.role, c.unit, *shown))
+    head = ("noise rms", "base, held-out rms", "extended, held-out rms")
+    return _table(("column", "used as", "unit", *head), rows)
+
+
 def fit_error_table(rows: Sequence[tuple[str, ResidualFigures]], scale: Scale) -> Table:
     """Return what the model leaves of every record, beside the record's noise level."""
     lines = []

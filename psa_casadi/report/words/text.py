@@ -18,6 +18,7 @@ from psa_casadi.report.words.phrases import (
     added,
     alternative_sentence,
     cause_size,
+    column_sentence,
     length_scale,
     listing,
     number,
@@ -58,6 +59,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
     for cause in d.causes:
         lines.append(("cause", _cause(d, cause)))
         lines.append(("rivals", _rivals(d, cause)))
+    lines.extend(("column", column_sentence(d, c)) for c in d.columns)
     lines.extend(("export", f"{alternative_sentence(d, a)}.") for a in d.alternatives)
     spent = budget_sentence(d, scale)
     if spent and d.verdict not in ("adequate", "not_driven"):
@@ -84,7 +86,7 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
             f"{plain(n)} ({probability_text(known[n])})" if first and known.get(n) else plain(n)
             for n in cause.cannot_be_told_from
         ]
-        return f"these data cannot tell it from {listing(rivals, 'or')}"
+        return f"these data cannot distinguish it from {listing(rivals, 'or')}"
     named = {c.effect for c in d.causes}
     others = [(p, n) for n, p in known.items() if n not in named]
     if not others or not first:

@@ -1,181 +1,12 @@
 """CasADi functions printed as C for exact steps: one text for a number and for lanes of numbers.
 
-What depends on the parameters alone is computed once for a run and kept in `k`. Powers of one base
-whose exponents differ by halves share one exponential; a division by a parameter is a product.
+What depends on the parameters alone is computed once for a run and kept in `k`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
-
-import casadi as ca
 
 from psa_casadi.component import Expression
-
-#: (operation, arguments) or ("x", index), ("c", value), ...; equal nodes are one number.
-_Node = tuple[Any, ...]
-#: (symbol's number or None, factor, shift)
-_Affine = tuple[int | None, float, float]
-
-_BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
-_CALLS = {
-    ca.OP_SQRT: "v_sqrt",
-    ca.OP_EXP: "v_exp",
-    ca.OP_LOG: "v_log",
-    ca.OP_FABS: "v_fabs",
-    ca.OP_FMIN: "v_fmin",
-    ca.OP_FMAX: "v_fmax",
-    ca.OP_SIN: "v_sin",
-    ca.OP_COS: "v_cos",
-    ca.OP_TAN: "v_tan",
-    ca.OP_ATAN: "v_atan",
-    ca.OP_TANH: "v_tanh",
-    ca.OP_SIGN: "v_sign",
-    ca.OP_LT: "v_less",
-    ca.OP_LE: "v_less_equal",
-    ca.OP_EQ: "v_equal",
-    ca.OP_NE: "v_unequal",
-    ca.OP_NOT: "v_not",
-    ca.OP_AND: "v_and",
-    ca.OP_OR: "v_or",
-    ca.OP_IF_ELSE_ZERO: "v_if",
-}
-_POWERS = (ca.OP_POW, ca.OP_CONSTPOW)
-_LEAVES = ("x", "v", "t", "w", "p", "c")
-
-
-class Unprintable(Exception):  # noqa: N818 - the model is stepped instead, which is no mistake
-    """An operation that these steps do not have."""
-
-
-@dataclass
-class _Graph:
-    """Nodes by number; a node's arguments have smaller numbers.
-
-    `fixed` ones need no state, `rated` ones none but the rate w.
-    """
-
-    nodes: list[_Node] = field(default_factory=list)
-    numbers: dict[_Node, int] = field(default_factory=dict)
-    fixed: list[bool] = field(default_factory=list)
-    rated: list[bool] = field(default_factory=list)
-
-    def add(self, *node: Any) -> int:
-        if node not in self.numbers:
-            leaf = node[0] in _LEAVES
-            given = [] if leaf else [int(a) for a in node[1:]]
-            self.numbers[node] = len(self.nodes)
-            self.nodes.append(node)
-            self.fixed.append(node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in given))
-            self.rated.append(
-                node[0] in ("p", "c", "w") if leaf else all(self.rated[a] for a in given)
-            )
-        return self.numbers[node]
-
-    def constant(self, value: float) -> int:
-        return self.add("c", float(value))
-
-    def value(self, number: int) -> float | None:
-        node = self.nodes[number]
-        return float(node[1]) if node[0] == "c" else None
-
-    def operation(self, op: int, *arguments: int) -> int:
-        if op == ca.OP_DIV and not (self.fixed[arguments[0]] and self.fixed[arguments[1]]):
-            return self._times(arguments[0], self._inverse(arguments[1]))
-        if op in _BINARY:
-            return self.add(_BINARY[op], *arguments)
-        if op in _POWERS:
-            return self._power(*arguments)
-        one = arguments[0]
-        simple: dict[int, Callable[[], int]] = {
-            ca.OP_SQ: lambda: self.add("*", one, one),
-            ca.OP_TWICE: lambda: self.add("+", one, one),
-            ca.OP_NEG: lambda: self.add("neg", one),
-            ca.OP_INV: lambda: self._inverse(one),
-            ca.OP_ASSIGN: lambda: one,
-        }
-        if op in simple:
-            return simple[op]()
-        if op == ca.OP_LOG and ("v_log_of_base", one) in self.numbers:
-            return self.add("v_log_of_base", one)  # beside a power of the same base
-        if op in _CALLS:
-            return self.add(_CALLS[op], *arguments)
-        raise Unprintable(f"operation {op}")
-
-    def _times(self, a: int, b: int) -> int:
-        return b if self.value(a) == 1.0 else self.add("*", a, b)
-
-    def _inverse(self, number: int) -> int:
-        """Return 1/x; one division serves all that divide by x, and by products with it."""
-        node = self.nodes[number]
-        if self.fixed[number]:
-            return self.add("/", self.constant(1.0), number)
-        if node[0] == "*":
-            return self.add("*", self._inverse(node[1]), self._inverse(node[2]))
-        if node[0] == "+" and node[1] == node[2]:
-            return self.add("*", self.constant(0.5), self._inverse(node[1]))
-        return self.add("/", self.constant(1.0), number)
-
-    def _power(self, base: int, exponent: int) -> int:
-        """Return base^exponent; base^(e + k/2) from base^e where that is there."""
-        symbol, factor, shift = self._affine(exponent)
-        halves = round(2.0 * shift)
-        if symbol is None:
-            if 2.0 * shift == halves and 0 < abs(halves) <= 32:
-                return self._halves(base, halves)
-            return self.add("v_exp", self.add("*", self.add("v_log_of_base", base), exponent))
-        rest = shift - 0.5 * halves
-        scaled = symbol if factor == 1.0 else self.add("*", symbol, self.constant(factor))
-        reduced = scaled if rest == 0.0 else self.add("+", scaled, self.constant(rest))
-        first = self.add("v_exp", self.add("*", self.add("v_log_of_base", base), reduced))
-        return self._shifted(first, base, halves)
-
-    def _shifted(self, power: int, base: int, halves: int) -> int:
-        """Return power base^(halves/2)."""
-        return self.add("*", power, self._halves(base, halves)) if halves else power
-
-    def _halves(self, base: int, halves: int) -> int:
-        """Return base^(halves/2): whole powers, roots, and what one division makes of them."""
-        if halves < 0:
-            return self._inverse(self._halves(base, -halves))
-        if halves % 2 == 0:
-            return self._whole(base, halves // 2)
-        root = self.add("v_sqrt", base)
-        return root if halves == 1 else self.add("*", self._whole(base, halves // 2), root)
-
-    def _whole(self, base: int, exponent: int) -> int:
-        if exponent == 1:
-            return base
-        half = self._whole(base, exponent // 2)
-        square = self.add("*", half, half)
-        return self.add("*", square, base) if exponent % 2 else square
-
-    def _affine(self, number: int) -> _Affine:
-        """Return (symbol, factor, shift) of an exponent factor symbol + shift."""
-        node = self.nodes[number]
-        if node[0] == "c":
-            return None, 0.0, node[1]
-        if node[0] == "neg":
-            symbol, factor, shift = self._affine(node[1])
-            return symbol, -factor, -shift
-        found = None
-        if node[0] in _BINARY.values():
-            found = _combined(node[0], self._affine(node[1]), self._affine(node[2]))
-        return found or (number, 1.0, 0.0)
-
-
-def _combined(operation: str, a: _Affine, b: _Affine) -> _Affine | None:
-    """Return the affine form of an operation on two, None if it is none."""
-    if operation in ("+", "-") and (a[0] is None or b[0] is None or a[0] == b[0]):
-        sign = 1.0 if operation == "+" else -1.0
-        return a[0] if a[0] is not None else b[0], a[1] + sign * b[1], a[2] + sign * b[2]
-    if operation == "*" and a[0] is None:
-        return b[0], a[2] * b[1], a[2] * b[2]
-    if operation == "*" and b[0] is None:
-        return a[0], b[2] * a[1], b[2] * a[2]
-    if operation == "/" and b[0] is None and b[2] != 0.0:
-        return a[0], a[1] / b[2], a[2] / b[2]
-    return None
+from psa_casadi.simulation.exact.graph import LEAVES, Graph
 
 
 class Printer:
@@ -183,7 +14,7 @@ class Printer:
 
     def __init__(self, arguments: Mapping[str, Expression]) -> None:
         self._arguments = dict(arguments)
-        self._graph = _Graph()
+        self._graph = Graph()
         self._kept: dict[int, int] = {}
         self._rated: dict[int, int] = {}
         self._own_rated: list[int] = []
@@ -191,7 +22,7 @@ class Printer:
 
     def function(self, name: str, outputs: Sequence[Expression]) -> None:
         """Print `static void name(t, x, v, w, k, out)` that fills `out` with all the outputs."""
-        numbers = self._numbers(outputs)
+        numbers = self._graph.read(self._arguments, outputs)
         lines = self._body(numbers, fixed=False)
         lines += [f"    out[{i}] = {self._name(n)};" for i, n in enumerate(numbers)]
         head = (
@@ -203,7 +34,7 @@ class Printer:
 
     def of_parameters(self, name: str, outputs: Sequence[Expression]) -> None:
         """Print `static void name(p, out)` for outputs that depend on the parameters alone."""
-        numbers = self._numbers(outputs)
+        numbers = self._graph.read(self._arguments, outputs)
         lines = self._body(numbers, fixed=True)
         lines += [f"    memset(out, 0, {len(numbers)} * sizeof *out);"]
         lines += [
@@ -238,28 +69,6 @@ class Printer:
         head = "APART static void psa_prepare(const real *p, real *k) {"
         return len(numbers), "\n".join([head, "    (void)p, (void)k;", *lines, "}", ""])
 
-    def _numbers(self, outputs: Sequence[Expression]) -> list[int]:
-        names = list(self._arguments)
-        whole = ca.cse([ca.densify(ca.vertcat(*[ca.vec(ca.SX(o)) for o in outputs]))])
-        function = ca.Function("f", list(self._arguments.values()), whole)
-        slots: dict[int, int] = {}
-        found = [0] * function.numel_out(0)
-        for k in range(function.n_instructions()):
-            op = function.instruction_id(k)
-            if op == ca.OP_CONST:
-                slots[function.instruction_output(k)[0]] = self._graph.constant(
-                    function.instruction_constant(k)
-                )
-            elif op == ca.OP_INPUT:
-                argument, element = function.instruction_input(k)
-                slots[function.instruction_output(k)[0]] = self._graph.add(names[argument], element)
-            elif op == ca.OP_OUTPUT:
-                found[function.instruction_output(k)[1]] = slots[function.instruction_input(k)[0]]
-            else:
-                given = [slots[a] for a in function.instruction_input(k)]
-                slots[function.instruction_output(k)[0]] = self._graph.operation(op, *given)
-        return found
-
     def _body(self, numbers: Sequence[int], *, fixed: bool, rated: bool = False) -> list[str]:
         """Return the assignments that numbers need; those of parameters or rate too, or from k."""
         needed: set[int] = set()
@@ -268,7 +77,7 @@ class Printer:
             n = stack.pop()
             node = self._graph.nodes[n]
             told = (self._graph.rated[n] and not rated) or self._graph.fixed[n]
-            if n in needed or node[0] in _LEAVES or (told and not fixed):
+            if n in needed or node[0] in LEAVES or (told and not fixed):
                 continue
             needed.add(n)
             stack += [int(a) for a in node[1:]]
@@ -287,7 +96,7 @@ class Printer:
 
     def _name(self, number: int) -> str:
         """Return how a varying function reads a node; what needs no state it reads from k."""
-        leaf = self._graph.nodes[number][0] in _LEAVES
+        leaf = self._graph.nodes[number][0] in LEAVES
         if self._graph.rated[number] and not (self._graph.fixed[number] or leaf):
             if number not in self._own_rated:
                 self._own_rated.append(number)

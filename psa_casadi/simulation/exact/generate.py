@@ -1,27 +1,25 @@
 """The generated half of the C code of exact steps: a model's functions, its split as tables."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Expression
+from psa_casadi.simulation.exact.columns import (
+    CHUNK,
+    Entry,
+    chain,
+    chains,
+    dispatch,
+    of_linear_part,
+)
 from psa_casadi.simulation.exact.dependence import closure
 from psa_casadi.simulation.exact.emit import Printer
 from psa_casadi.simulation.exact.split import Split
 
 _KINDS = {"group": "EX_GROUP", "port": "EX_PORT", "loop": "EX_LOOP"}
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A partial derivative that is not zero: of which row, by a state (0), the rate (1), p (2)."""
-
-    row: int
-    kind: int
-    index: int
 
 
 def generate(split: Split, output: str) -> str:
@@ -42,7 +40,7 @@ def generate(split: Split, output: str) -> str:
     printer.function("ex_outputs", [s.y])
     printer.function("ex_shown", [shown])
     printer.function("ex_shown_slopes", [shown, *partials])
-    printer.functions.append(_chains("ex_shown_chain", [_chain("ex_shown_chain_0", entries)]))
+    printer.functions.append(chains("ex_shown_chain", [chain("ex_shown_chain_0", entries)]))
     kept, prepare = printer.kept()
     place = {state: k for k, state in enumerate(split.linear)}
     chords = [k for k, q in enumerate(split.ports) if q.chord >= 0]
@@ -63,7 +61,6 @@ def generate(split: Split, output: str) -> str:
         "ex_path": path,
         "ex_theta": thetas,
         "ex_reads": [int(np.flatnonzero(row)[-1]) + 1 for row in reach],
-        "ex_row_size": [int(row.sum()) for row in reach],
         "ex_port_timed": [int(ca.depends_on(q.value, s.time)) for q in split.ports],
         "ex_port_reaches": [int(np.flatnonzero(reach[:, place[q.state]])[0]) for q in split.ports],
         "ex_port_row": [place[q.state] for q in split.ports],
@@ -84,14 +81,17 @@ def generate(split: Split, output: str) -> str:
         "EX_NFEED": max((len(f) for f in feeds), default=0),
         "EX_NDRIVE": max((lists["ex_reads"][k] for k in lists["ex_chord_driver"]), default=0),
     }
-    sizes |= {"EX_NEED": len(needed), "EX_NPATH": len(path)}
+    sizes |= {"EX_NEED": len(needed), "EX_NPATH": len(path), "EX_CHUNK": CHUNK}
+    sizes["EX_NOWN"] = int(reach.sum()) + int(reach[lists["ex_need"]].sum())
+    printer.functions.append(of_linear_part(reach, lists["ex_need"], split.linear))
     head = ["#ifndef PSA_EXACT_MODEL_H", "#define PSA_EXACT_MODEL_H", '#include "exact_math.h"']
     head += [f"#define {name} {value}" for name, value in sizes.items()]
+    head += ["#define EX_ROWS ((EX_NL + COLUMNS - 1) / COLUMNS * COLUMNS)"]
     head += [
         "enum { EX_GROUP, EX_PORT, EX_LOOP };",
         "typedef struct { int kind, count; const int *members; } psa_item;",
         *(_integers(name, values) for name, values in lists.items()),
-        _table("ex_row", [np.flatnonzero(row).tolist() for row in reach], len(split.linear)),
+        _table("ex_reach", reach.astype(int).tolist(), len(split.linear)),
         _table("ex_feed", feeds, sizes["EX_NFEED"] + 1),
         _table("ex_port_along", _along(split), max(1, len(split.groups))),
         *tables,
@@ -123,7 +123,7 @@ def _items(split: Split) -> list[str]:
 
 def _partials(
     split: Split, rows: Sequence[Expression], rate: Expression | None
-) -> tuple[list[Expression], list[_Entry]]:
+) -> tuple[list[Expression], list[Entry]]:
     """Return the partial derivatives that are not zero, with their entries."""
     s = split.structure
     sources = [(0, s.x), (1, rate), (2, s.p)]
@@ -136,52 +136,15 @@ def _partials(
             for k in range(by.numel()):
                 if slopes.sparsity().has_nz(0, k):
                     found.append(slopes[0, k])
-                    entries.append(_Entry(row, kind, k))
+                    entries.append(Entry(row, kind, k))
     return found, entries
 
 
-_GIVEN = "real t, const real *x, const real *v, real w, const real *k, real *out"
 _OF_RATE = "real w, real *k"
-_OF_COLUMNS = "const real *d, const column *x, column w, const column *p, column *out"
-
-
-def _dispatch(name: str, count: int, given: str = _GIVEN) -> str:
-    """Return a function that calls the one with the number it is given."""
-    passed = [q.split()[-1].lstrip("*") for q in given.split(",")]
-    unused = ", ".join(f"(void){q}" for q in passed)
-    calls = ", ".join(passed)
-    cases = "".join(f"    case {k}: {name}_{k}({calls}); break;\n" for k in range(count))
-    return (
-        f"static inline void {name}(int which, {given}) {{\n    {unused};\n"
-        f"    switch (which) {{\n{cases}    default: break;\n    }}\n}}\n"
-    )
-
-
-def _chain(name: str, entries: Sequence[_Entry], rows: int = 1, last: Sequence[int] = ()) -> str:
-    """Return the chain rule as C: partial derivatives `d` times columns of what they are by.
-
-    Terms by the states `last` stand at the end: what comes before does not wait for them.
-    """
-    terms: list[list[tuple[bool, str]]] = [[] for _ in range(rows)]
-    for place, e in enumerate(entries):
-        by = ("x[{}]", "w", "p[{}]")[e.kind].format(e.index)
-        terms[e.row].append((e.kind == 0 and e.index in last, f"d[{place}] * {by}"))
-    lines = [
-        f"    out[{i}] = {' + '.join(term for _, term in sorted(row)) or '(column){0.0}'};\n"
-        for i, row in enumerate(terms)
-    ]
-    unused = "    (void)d, (void)x, (void)w, (void)p;\n"
-    return f"static inline void {name}({_OF_COLUMNS}) {{\n{unused}{''.join(lines)}}}\n"
-
-
-def _chains(name: str, chains: Sequence[str]) -> str:
-    """Return chains and the function that calls one of them; with lanes there are no columns."""
-    text = "".join(chains) + _dispatch(name, len(chains), _OF_COLUMNS)
-    return f"#if PSA_LANES == 1\n{text}#endif\n"
 
 
 def _groups(split: Split, printer: Printer, rate: Expression) -> tuple[int, int]:
-    s, chains, rate_chains, largest, rate_size = split.structure, [], [], 1, 1
+    s, texts, rate_texts, largest, rate_size = split.structure, [], [], 1, 1
     for k, group in enumerate(split.groups):
         slopes = ca.substitute(group.slopes, group.rate, rate)
         rows = [slopes[i] for i in range(len(group.states))]
@@ -195,23 +158,23 @@ def _groups(split: Split, printer: Printer, rate: Expression) -> tuple[int, int]
         printer.function(f"ex_rate_slopes_{k}", [driver, *moved])
         rate_size = max(rate_size, 1 + len(moved))
         largest = max(largest, len(rows) + len(partials))
-        chains.append(_chain(f"ex_group_chain_{k}", entries, len(rows), group.states))
-        rate_chains.append(_chain(f"ex_rate_chain_{k}", rate_entries))
+        texts.append(chain(f"ex_group_chain_{k}", entries, len(rows), group.states))
+        rate_texts.append(chain(f"ex_rate_chain_{k}", rate_entries))
     for name in ("ex_group", "ex_group_slopes", "ex_rate", "ex_rate_slopes"):
-        printer.functions.append(_dispatch(name, len(split.groups)))
-    printer.functions.append(_dispatch("ex_group_rate", len(split.groups), _OF_RATE))
-    printer.functions.append(_chains("ex_group_chain", chains))
-    printer.functions.append(_chains("ex_rate_chain", rate_chains))
+        printer.functions.append(dispatch(name, len(split.groups)))
+    printer.functions.append(dispatch("ex_group_rate", len(split.groups), _OF_RATE))
+    printer.functions.append(chains("ex_group_chain", texts))
+    printer.functions.append(chains("ex_rate_chain", rate_texts))
     return largest, rate_size
 
 
 def _ports(split: Split, printer: Printer, tables: list[str]) -> int:
-    chains, by_state, largest = [], [], 1
+    texts, by_state, largest = [], [], 1
     for k, port in enumerate(split.ports):
         partials, entries = _partials(split, [port.value], None)
         printer.function(f"ex_port_{k}", [port.value])
         printer.function(f"ex_port_slopes_{k}", [port.value, *partials])
-        chains.append(_chain(f"ex_port_chain_{k}", entries))
+        texts.append(chain(f"ex_port_chain_{k}", entries))
         at = [-1] * len(split.linear)
         for place, entry in enumerate(entries):
             if entry.kind == 0 and entry.index in split.linear:
@@ -220,8 +183,8 @@ def _ports(split: Split, printer: Printer, tables: list[str]) -> int:
         largest = max(largest, 1 + len(partials))
     tables.append(_table("ex_port_by_linear", by_state, max(1, len(split.linear))))
     for name in ("ex_port", "ex_port_slopes"):
-        printer.functions.append(_dispatch(name, len(split.ports)))
-    printer.functions.append(_chains("ex_port_chain", chains))
+        printer.functions.append(dispatch(name, len(split.ports)))
+    printer.functions.append(chains("ex_port_chain", texts))
     return largest
 
 

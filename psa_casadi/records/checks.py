@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from psa_casadi.errors import Problems
 from psa_casadi.units import FloatArray
 
-#: Fewer samples than this describe no experiment.
-MIN_SAMPLES = 16
-
+#: Fewer samples than this describe no experiment, and judge none.
+FEWEST_SAMPLES = 16
 #: Larger numbers are no measured ones, in whatever unit; their squares would soon be infinite.
 LARGEST = 1e100
 
@@ -46,11 +45,11 @@ class Located:
 
 
 def check_length(path: str, samples: int, problems: Problems) -> None:
-    """Demand at least `MIN_SAMPLES` samples."""
-    if samples < MIN_SAMPLES:
+    """Demand at least `FEWEST_SAMPLES` samples."""
+    if samples < FEWEST_SAMPLES:
         problems.add(
-            f"{path}: found {samples} samples, expected at least {MIN_SAMPLES}; record for longer "
-            f"or name the right file."
+            f"{path}: found {samples} samples, expected at least {FEWEST_SAMPLES}; record for "
+            f"longer or name the right file."
         )
 
 
@@ -59,8 +58,10 @@ def check_time(time: Located, problems: Problems) -> None:
     check_complete(time, problems)
     known = np.flatnonzero(np.isfinite(time.values))
     wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
-    problems.add_uncounted(max(0, wrong.size - LISTED))
-    for row, before in zip(known[wrong + 1][:LISTED], known[wrong][:LISTED], strict=True):
+    if wrong.size > LISTED:
+        problems.add(_disorder(time, known[wrong], known[wrong + 1]))
+        return
+    for row, before in zip(known[wrong + 1], known[wrong], strict=True):
         now, last = time.values[row], time.values[before]
         what = "stands still" if now == last else "goes back"
         problems.add(
@@ -71,6 +72,19 @@ def check_time(time: Located, problems: Problems) -> None:
         )
 
 
+def _disorder(time: Located, before: NDArray[np.intp], after: NDArray[np.intp]) -> str:
+    """Say in one sentence what is wrong with the order of many rows."""
+    first, still = after[0], time.values[after] == time.values[before]
+    places = f"{time.place}s"
+    where = (
+        f"{time.path}: column 'time': {after.size} of {time.values.size} {places} are not later"
+        f" than the one before, {time.place} {time.lines[first]} the first of them"
+    )
+    if np.all(still):
+        return f"{where}: their time stands still; remove repeated {places}."
+    return f"{where}: the {places} are not in the order of time; sort them by it."
+
+
 def check_complete(column: Located, problems: Problems) -> None:
     """Demand a finite number in every row."""
     column.complain(
@@ -78,17 +92,17 @@ def check_complete(column: Located, problems: Problems) -> None:
         "found no value, expected a number; fill the cell or remove the {place}.",
         problems,
     )
-    _check_finite(column, problems)
+    check_finite(column, problems)
 
 
 def check_displacement(column: Located, problems: Problems) -> None:
     """Demand finite numbers, of which enough are there; missing ones are allowed."""
-    _check_finite(column, problems)
+    check_finite(column, problems)
     valid = int(np.isfinite(column.values).sum())
-    if column.values.size >= MIN_SAMPLES > valid:
+    if column.values.size >= FEWEST_SAMPLES > valid:
         problems.add(
             f"{column.path}: column 'displacement': found {valid or 'no'} valid values in "
-            f"{column.values.size} rows, expected at least {MIN_SAMPLES}; check that the sensor "
+            f"{column.values.size} rows, expected at least {FEWEST_SAMPLES}; check that the sensor "
             f"was recorded."
         )
 
@@ -103,7 +117,8 @@ def check_excitation(column: Located, problems: Problems) -> None:
         )
 
 
-def _check_finite(column: Located, problems: Problems) -> None:
+def check_finite(column: Located, problems: Problems) -> None:
+    """Demand measured numbers where there are any."""
     column.complain(
         np.isinf(column.values),
         "found {value}, expected a finite number; correct the cell or remove the {place}.",

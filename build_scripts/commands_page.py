@@ -1,0 +1,30 @@
+"""Hook of mkdocs: the page of commands is made from the command line itself."""
+
+import re
+from typing import Any
+
+import typer
+from typer.cli import get_docs_for_click
+from typer.main import get_command
+
+from psa_casadi.cli.app import app
+
+PAGE = "commands.md"
+
+#: What is shortened with dots stands below in full.
+_SHORTENED = re.compile(r"^\*\*Commands\*\*:\n\n(?:\* .*\n)+\n?", re.MULTILINE)
+_EXAMPLE = re.compile(r"^Example: (psa .*)$", re.MULTILINE)
+_TITLE = re.compile(r"\A# .*\n+")
+
+
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Return the text of a page, the one of commands with all of them below."""
+    return f"{markdown}\n{commands()}" if page.file.src_uri == PAGE else markdown
+
+
+def commands() -> str:
+    """Return every command with its arguments and options in Markdown."""
+    command = get_command(app)
+    context = typer.Context(command, info_name="psa")
+    text = get_docs_for_click(obj=command, ctx=context, name="psa")
+    return _EXAMPLE.sub(r"Example: `\1`", _TITLE.sub("", _SHORTENED.sub("", text)))

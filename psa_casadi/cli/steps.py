@@ -1,0 +1,85 @@
+"""How far a long work is, in words: the step of how many, the time so far, what is usual."""
+
+import time as clock
+from dataclasses import dataclass
+
+from rich.text import Text
+
+
+@dataclass(frozen=True)
+class Course:
+    """The steps that a work takes in turn: a name, and how what it tells meanwhile begins or ends.
+
+    Nine in ten take no longer than `usual_s` [s], once their models are compiled.
+    """
+
+    steps: tuple[tuple[str, tuple[str, ...]], ...]
+    usual_s: float
+
+    def step_of(self, told: str) -> int:
+        """Return the number of the step that tells something, from 1; 0 where none does."""
+        for k, (_, marks) in enumerate(self.steps, 1):
+            if told.startswith(marks):
+                return k
+        return 0
+
+
+_BASE = ("starting values", ("starting values",))
+_FIT = ("the base model", ("base fit", "exchanged", "resonances and lags", "moments", "the model"))
+IDENTIFY = Course(
+    (_BASE, _FIT, ("what to measure next", ("what further",)), ("files", ("profile", "writing"))),
+    20.0,
+)
+DIAGNOSE = Course(
+    (
+        _BASE,
+        _FIT,
+        ("screening the effects", ("the displacement with", "screening")),
+        (
+            "trying causes",
+            ("cause ", "several causes", "without ", "all causes", "fitting the r", "the same"),
+        ),
+        ("judging", ("judging",)),
+        ("files", ("comparing", "improving", "writing", "fitting the unnamed")),
+    ),
+    40.0,
+)
+PLAIN = Course((), 0.0)
+
+
+class Told:
+    """What a work has told so far, as a line that a terminal draws again and again."""
+
+    def __init__(self, what: str, course: Course) -> None:
+        self._what, self._course = what, course
+        self._begin, self._step, self._said = clock.monotonic(), 0, ""
+
+    def tell(self, said: str) -> None:
+        """Take what is told; the step never goes back, as parts of a work come again."""
+        self._said = said
+        self._step = max(self._step, self._course.step_of(said))
+
+    def line(self) -> str:
+        """Return how far the work is."""
+        elapsed = clock.monotonic() - self._begin
+        parts = [self._what]
+        if self._step:
+            name, _ = self._course.steps[self._step - 1]
+            parts.append(f"step {self._step} of {len(self._course.steps)} ({name})")
+        parts.append(_duration(elapsed))
+        line = ", ".join(parts)
+        if self._course.usual_s:
+            usual = _duration(self._course.usual_s)
+            late = elapsed > self._course.usual_s
+            line += f" (longer than most: {usual})" if late else f" (most take up to {usual})"
+        return f"{line}: {self._said}" if self._said else line
+
+    def __rich__(self) -> Text:
+        """Return the line as it is now."""
+        return Text(self.line())
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min"

@@ -1,0 +1,143 @@
+"""What an FMU carries as evidence: whether it is the model's, and what it takes to repeat it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.check.playback import ERROR_LIMIT, Playback
+from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, stopped
+from psa_casadi.export.common.posterior import MOST_SAMPLES
+from psa_casadi.export.fmu.evidence_files import (
+    OUTPUTS,
+    SETS,
+    VALIDATION,
+    evidence_texts,
+    run_inputs,
+    run_start,
+)
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.importer.masters import Signals
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.prepare import prepared
+from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import Evidence, RecordRun
+from psa_casadi.records.quality.suspects import cleaned
+from psa_casadi.records.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+
+_NONE = (
+    "the model says nothing of its records and errors; identify or diagnose it with this version of"
+    " psa_casadi, and export it again"
+)
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """Rows that need no run, and the runs to play."""
+
+    rows: tuple[CheckRow, ...]
+    playbacks: tuple[Playback, ...]
+
+
+def wrong_evidence(archive: Archive, model: Model) -> Iterator[str]:
+    """The files of evidence are what the model's evidence makes them."""
+    folder = archive.directory
+    samples = min(len(list((folder / SETS).glob("sample_*.ssv"))), MOST_SAMPLES)
+    expected = evidence_texts(model, samples)
+    for name, text in sorted(expected.items()):
+        if not (folder / name).is_file():
+            yield f"{name} is missing"
+        elif (folder / name).read_bytes() != text.encode("utf-8"):
+            yield f"{name} is not what the model says"
+    if model.evidence is not None and model.evidence.reference is not None:
+        yield from (f"{n} is missing" for n in (OUTPUTS, VALIDATION) if not (folder / n).is_file())
+    found = {p.relative_to(folder).as_posix() for p in (folder / SETS).glob("*")}
+    yield from (f"{name} is not among the model's" for name in sorted(found - set(expected)))
+
+
+def repeated(archive: Archive, model: Model | None, records: Sequence[Record]) -> Repeated:
+    """Return what `psa check --evidence` tells, with records that stand behind the model."""
+    evidence = model.evidence if model else None
+    if model is None or evidence is None:
+        return Repeated((count("evidence", lambda: (_NONE,)),), ())
+    rows = [count("records as stated", _strange, evidence, records)] if records else []
+    playbacks = []
+    try:
+        if evidence.reference is not None:
+            playbacks.append(_reference(archive, model))
+    except BREAKDOWNS as error:
+        rows.append(stopped("reference run", f"the check stopped: {error}"))
+    for record in records:
+        for run in (r for r in evidence.runs if r.sha256 == record.sha256):
+            found = _of_record(archive, model, record, run)
+            if isinstance(found, Playback):
+                playbacks.append(found)
+            else:
+                rows.append(found)
+    return Repeated(tuple(rows), tuple(playbacks))
+
+
+def _strange(evidence: Evidence, records: Sequence[Record]) -> Iterator[str]:
+    known = {r.sha256 for r in evidence.runs}
+    for record in records:
+        if record.sha256 not in known:
+            of = ", ".join(f"{r.record} ({r.sha256[:12]}...)" for r in evidence.runs)
+            yield f"{record.name} has sha256 {record.sha256[:12]}..., the model states {of}"
+
+
+def _reference(archive: Archive, model: Model) -> Playback:
+    """Return the run that the archive holds; raises what is wrong with its file of outputs."""
+    times, values = run_inputs(model)
+    text = (archive.directory / OUTPUTS).read_text(encoding="utf-8")
+    names = text.partition("\n")[0].split(",")
+    table = np.loadtxt(text.splitlines()[1:], delimiter=",", ndmin=2)
+    if table.shape != (len(times), len(names)) or "displacement" not in names:
+        raise InputError(f"{OUTPUTS} has not a row of outputs for each time")
+    inputs = Signals(model.input_names, times, values)
+    expected = table[:, names.index("displacement")]
+    return Playback("reference run", times, inputs, run_start(model), "displacement", expected)
+
+
+def _of_record(
+    archive: Archive, model: Model, record: Record, run: RecordRun
+) -> Playback | CheckRow:
+    """Return the run of a record, or the row that says why there is none."""
+    kind = "held-out" if run.held_out else "fitted"
+    name = f"{kind} error of {record.name}"
+    present = {c.name for c in model.components}
+    outside = model.evidence.outside if model.evidence else ()
+    if missing := [n for n in outside if n not in present]:
+        remark = f"not compared: the FMU leaves out {', '.join(missing)}, with which it was found"
+        return CheckRow(name, 0.0, ERROR_LIMIT, True, remark)
+    ready = prepared(record)[0] if run.averaged > 1 else cleaned(record)
+    if ready.n != run.samples:
+        return stopped(name, f"the record has {ready.n} samples, {run.samples} are stated")
+    shown = "measured_displacement"
+    times = ready.time - ready.time[0]
+    return Playback(
+        name,
+        times,
+        _signals(archive, ready, times),
+        {n: v for n, v in run.start.items() if n in model.state_names},
+        shown if shown in archive.names("output") else "displacement",
+        np.where(_judged(run), measured(ready) - run.offset_m, np.nan),
+        run.held_out_m if run.held_out else run.fitted_m,
+    )
+
+
+def _signals(archive: Archive, record: Record, times: FloatArray) -> Signals:
+    columns = {n: getattr(record, n, None) for n in archive.names("input")}
+    known = {n: c for n, c in columns.items() if c is not None}
+    return Signals(tuple(known), times, np.array(list(known.values())).T)
+
+
+def _judged(run: RecordRun) -> npt.NDArray[np.bool_]:
+    """Return the samples that the stated error is over."""
+    mask = np.full(run.samples, not run.held_out)
+    for first, stop in run.held_out:
+        mask[first:stop] = True
+    return mask

@@ -1,0 +1,146 @@
+"""Expressions as C99: one assignment for each number, in double or single precision."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from psa_casadi.component import Expression
+from psa_casadi.simulation.exact.graph import LEAVES, Graph, Unprintable
+
+_FUNCTIONS = {
+    "v_sqrt": "sqrt", "v_exp": "exp", "v_log": "log", "v_log_of_base": "log", "v_fabs": "fabs",
+    "v_sin": "sin", "v_cos": "cos", "v_tan": "tan", "v_atan": "atan", "v_tanh": "tanh",
+}  # fmt: skip
+_COMPARED = {"v_less": "<", "v_less_equal": "<=", "v_equal": "==", "v_unequal": "!="}
+_LOGICAL = {**dict.fromkeys(_COMPARED, 2), "v_not": 1, "v_and": 2, "v_or": 2}
+
+
+@dataclass(frozen=True)
+class Precision:
+    """A precision of C: its type, and the suffix of its constants and functions."""
+
+    name: str
+    ctype: str
+    suffix: str
+    single: bool
+
+    def literal(self, value: float) -> str:
+        """Return a constant; what is too small for the precision is 0.
+
+        Raises Unprintable where it is too large, or no number.
+        """
+        limits = np.finfo(np.float32 if self.single else np.float64)
+        if not abs(value) <= float(limits.max):
+            raise Unprintable(f"the constant {value:g} is no number in {self.name} precision")
+        kept = float(value) if abs(value) >= float(limits.tiny) else 0.0
+        return f"{kept!r}{self.suffix}"
+
+
+PRECISIONS = {
+    "double": Precision("double", "double", "", single=False),
+    "single": Precision("single", "float", "f", single=True),
+}
+
+
+@dataclass
+class Printer:
+    """Prints expressions of named places; equal numbers are computed once.
+
+    `places` names the letters of symbols ("x", "v", "t") and gives the C text of their elements.
+    """
+
+    precision: Precision
+    symbols: Mapping[str, Expression]
+    places: Mapping[str, Sequence[str]]
+    used: set[tuple[str, int]] = field(default_factory=set)
+
+    def lines(self, outputs: Sequence[Expression]) -> tuple[list[str], list[str]]:
+        """Return assignments in their order, and the C text of each output."""
+        graph = Graph()
+        numbers = graph.read(self.symbols, outputs)
+        folded: dict[int, float] = {}
+        needed = self._needed(graph, numbers, folded)
+        ctype = self.precision.ctype
+        lines = [
+            f"const {ctype} s{n} = {self._value(graph, folded, n)};"
+            for n in needed
+            if graph.nodes[n][0] not in _LOGICAL
+        ]
+        return lines, [self._name(graph, folded, n) for n in numbers]
+
+    def _needed(self, graph: Graph, numbers: Sequence[int], folded: dict[int, float]) -> list[int]:
+        """Return the numbers to compute, sorted; constants are computed here."""
+        for n, node in enumerate(graph.nodes):
+            if graph.fixed[n] and node[0] not in LEAVES:
+                folded[n] = _constant(node[0], [_known(graph, folded, a) for a in node[1:]])
+        needed: set[int] = set()
+        stack = list(numbers)
+        while stack:
+            n = stack.pop()
+            if n in needed or graph.fixed[n] or graph.nodes[n][0] in LEAVES:
+                continue
+            needed.add(n)
+            stack += [int(a) for a in graph.nodes[n][1:]]
+        return sorted(needed)
+
+    def _name(self, graph: Graph, folded: Mapping[int, float], n: int) -> str:
+        kind = graph.nodes[n][0]
+        if graph.fixed[n]:
+            return self.precision.literal(_known(graph, folded, n))
+        if kind in LEAVES:
+            self.used.add((kind, graph.nodes[n][1]))
+            return self.places[kind][graph.nodes[n][1]]
+        if kind in _LOGICAL:
+            one, none = self.precision.literal(1.0), self.precision.literal(0.0)
+            return f"({self._condition(graph, folded, n)} ? {one} : {none})"
+        return f"s{n}"
+
+    def _condition(self, graph: Graph, folded: Mapping[int, float], n: int) -> str:
+        kind, *arguments = graph.nodes[n]
+        if kind in _COMPARED:
+            a, b = (self._name(graph, folded, q) for q in arguments)
+            return f"({a} {_COMPARED[kind]} {b})"
+        if kind in _LOGICAL:
+            inner = [self._condition(graph, folded, q) for q in arguments]
+            if kind == "v_not":
+                return f"(!{inner[0]})"
+            return f"({inner[0]} {'|' if kind == 'v_or' else '&'} {inner[1]})"
+        return f"({self._name(graph, folded, n)} != {self.precision.literal(0.0)})"
+
+    def _value(self, graph: Graph, folded: Mapping[int, float], n: int) -> str:
+        kind, *arguments = graph.nodes[n]
+        none = self.precision.literal(0.0)
+        if kind == "v_if":
+            condition = self._condition(graph, folded, arguments[0])
+            return f"{condition} ? {self._name(graph, folded, arguments[1])} : {none}"
+        given = [self._name(graph, folded, a) for a in arguments]
+        if kind == "neg":
+            return f"-({given[0]})"
+        if kind in ("+", "-", "*", "/"):
+            right = f"({given[1]})" if given[1].startswith("-") else given[1]
+            return f"{given[0]} {kind} {right}"
+        if kind in ("v_fmin", "v_fmax"):
+            sign = "<" if kind == "v_fmin" else ">"
+            return f"{given[0]} {sign} {given[1]} ? {given[0]} : {given[1]}"
+        if kind == "v_sign":
+            one = self.precision.literal(1.0)
+            return f"{given[0]} > {none} ? {one} : ({given[0]} < {none} ? -{one} : {none})"
+        return f"{_FUNCTIONS[kind]}{self.precision.suffix}({', '.join(given)})"
+
+
+def _known(graph: Graph, folded: Mapping[int, float], n: int) -> float:
+    value = graph.value(n)
+    return folded[n] if value is None else value
+
+
+def _constant(kind: str, given: Sequence[float]) -> float:
+    """Return the value of an operation on constants."""
+    if kind == "neg":
+        return -given[0]
+    if kind == "v_sqrt":
+        return float(np.sqrt(given[0]))
+    if kind not in ("+", "-", "*", "/"):
+        raise Unprintable(f"operation {kind} on constants")
+    a, b = given
+    return {"+": a + b, "-": a - b, "*": a * b, "/": a / b if b else float("nan")}[kind]

@@ -1,0 +1,158 @@
+"""Plans a model's fixed step: whether it fits, in how many substeps, how far it errs."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.errors import InputError
+from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
+from psa_casadi.export.fixed_step.header import header_code
+from psa_casadi.export.fixed_step.plan import CodePlan, check_names, timed
+from psa_casadi.export.fixed_step.probe import VoltageError, errors
+from psa_casadi.export.fixed_step.source import source_code
+from psa_casadi.export.fixed_step.step import step_expression
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.exact.graph import Unprintable
+from psa_casadi.simulation.exact.split import split_of
+
+#: Substeps that are tried where none are asked for, and the error that is good enough.
+SUBSTEPS, GOOD = (1, 2, 4, 8), 1e-3
+#: Error beyond which a step is of no use.
+USELESS = 0.1
+_HELD = {"linear": False, "zero": True}
+
+
+@dataclass(frozen=True, eq=False)
+class FixedStep:
+    """A planned step with its sources by file name, and its measured errors."""
+
+    plan: CodePlan
+    texts: dict[str, str]
+    errors: tuple[VoltageError, ...]
+
+    @property
+    def worst(self) -> VoltageError:
+        """Return the largest error."""
+        return max(self.errors, key=lambda e: e.error)
+
+
+def fixed_step(
+    model: Model,
+    *,
+    name: str,
+    step: float,
+    precision: str = "double",
+    hold: str = "linear",
+    substeps: int | None = None,
+) -> FixedStep:
+    """Return the fixed step of a model: generated, compiled here, and compared.
+
+    Without `substeps` the fewest of `SUBSTEPS` that err by less than `GOOD` are taken, or those
+    that err least.
+
+    Raises InputError for bad arguments, for a model that does not fit, with the effect and the
+    reason, and for a step that is too long; MachineError if the compiler fails.
+    """
+    _check(name, step, precision, hold, substeps)
+    chosen = PRECISIONS[precision]
+    found: list[FixedStep] = []
+    for count in SUBSTEPS if substeps is None else (substeps,):
+        plan, source = _planned(model, _Wish(name, step, count, _HELD[hold], chosen))
+        texts = {f"{name}.h": header_code(plan), f"{name}.c": source}
+        measured = errors(plan, texts)
+        texts[f"{name}.h"] = header_code(plan, measured)
+        found.append(FixedStep(plan, texts, measured))
+        if found[-1].worst.error <= GOOD:
+            break
+    good = [f for f in found if f.worst.error <= GOOD]
+    best = (good or sorted(found, key=lambda f: f.worst.error))[0]
+    if not best.worst.error <= USELESS:
+        raise InputError(
+            f"With a step of {step:g} s in {best.plan.substeps} substeps the displacement errs by"
+            f" {100 * best.worst.error:.3g} % of its range on {best.worst.voltage}; the step is too"
+            " long for this model: take a shorter one, or more --substeps."
+        )
+    return best
+
+
+def _check(name: str, step: float, precision: str, hold: str, substeps: int | None) -> None:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+        raise InputError(
+            f"'{name}' cannot name functions in C; use letters, digits, underscores, no digit"
+            " first."
+        )
+    if not (np.isfinite(step) and step > 0.0):
+        raise InputError(f"The step is {step:g} s; give a time above 0, such as 10us.")
+    if precision not in PRECISIONS:
+        raise InputError(f"The precision '{precision}' is not known; choose double or single.")
+    if hold not in _HELD:
+        raise InputError(f"The hold '{hold}' is not known; choose linear or zero.")
+    if substeps is not None and not 1 <= substeps <= 1000:
+        raise InputError(f"The substeps are {substeps}; give a number from 1 to 1000.")
+
+
+@dataclass(frozen=True)
+class _Wish:
+    """How a step is wanted, whatever the model."""
+
+    name: str
+    step: float
+    substeps: int
+    held: bool
+    precision: Precision
+
+
+def _planned(model: Model, wish: _Wish) -> tuple[CodePlan, str]:
+    """Return the plan of a step and its source.
+
+    Raises InputError where the model does not fit, with the effect to blame and the reason.
+    """
+    found = _plan_or_reason(model, wish)
+    if not isinstance(found, str):
+        check_names(found[0])
+        return found
+    own = {c.name for c in (*BASE, *SIMPLIFIED)}
+    without = [c.name for c in model.components if _fits_without(model, c.name, wish)]
+    blamed = [name for name in without if name not in own]
+    if not blamed:
+        raise InputError(
+            f"The model '{model.name}' has no step of fixed length and constant cost: {found}."
+            " Export an FMU with the adaptive solver."
+        )
+    who = " or ".join(f"'{name}'" for name in blamed)
+    raise InputError(
+        f"The effect {who} does not fit a step of fixed length and constant cost: with it the"
+        f" model is not of the form that is needed ({found}). Leave the effect out, or export an"
+        " FMU with the adaptive solver."
+    )
+
+
+def _plan_or_reason(model: Model, wish: _Wish) -> tuple[CodePlan, str] | str:
+    split = split_of(model.structure)
+    if isinstance(split, str):
+        return split
+    if not model.output_names:
+        return "it has no outputs"
+    expression = step_expression(model, split, wish.step / wish.substeps)
+    plan = CodePlan(
+        model, expression, wish.name, wish.step, wish.substeps, wish.held, wish.precision
+    )
+    if wish.precision.single and timed(plan):
+        return (
+            "its equations depend on the time itself, which single precision knows to 0.2 ms after"
+            " an hour; double precision does not have this limit"
+        )
+    try:
+        return plan, source_code(plan)
+    except Unprintable as reason:
+        return f"its equations have what the code cannot express, {reason}"
+
+
+def _fits_without(model: Model, name: str, wish: _Wish) -> bool:
+    try:
+        other = model.without([name])
+    except InputError:
+        return False  # others need it
+    return not isinstance(_plan_or_reason(other, wish), str)

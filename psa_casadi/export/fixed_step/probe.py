@@ -1,0 +1,147 @@
+"""The generated code run on this machine: compiled, played on reference voltages, compared."""
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from psa_casadi.export.fixed_step.matrices import FloatArray
+from psa_casadi.export.fixed_step.plan import CodePlan
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.compiler import shared_library
+from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.ways import output_of
+from psa_casadi.variables import nominal_value
+
+#: Steps of a reference voltage.
+STEPS = 1000
+#: Tolerance of the reference: its error is far below that of any step.
+_RTOL = 1e-10
+
+
+def _tones(s: FloatArray) -> FloatArray:
+    parts = [np.sin(2 * np.pi * k * s + q) for k, q in ((11, 2.0), (37, 4.0), (90, 1.0))]
+    return np.asarray(0.8 * np.sin(np.pi * s) ** 2 * (0.5 + 0.15 * sum(parts)))
+
+
+#: Reference voltages from 0 to 1 over the share of their 1000 steps; what each of them holds.
+VOLTAGES: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
+    "sine": ("5 periods of 200 steps", lambda s: 0.5 * (1.0 - np.cos(10.0 * np.pi * s))),
+    "triangle": (
+        "4 periods of 250 steps",
+        lambda s: 1.0 - np.abs(2.0 * ((4.0 * s) % 1.0) - 1.0),
+    ),
+    "tones": ("11, 37 and 90 periods in 1000 steps", _tones),
+    "ramps and holds": (
+        "ramps of 200 steps, and holds between them",
+        lambda s: np.interp(s, [0.0, 0.2, 0.4, 0.6, 0.8, 1.0], [0.0, 0.9, 0.9, 0.3, 0.3, 0.0]),
+    ),
+    "jumps": (
+        "jumps within one step, by up to 0.8 of the range",
+        lambda s: np.select([s < 0.1, s < 0.4, s < 0.7], [0.0, 0.8, 0.2], 0.9),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class VoltageError:
+    """The largest error on one reference voltage over the range of the output there."""
+
+    voltage: str
+    error: float
+
+
+def played_inputs(model: Model, shape: FloatArray) -> FloatArray:
+    """Return inputs (n, nu): the voltage takes a shape, or all inputs of a model without one.
+
+    Shapes go from 0 to 1; an input goes from its start value to its usual size.
+    """
+    s = model.structure
+    u = np.tile([q.start for q in s.inputs], (len(shape), 1))
+    for place, declared in enumerate(s.inputs):
+        if declared.name == "voltage" or "voltage" not in model.input_names:
+            full = nominal_value(declared.nominal, model.values)
+            u[:, place] += (full - declared.start) * shape
+    return u
+
+
+def shown_output(model: Model) -> str:
+    """Return the name of the output that is compared: the displacement, or the first one."""
+    return output_of(model) or model.output_names[0]
+
+
+class Probe:
+    """A generated step as a library of this machine."""
+
+    def __init__(self, plan: CodePlan, texts: dict[str, str]) -> None:
+        self._plan = plan
+        library = shared_library({**texts, "probe.c": _probe_code(plan)}, (), ("-O2",))
+        self._play = library_function(library)
+
+    def play(self, u: FloatArray) -> FloatArray:
+        """Return all outputs (n - 1, ny) after each step of inputs (n, nu), from the start on."""
+        given = np.ascontiguousarray(u, dtype=np.float64)
+        y = np.empty((len(u) - 1, len(self._plan.model.output_names)))
+        self._play(len(u), given.ctypes.data, y.ctypes.data)
+        return y
+
+
+def library_function(path: object) -> Callable[..., None]:
+    """Return the function of a probe's library."""
+    function = ctypes.CDLL(str(path)).psa_probe
+    function.argtypes = [ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]
+    function.restype = None
+    return function
+
+
+def errors(plan: CodePlan, texts: dict[str, str]) -> tuple[VoltageError, ...]:
+    """Return the errors on all reference voltages, by the stepper at a far finer tolerance.
+
+    An error that is no number is infinite. Raises SimulationError where the model itself fails.
+    """
+    model, probe = plan.model, Probe(plan, texts)
+    output = model.output_names.index(shown_output(model))
+    x0 = np.array([q.start for q in model.structure.states])
+    times = plan.step * np.arange(STEPS + 1, dtype=np.float64)
+    found = []
+    for name, (_, shape) in VOLTAGES.items():
+        u = played_inputs(model, shape(np.linspace(0.0, 1.0, STEPS + 1)))
+        hold = "zero" if plan.held else "linear"
+        true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
+        # held inputs hold from the instant on that they are given for
+        own = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
+        size = float(np.ptp(true)) or float(model.output_nominals()[output])
+        worst = float(np.max(np.abs(own - true))) / size
+        found.append(VoltageError(name, worst if np.isfinite(worst) else float("inf")))
+    return tuple(found)
+
+
+def _probe_code(plan: CodePlan) -> str:
+    name, s, real = plan.name, plan.model.structure, plan.precision.ctype
+    nu = len(s.inputs)
+    given = [f"        input.{q.name} = ({real})u[k * {nu} + {i}];" for i, q in enumerate(s.inputs)]
+    taken = [f"        *y++ = (double)output.{q.name};" for q in s.outputs]
+    return "\n".join(
+        [
+            f'#include "{name}.h"',
+            "#if defined(_WIN32)",
+            "__declspec(dllexport)",
+            "#else",
+            '__attribute__((visibility("default")))',
+            "#endif",
+            "void psa_probe(long steps, const double *u, double *y);",
+            "void psa_probe(long steps, const double *u, double *y) {",
+            f"    {name}_state state;",
+            f"    {name}_input input;",
+            f"    {name}_output output;",
+            f"    {name}_init(&state);",
+            "    for (long k = 1; k < steps; ++k) {",
+            *given,
+            f"        {name}_step(&state, &input, &output);",
+            *taken,
+            "    }",
+            "}",
+            "",
+        ]
+    )

@@ -1,0 +1,226 @@
+"""The source of a fixed step in C99: start, step and outputs in straight lines of numbers."""
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+
+from psa_casadi.component import Expression
+from psa_casadi.export.fixed_step.expressions import Printer
+from psa_casadi.export.fixed_step.plan import CodePlan, outputs_of, timed
+
+#: Size over a state's usual one below which it counts as 0: next to it numbers become slow ones.
+_NOTHING = 1e-15
+
+
+def source_code(plan: CodePlan) -> str:
+    """Return the source: the start, the step and the outputs."""
+    name = plan.name
+    rounded = _rounding(plan) if plan.precision.single else []
+    return "\n".join(
+        [
+            f"/* {name}.h tells what this is */",
+            f'#include "{name}.h"',
+            "",
+            "#include <math.h>",
+            "",
+            *rounded,
+            *_init(plan),
+            "",
+            *_advance(plan),
+            "",
+            *_output(plan),
+            "",
+            *_step(plan),
+            "",
+        ]
+    )
+
+
+def _init(plan: CodePlan) -> list[str]:
+    s, literal = plan.model.structure, plan.precision.literal
+    inputs = [q.start for q in s.inputs]
+    start = [0.0, [q.start for q in s.states], inputs, plan.model.parameter_vector()]
+    ports = ca.Function("ports", [s.time, s.x, s.u, s.p], [plan.expression.port_start])
+    values = np.array(ports(*start)).ravel().tolist()
+    lines = [f"void {plan.name}_init({plan.name}_state *state) {{"]
+    lines += [f"    state->{q.name} = {literal(q.start)};" for q in s.states]
+    if plan.precision.single:
+        lines += [f"    state->low_of_{q.name} = {literal(0.0)};" for q in s.states]
+    lines += [
+        f"    state->port_of_{q} = {literal(v)};"
+        for q, v in zip(plan.expression.port_names, values, strict=True)
+    ]
+    lines += [f"    state->last_input.{q.name} = {literal(q.start)};" for q in s.inputs]
+    if timed(plan):
+        lines.append(f"    state->steps_done = {literal(0.0)};")
+    return [*lines, "}"]
+
+
+def _rounding(plan: CodePlan) -> list[str]:
+    """Return the sum that keeps what rounding takes: slow changes add up in single precision."""
+    real = plan.precision.ctype
+    return [
+        "/* x + change; what rounding takes is kept in low and added the next time */",
+        f"static void gain({real} *x, {real} *low, {real} change, {real} nothing) {{",
+        f"    const {real} sum = change + *low, next = *x + sum;",
+        "    *low = (sum - (next - *x) + nothing) - nothing;",
+        "    *x = (next + nothing) - nothing;",
+        "}",
+        "",
+    ]
+
+
+def _printer(plan: CodePlan, states: str) -> Printer:
+    e, s = plan.expression, plan.model.structure
+    last, du = f"{states}->last_input", "change"
+    step = plan.precision.literal(plan.step / plan.substeps)
+    return Printer(
+        plan.precision,
+        {"t": s.time, "x": s.x, "v": ca.vertcat(e.low, s.u, e.du, e.port)},
+        {
+            "t": [f"({step} * {states}->steps_done)"],
+            "x": [f"{states}->{q.name}" for q in s.states],
+            "v": [
+                *(f"{states}->low_of_{q.name}" for q in s.states),
+                *(f"{last}.{q.name}" for q in s.inputs),
+                *(f"{du}->{q.name}" for q in s.inputs),
+                *(f"{states}->port_of_{q}" for q in e.port_names),
+            ],
+        },
+    )
+
+
+def _advance(plan: CodePlan) -> list[str]:
+    """Return the function that takes one step of the expression."""
+    e, s, p = plan.expression, plan.model.structure, plan.precision
+    gone = [] if p.single else [e.low]
+    change, ports = _held(plan, [e.change, e.port_end], gone)
+    lines, texts = _printer(plan, "state").lines([change, ports])
+    n, nominal = len(s.states), plan.model.state_nominals()
+    head = f"static void advance({plan.name}_state *state"
+    if not plan.held:
+        head += f", const {plan.name}_input *change"
+    body = [f"    {line}" for line in lines]
+    body += [f"    const {p.ctype} end{k} = {text};" for k, text in enumerate(texts)]
+    for k, q in enumerate(s.states):
+        nothing = p.literal(_NOTHING * abs(nominal[k]))
+        body.append(
+            f"    gain(&state->{q.name}, &state->low_of_{q.name}, end{k}, {nothing});"
+            if p.single
+            else f"    state->{q.name} = (state->{q.name} + end{k} + {nothing}) - {nothing};"
+        )
+    body += [f"    state->port_of_{q} = end{n + k};" for k, q in enumerate(e.port_names)]
+    if timed(plan):
+        body.append(f"    state->steps_done += {p.literal(1.0)};")
+    used = " ".join([*lines, *texts])
+    unused = [] if plan.held or "change->" in used else ["    (void)change;"]
+    return ["/* One step, from last_input along its change */", head + ") {", *unused, *body, "}"]
+
+
+def _held(
+    plan: CodePlan, expressions: Sequence[Expression], gone: Sequence[Expression]
+) -> list[Expression]:
+    """Return a step's expressions as they are needed: without the change of inputs that hold.
+
+    Ports that read such an input jump with it, so that they are evaluated at the start.
+    """
+    e, s = plan.expression, plan.model.structure
+    away = [*gone, *([e.du] if plan.held else [])]
+    given = [ca.SX.zeros(q.numel()) for q in away]
+    if plan.held:
+        jump = [k for k in range(e.port.numel()) if ca.depends_on(e.port_start[k], s.u)]
+        values = [e.port_start[k] if k in jump else e.port[k] for k in range(e.port.numel())]
+        away.append(e.port)
+        given.append(ca.vertcat(ca.SX(0, 1), *values))
+    return list(ca.substitute(list(expressions), away, given)) if away else list(expressions)
+
+
+def _output(plan: CodePlan) -> list[str]:
+    s, name = plan.model.structure, plan.name
+    printer = _printer(plan, "state")
+    lines, texts = printer.lines([outputs_of(plan.model)])
+    head = f"static void outputs(const {name}_state *state, {name}_output *output) {{"
+    body = [f"    {line}" for line in lines]
+    body += [f"    output->{q.name} = {t};" for q, t in zip(s.outputs, texts, strict=True)]
+    unused = [
+        f"    (void){what};"
+        for what, there in (("state", bool(printer.used)), ("output", bool(s.outputs)))
+        if not there
+    ]
+    return [head, *unused, *body, "}"]
+
+
+def _step(plan: CodePlan) -> list[str]:
+    s, name, p, count = plan.model.structure, plan.name, plan.precision, plan.substeps
+    head = (
+        f"void {name}_step({name}_state *state, const {name}_input *input, {name}_output *output)"
+    )
+    loop = f"    for (int k = 0; k < {count}; ++k) " if count > 1 else "    "
+    if not s.inputs:
+        call = "advance(state);" if plan.held else "advance(state, input);"
+        lines = ["    (void)input;", loop + call]
+    elif plan.held:
+        lines = ["    state->last_input = *input;", loop + "advance(state);"]
+    else:
+        lines = [f"    {name}_input change;"]
+        share = f" * {p.literal(1.0 / count)}" if count > 1 else ""
+        for q in s.inputs:
+            difference = f"input->{q.name} - state->last_input.{q.name}"
+            value = f"({difference}){share}" if share else difference
+            lines.append(f"    change.{q.name} = {value};")
+        if count > 1:
+            moved = [f"        state->last_input.{q.name} += change.{q.name};" for q in s.inputs]
+            lines += [loop + "{", "        advance(state, &change);", *moved, "    }"]
+        else:
+            lines.append("    advance(state, &change);")
+        lines.append("    state->last_input = *input;")
+    return [head + " {", *lines, "    outputs(state, output);", "}"]
+
+
+def function_code(plan: CodePlan, function: str) -> str:
+    """Return `void function(t, x, u, change)`: a step of states that remembers nothing else.
+
+    The ports are evaluated at the start of every substep, so that the states are all there is.
+    """
+    e, s = plan.expression, plan.model.structure
+    (change,) = ca.substitute(
+        [e.change], [e.low, e.port], [ca.SX.zeros(e.low.numel()), e.port_start]
+    )
+    printer = Printer(
+        plan.precision,
+        {"t": s.time, "x": s.x, "v": ca.vertcat(s.u, e.du)},
+        {
+            "t": ["t"],
+            "x": [f"x[{k}]" for k in range(len(s.states))],
+            "v": [f"{of}[{k}]" for of in ("u", "change") for k in range(len(s.inputs))],
+        },
+    )
+    lines, texts = printer.lines([change])
+    given = "double t, double *x, const double *u, const double *change"
+    nothing = [plan.precision.literal(_NOTHING * abs(q)) for q in plan.model.state_nominals()]
+    body = [f"    {line}" for line in lines]
+    body += [f"    const double end{k} = {text};" for k, text in enumerate(texts)]
+    body += [f"    x[{k}] = (x[{k}] + end{k} + {q}) - {q};" for k, q in enumerate(nothing)]
+    inputs, count = max(1, len(s.inputs)), plan.substeps
+    return "\n".join(
+        [
+            "",
+            f"static void {function}_part({given}) {{",
+            "    (void)t, (void)u, (void)change;",
+            *body,
+            "}",
+            "",
+            f"void {function}({given}) {{",
+            f"    double now[{inputs}] = {{0.0}}, part[{inputs}] = {{0.0}};",
+            f"    for (int k = 0; k < {count}; ++k) {{",
+            f"        for (int i = 0; i < {len(s.inputs)}; ++i) {{",
+            f"            part[i] = change[i] * {1.0 / count!r};",
+            "            now[i] = u[i] + k * part[i];",
+            "        }",
+            f"        {function}_part(t + k * {plan.step / count!r}, x, now, part);",
+            "    }",
+            "}",
+            "",
+        ]
+    )

@@ -1,0 +1,211 @@
+"""One step of fixed length as an expression: a model's exact step with nothing left to decide.
+
+The linear part is taken exactly (`matrices`). States along a driver's way (hysteresis) take two
+Rosenbrock steps of fourth order over it, which meet where the driver turns, else in the middle.
+A port's values at start, half and end make a parabola in time. Ports that feed back to what they
+depend on take two Newton steps. So every step costs the same, whatever happens in it.
+
+Source: the exact steps of `simulation/exact`, whose choices are made once, at export.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from psa_casadi.component import Expression
+from psa_casadi.export.fixed_step.matrices import FloatArray, linear_part, responses
+from psa_casadi.export.fixed_step.way import Ends, Leaving, along_the_way, solved
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.exact.split import Split
+
+#: Newton steps of ports that feed back.
+_NEWTON = 2
+#: Instants of a step at which the ports are evaluated, beside its start.
+HALF, WHOLE = 0, 1
+SHARES = (0.5, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class StepExpression:
+    """A step as expressions of its symbols; parameters are numbers.
+
+    From `time`, states `x` (nx,), inputs `u` (nu,) that change by `du` over the step and ports
+    `port` (np,) at the start follow the states' `change` (nx,) and the ports `port_end` (np,).
+    `low` (nx,) is what rounding took off `x`. `port_start` gives the ports from time, x and u.
+    `port_names` are the states whose derivatives they are part of.
+    """
+
+    time: Expression
+    x: Expression
+    low: Expression
+    u: Expression
+    du: Expression
+    port: Expression
+    change: Expression
+    port_end: Expression
+    port_start: Expression
+    port_names: tuple[str, ...]
+
+    @property
+    def symbols(self) -> list[Expression]:
+        """Return all symbols, in the order of the fields."""
+        return [self.time, self.x, self.low, self.u, self.du, self.port]
+
+
+def step_expression(model: Model, split: Split, step: float) -> StepExpression:
+    """Return the step of `step` [s] of a model with its values."""
+    return _Builder(model, split, step).built()
+
+
+class _Builder:
+    """A step under construction: how each state has changed by the half and the end."""
+
+    def __init__(self, model: Model, split: Split, step: float) -> None:
+        self.model, self.split, self.step = model, split, step
+        s = split.structure
+        self.linear = linear_part(model, split)
+        nominal = model.state_nominals()[list(split.linear)]
+        self.responses = [
+            responses(self.linear.m, nominal, step=step, share=share) for share in SHARES
+        ]
+        self.low, self.du = ca.SX.sym("low", s.x.numel()), ca.SX.sym("du", s.u.numel())
+        self.port = ca.SX.sym("port", len(split.ports))
+        self.slope = self._first_slopes()
+        # what the linear states have changed by, in their order, and all others in the model's
+        self.moved = [
+            _times(r.constant, self.slope) + _times(r.ramp, _times(self.linear.b, self.du))
+            for r in self.responses
+        ]
+        self.turned = [ca.SX.zeros(s.x.numel()) for _ in SHARES]
+        self.ports = [ca.SX(self.port) for _ in SHARES]
+
+    def built(self) -> StepExpression:
+        s, split = self.split.structure, self.split
+        for kind, members in split.order:
+            if kind == "group":
+                self._group(members[0])
+            elif kind == "port":
+                self._port(members[0])
+            else:
+                self._loop(members)
+        start = [self._numbers(q.value) for q in split.ports]
+        return StepExpression(
+            time=s.time, x=s.x, low=self.low, u=s.u, du=self.du, port=self.port,
+            change=self._change(WHOLE), port_end=self.ports[WHOLE],
+            port_start=ca.vertcat(ca.SX(0, 1), *start),
+            port_names=tuple(s.states[q.state].name for q in split.ports),
+        )  # fmt: skip
+
+    def _numbers(self, expression: Expression) -> Expression:
+        s = self.split.structure
+        return ca.substitute([ca.SX(expression)], [s.p], [ca.DM(self.model.parameter_vector())])[0]
+
+    def _first_slopes(self) -> Expression:
+        """Return L' at the start; the diagonal is taken out, so that rest is rest when rounded."""
+        s, (m, b, c) = self.split.structure, (self.linear.m, self.linear.b, self.linear.c)
+        rows = list(self.split.linear)
+        x, low = s.x[rows], self.low[rows]
+        slopes = []
+        for i in range(len(rows)):
+            scale = m[i, i] or 1.0
+            own = x[i] if m[i, i] else ca.SX(0)
+            others = sum(
+                (m[i, j] / scale * x[j] for j in range(len(rows)) if j != i and m[i, j]), ca.SX(0)
+            )
+            given = sum((b[i, j] / scale * s.u[j] for j in range(b.shape[1]) if b[i, j]), ca.SX(0))
+            rest = own + given + others + c[i] / scale
+            slopes.append(scale * (rest + low[i] if m[i, i] else rest))
+        for k, port in enumerate(self.split.ports):
+            slopes[rows.index(port.state)] += self.port[k]
+        return ca.vertcat(*slopes)
+
+    def _change(self, node: int) -> Expression:
+        """Return what all states have changed by at a node, as far as it is known."""
+        parts = [self.turned[node][i] for i in range(self.split.structure.x.numel())]
+        for k, i in enumerate(self.split.linear):
+            parts[i] = self.moved[node][k]
+        return ca.vertcat(*parts)
+
+    def _at(self, node: int, expression: Expression, change: Expression) -> Expression:
+        """Return an expression at a node at which the states have changed."""
+        s, share = self.split.structure, SHARES[node]
+        there = [s.time + share * self.step, s.x + change, s.u + share * self.du]
+        return ca.substitute([self._numbers(expression)], [s.time, s.x, s.u], there)[0]
+
+    def _respond(self, k: int) -> None:
+        """Add the response to a port, once its values at the half and the end are known."""
+        first, second = self.ports[HALF][k] - self.port[k], self.ports[WHOLE][k] - self.port[k]
+        ramp, square = 4.0 * first - second, 2.0 * (second - 2.0 * first)
+        place = self.split.linear.index(self.split.ports[k].state)
+        for node, r in enumerate(self.responses):
+            self.moved[node] += _column(r.ramp, place) * ramp + _column(r.square, place) * square
+
+    def _port(self, k: int) -> None:
+        value = self.split.ports[k].value
+        for node in range(len(SHARES)):
+            self.ports[node][k] = self._at(node, value, self._change(node))
+        self._respond(k)
+
+    def _loop(self, members: Sequence[int]) -> None:
+        """Take ports that depend on their own responses: Newton steps from the start's values."""
+        guess = ca.SX.sym("guess", len(SHARES) * len(members))
+        before = [ca.SX(q) for q in self.moved]
+        for place, k in enumerate(members):
+            for node in range(len(SHARES)):
+                self.ports[node][k] = guess[len(SHARES) * place + node]
+            self._respond(k)
+        found = [
+            self._at(node, self.split.ports[k].value, self._change(node))
+            for k in members
+            for node in range(len(SHARES))
+        ]
+        miss = ca.vertcat(*found) - guess
+        slopes = ca.jacobian(miss, guess)
+        values = ca.vertcat(*[self.port[k] for k in members for _ in SHARES])
+        for _ in range(_NEWTON):
+            at, by = ca.substitute([miss, slopes], [guess], [values])
+            values -= solved(by, at)
+        self.moved = before
+        for place, k in enumerate(members):
+            for node in range(len(SHARES)):
+                self.ports[node][k] = values[len(SHARES) * place + node]
+            self._respond(k)
+
+    def _group(self, g: int) -> None:
+        """Take the states along a driver's way."""
+        s, group = self.split.structure, self.split.groups[g]
+        slopes = ca.Function(
+            "slopes", [s.time, s.x, s.u, group.rate], [self._numbers(group.slopes)]
+        )
+        ends = Ends(
+            step=self.step, time=s.time, x=s.x, u=s.u, du=self.du,
+            half=self._change(HALF), whole=self._change(WHOLE),
+        )  # fmt: skip
+        leaving = Leaving(group.driver, group.states, self._rates(group.driver), slopes)
+        for node, change in enumerate(along_the_way(ends, leaving)):
+            for place, i in enumerate(group.states):
+                self.turned[node][i] = change[place]
+
+    def _rates(self, driver: int) -> tuple[Expression, Expression, Expression]:
+        """Return a driver's rate at start, half and end, from its changes: rest is exactly 0."""
+        place = self.split.linear.index(driver)
+        m, b = self.linear.m[[place], :], self.linear.b[[place], :]
+        rates = [self.slope[place]]
+        for node, share in enumerate(SHARES):
+            rate = rates[0] + _times(m, self.moved[node]) + _times(b, share * self.du)
+            for k, port in enumerate(self.split.ports):
+                if port.state == driver:
+                    rate += self.ports[node][k] - self.port[k]
+            rates.append(rate)
+        return rates[0], rates[1], rates[2]
+
+
+def _times(matrix: FloatArray, column: Expression) -> Expression:
+    """Return a product in which zeros of the matrix leave nothing."""
+    return ca.mtimes(ca.sparsify(ca.DM(matrix)), ca.SX(column))
+
+
+def _column(matrix: FloatArray, place: int) -> ca.DM:
+    return ca.sparsify(ca.DM(np.ascontiguousarray(matrix[:, place])))

@@ -1,0 +1,207 @@
+"""States along a driver's way over one step: two legs, whatever the driver does.
+
+The legs meet where the driver turns, found by linear interpolation of its rate in the half of the
+step in which the rate changes sign, else in the middle. A leg is one Rosenbrock step of fourth
+order over the way, at the leg's mean rate: three evaluations, and L-stable, so that a jump of the
+voltage across the whole range does not throw the states out of bounds.
+
+Source of the method: Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7,
+the L-stable one of Table 7.2.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from psa_casadi.component import Expression
+
+#: Shortest leg over a step: below it a rate has no meaning, and nothing happens.
+_SHORTEST = 1e-6
+#: The Rosenbrock method, in the form without products of the Jacobian: 1/gamma, instants of the
+#: stages, weights of earlier stages in their states and in their right sides, of the derivative by
+#: time, and of the stages in the end. The last stage has the value of the one before.
+_DIAGONAL = 1.0 / 0.57282
+_AT = (0.0, 1.14564, 0.65521686381559)
+_STATES = ((), (2.0,), (1.867943637803922, 0.2344449711399156))
+_RIGHT = (
+    (),
+    (-7.137615036412310,),
+    (2.580708087951457, 0.6515950076447975),
+    (-2.137148994382534, -0.3214669691237626, -0.6949742501781779),
+)
+_BY_TIME = (0.57282, -1.769193891319233, 0.7592633437920482, -0.1049021087100450)
+_END = (2.255570073418735, 0.2870493262186792, 0.4353179431840180, 1.093502252409163)
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """A step of `step` [s] from time, states x and inputs u, which change by `du`.
+
+    `half` and `whole` are what the states known so far have changed by there.
+    """
+
+    step: float
+    time: Expression
+    x: Expression
+    u: Expression
+    du: Expression
+    half: Expression
+    whole: Expression
+
+
+@dataclass(frozen=True, eq=False)
+class Leaving:
+    """A driver and the states along its way, by index; its rates at start, half and end.
+
+    `slopes` is the function (time, x, u, rate) of the states' derivatives.
+    """
+
+    driver: int
+    states: tuple[int, ...]
+    rates: tuple[Expression, Expression, Expression]
+    slopes: ca.Function
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """Where the legs meet: whether the driver turns, at which share, and its change by then."""
+
+    turned: Expression
+    share: Expression
+    way: Expression
+
+
+@dataclass(frozen=True, eq=False)
+class _Leg:
+    """One leg: the driver's way, the states' changes, and these at the slopes of its begin."""
+
+    way: Expression
+    change: Expression
+    straight: Expression
+
+
+def along_the_way(ends: Ends, leaving: Leaving) -> tuple[Expression, Expression]:
+    """Return what the states along a driver's way have changed by at half and end, (n,) each."""
+    turn = _turn(ends, leaving)
+    x0 = ends.x
+    meeting = _between(ends, leaving.driver, turn)
+    first = _leg(ends, leaving, x0, meeting, ca.SX(0), turn.share)
+    x1 = _shifted(meeting, leaving.states, first.change)
+    last = _leg(ends, leaving, x1, ends.x + ends.whole, turn.share, 1.0 - turn.share)
+    half = _at_half(ends, leaving, turn, first, last)
+    return half, first.change + last.change
+
+
+def _turn(ends: Ends, leaving: Leaving) -> _Turn:
+    """Find the turn: the rate's zero in a half, and Hermite's cubic of the driver there."""
+    start, middle, end = leaving.rates
+    early, late = start * middle < 0.0, middle * end < 0.0
+    turned = ca.logic_or(early, late)
+    half, whole = ends.half[leaving.driver], ends.whole[leaving.driver]
+    before, after = ca.if_else(early, start, middle), ca.if_else(early, middle, end)
+    low, high = ca.if_else(early, 0.0, half), ca.if_else(early, half, whole)
+    local = before / ca.if_else(turned, before - after, 1.0)
+    rest, length = 1.0 - local, 0.5 * ends.step
+    way = (
+        rest * rest * (1.0 + 2.0 * local) * low
+        + local * local * (3.0 - 2.0 * local) * high
+        + local * rest * length * (rest * before - local * after)
+    )
+    share = ca.if_else(turned, ca.if_else(early, 0.0, 0.5) + 0.5 * local, 0.5)
+    return _Turn(turned, share, ca.if_else(turned, way, half))
+
+
+def _between(ends: Ends, driver: int, turn: _Turn) -> Expression:
+    """Return the states where the legs meet: parabolas in time, but the driver's own value."""
+    s = turn.share
+    change = 4.0 * s * (1.0 - s) * ends.half + s * (2.0 * s - 1.0) * ends.whole
+    parts = [ends.x[i] + change[i] for i in range(ends.x.numel())]
+    parts[driver] = ends.x[driver] + turn.way
+    return ca.vertcat(*parts)
+
+
+def _shifted(x: Expression, states: Sequence[int], change: Expression) -> Expression:
+    """Return states of which some have changed by so much since the start of the step."""
+    parts = [x[i] for i in range(x.numel())]
+    for place, i in enumerate(states):
+        parts[i] = parts[i] + change[place]
+    return ca.vertcat(*parts)
+
+
+def _leg(
+    ends: Ends,
+    leaving: Leaving,
+    origin: Expression,
+    target: Expression,
+    begin: Expression,
+    share: Expression,
+) -> _Leg:
+    """Take one leg from the states `origin` to `target`, from `begin` on for `share`."""
+    duration = share * ends.step
+    way = target[leaving.driver] - origin[leaving.driver]
+    rate = way / ca.fmax(duration, _SHORTEST * ends.step)
+    theta, gone = ca.SX.sym("theta"), ca.SX.sym("gone", len(leaving.states))
+    when = begin + theta * share
+    x = _shifted(_towards(origin, target, theta, leaving.states), leaving.states, gone)
+    given = (ends.time + when * ends.step, x, ends.u + when * ends.du, rate)
+    value = duration * leaving.slopes(*given)
+    by_states, by_time = ca.jacobian(value, gone), ca.jacobian(value, theta)
+
+    def at(share_of_leg: float, change: Expression, *wanted: Expression) -> list[Expression]:
+        here = [ca.SX(share_of_leg), change]
+        return list(ca.substitute(list(wanted), [theta, gone], here))
+
+    start, j, slope = at(0.0, ca.SX.zeros(gone.numel()), value, by_states, by_time)
+    system = _DIAGONAL * ca.SX.eye(gone.numel()) - j
+    stages: list[Expression] = []
+    last = start
+    for i, right in enumerate(_RIGHT):
+        if 0 < i < len(_STATES):
+            (last,) = at(_AT[i], _weighted(_STATES[i], stages), value)
+        stages.append(solved(system, last + _weighted(right, stages) + _BY_TIME[i] * slope))
+    return _Leg(way, _weighted(_END, stages), start)
+
+
+def _towards(
+    origin: Expression, target: Expression, theta: Expression, states: Sequence[int]
+) -> Expression:
+    """Return the states at a share of a leg; those along the way stand at its begin."""
+    parts = [origin[i] + theta * (target[i] - origin[i]) for i in range(origin.numel())]
+    for i in states:
+        parts[i] = origin[i]
+    return ca.vertcat(*parts)
+
+
+def _weighted(weights: Sequence[float], stages: Sequence[Expression]) -> Expression:
+    return sum((w * k for w, k in zip(weights, stages, strict=True)), ca.SX(0))
+
+
+def _at_half(ends: Ends, leaving: Leaving, turn: _Turn, first: _Leg, last: _Leg) -> Expression:
+    """Return the states' changes at the half: a parabola over the way of the leg it lies on."""
+    inside = turn.share > 0.5  # the half lies on the first leg
+    half = ends.half[leaving.driver]
+    way = ca.if_else(inside, first.way, last.way)
+    gone = ca.if_else(inside, half, half - turn.way)
+    still = way == 0.0
+    share = ca.fmin(ca.fmax(gone / ca.if_else(still, 1.0, way), 0.0), 1.0)
+    change = ca.if_else(inside, first.change, last.change)
+    straight = ca.if_else(inside, first.straight, last.straight)
+    behind = ca.if_else(inside, 0.0, first.change)
+    on_leg = share * (straight + share * (change - straight))
+    return ca.if_else(turn.turned, behind + on_leg, first.change)
+
+
+def solved(a: Expression, b: Expression) -> Expression:
+    """Solve a small system by Gauss elimination without exchanges: its diagonal is the largest."""
+    n = b.numel()
+    rows = [[*(a[i, j] for j in range(n)), b[i]] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [q - factor * r for q, r in zip(rows[i], rows[k], strict=True)]
+    x: list[Expression] = [ca.SX(0)] * n
+    for k in reversed(range(n)):
+        known = sum((rows[k][j] * x[j] for j in range(k + 1, n)), ca.SX(0))
+        x[k] = (rows[k][n] - known) / rows[k][k]
+    return ca.vertcat(*x)

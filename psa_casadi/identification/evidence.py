@@ -1,0 +1,178 @@
+"""What stands behind a fitted model, to be kept with it: ranges, covariance, runs to play again."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.identification.certainty.determinacy import Determinacy
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import OUTPUT, measured, record_start
+from psa_casadi.identification.fitting.shared_starts import shared_starts
+from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import (
+    Covariance,
+    Evidence,
+    RecordRun,
+    ReferenceRun,
+    SeenRange,
+)
+from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.variables import Interval
+
+FloatArray = npt.NDArray[np.float64]
+
+#: The most samples of a reference run, and what straight lines between them may miss the voltage
+#: by, over its range.
+_LONGEST, _MISSED = 300, 2e-3
+#: Digits of a reference run's samples, of their largest value.
+_DIGITS = 7
+#: Differences of neighbouring samples are noise up to so many of its standard deviations.
+_NOISE = 6.0 * np.sqrt(2.0)
+
+
+def evidence_of(
+    fit: Fit,
+    found: Determinacy,
+    experiments: Sequence[Experiment],
+    predicted: Sequence[FloatArray],
+    *,
+    by: str,
+    sampled: Sequence[Record] = (),
+) -> Evidence:
+    """Return the evidence of a fit: what was seen, how sure the values are, runs to play again.
+
+    `predicted` [m] are the records in full, in the order of `experiments`; `sampled` the records
+    as they were given, where samples of them were averaged. Held-out samples have the error of the
+    runs; its interval and the budget are the diagnosis's to add.
+    """
+    model, records = fit.model, [e.record for e in experiments]
+    factors = [_factor(r, s) for r, s in zip(records, sampled or records, strict=True)]
+    runs = _runs(fit, experiments, predicted, factors)
+    chosen = next((k for k, e in enumerate(experiments) if e.held_out_whole), 0)
+    used = [_errors(e, y)[e.used] for e, y in zip(experiments, predicted, strict=True)]
+    return Evidence(
+        by=by,
+        fitted_m=_rms(np.concatenate(used)),
+        seen=_seen(records),
+        covariance=_covariance(found),
+        runs=runs,
+        reference=_reference(model, records[chosen]),
+        outside=tuple(c.name for c in model.effects if not c.in_plant),
+        unnamed=tuple(c.description for c in model.effects if c.name.startswith("patch")),
+    )
+
+
+def _runs(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    predicted: Sequence[FloatArray],
+    factors: Sequence[int],
+) -> tuple[RecordRun, ...]:
+    theta, _ = shared_starts(fit.model, fit.unknowns, fit.theta, experiments)
+    runs = []
+    for k, (e, y, factor) in enumerate(zip(experiments, predicted, factors, strict=True)):
+        x0 = record_start(fit.model, e.record, fit.unknowns.start(theta, k))
+        errors, held = _errors(e, y), bool(e.held_out.any())
+        runs.append(
+            RecordRun(
+                record=e.record.name,
+                sha256=e.record.sha256,
+                start=dict(zip(fit.model.state_names, x0.tolist(), strict=True)),
+                offset_m=float(y[0]) - _shown(fit.model, e.record, x0),
+                samples=e.record.n,
+                averaged=factor,
+                fitted_m=_rms(errors[e.used]),
+                held_out_m=_rms(errors[e.held_out]) if held else None,
+                held_out=tuple(zip(*(k.tolist() for k in runs_of(e.held_out)), strict=True)),
+            )
+        )
+    return tuple(runs)
+
+
+def _errors(experiment: Experiment, predicted: FloatArray) -> FloatArray:
+    return measured(experiment.record) - predicted
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
+
+
+def _shown(model: Model, record: Record, x0: FloatArray) -> float:
+    """Return what the sensor shows at the start of a record, without an offset [m]."""
+    inputs = record_inputs(model, record, 1)[0]
+    y = np.array(model.structure.f(0.0, x0, inputs, model.parameter_vector())[1]).ravel()
+    return float(y[model.output_names.index(OUTPUT)])
+
+
+def _factor(record: Record, sampled: Record) -> int:
+    return max(1, round(record.sample_time / sampled.sample_time))
+
+
+def _seen(records: Sequence[Record]) -> SeenRange:
+    low = min(float(r.voltage.min()) for r in records)
+    high = max(float(r.voltage.max()) for r in records)
+    warm = [t for r in records if r.temperature is not None for t in (r.temperature,)]
+    return SeenRange(
+        voltage=Interval(low, high),
+        rate=max(_rate(r) for r in records),
+        duration=max(r.duration for r in records),
+        temperature=(
+            Interval(min(float(t.min()) for t in warm), max(float(t.max()) for t in warm))
+            if warm
+            else None
+        ),
+    )
+
+
+def _rate(record: Record) -> float:
+    """Return the largest rate of the voltage [V/s], beyond what its white noise makes."""
+    moved = np.abs(np.diff(record.voltage)) - _NOISE * fast_noise(record.voltage)
+    return max(0.0, float(np.max(moved / np.diff(record.time))))
+
+
+def _covariance(found: Determinacy) -> Covariance:
+    """Return the covariance, without names where it has overflowed."""
+    matrix = 0.5 * (found.covariance + found.covariance.T)
+    if not np.isfinite(matrix).all():
+        return Covariance((), ())
+    return Covariance(found.names, tuple(tuple(row) for row in matrix.tolist()))
+
+
+def _reference(model: Model, record: Record) -> ReferenceRun:
+    """Return the longest first part of a record whose voltage so few samples tell."""
+    stride = 1
+    while stride < record.n // 8 and _told_by(record, 2 * stride):
+        stride *= 2
+    kept = np.arange(0, min(record.n, _LONGEST * stride), stride)
+    columns = {n: getattr(record, n, None) for n in model.input_names}
+    inputs = {n: _rounded(c[kept]) for n, c in columns.items() if c is not None}
+    shown = measured(record)[kept]
+    valid = np.isfinite(shown)
+    digits = iter(_rounded(shown[valid]))
+    return ReferenceRun(
+        record=record.name,
+        time=tuple(round(float(t), 12) for t in record.time[kept] - record.time[0]),
+        inputs=inputs,
+        displacement=tuple(next(digits) if v else None for v in valid),
+    )
+
+
+def _told_by(record: Record, stride: int) -> bool:
+    """Whether every so many samples tell the voltage that lies between them."""
+    part = slice(0, min(record.n, (_LONGEST - 1) * stride + 1))
+    time, voltage = record.time[part], record.voltage[part]
+    lines = np.interp(time, time[::stride], voltage[::stride])
+    last = (len(time) - 1) // stride * stride + 1
+    missed = np.abs(lines - voltage)[:last]
+    return bool(np.max(missed) <= _MISSED * max(float(np.ptp(record.voltage)), 1e-300))
+
+
+def _rounded(values: FloatArray) -> tuple[float, ...]:
+    largest = float(np.max(np.abs(values), initial=0.0))
+    digits = _DIGITS - 1 - int(np.floor(np.log10(largest))) if largest > 0.0 else 0
+    return tuple(round(float(v), digits) + 0.0 for v in values)

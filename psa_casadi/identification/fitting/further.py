@@ -1,0 +1,241 @@
+"""Columns beside the displacement that are fitted as outputs: current, charge, monitor and so on.
+
+Every column has an offset in each record and factors for what it shows, the same in all records;
+both are linear, so that they are projected out of the residual instead of being searched (variable
+projection; Golub and Pereyra 1973, with the Jacobian of Kaufman 1975).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.components import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
+from psa_casadi.identification.fitting.prediction import traced_by_theta
+from psa_casadi.identification.fitting.unknowns import Unknowns
+from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.ways import Way
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a column of a record shows.
+
+    `outputs` of the model, each with a factor; the first factor is that of `scale`, a parameter of
+    the `sensor` that a model gets for the column, where it has one. `unit` is the SI unit. The
+    model is taken to be right to the share `straight` of what is shown (rms): a smaller error says
+    nothing of a stack.
+    """
+
+    unit: str
+    outputs: tuple[str, ...]
+    straight: float = 1e-3
+    sensor: Component | None = None
+    scale: str | None = None
+
+
+#: The columns that are fitted, by name. The charge on a stack is that of its capacitance and, by
+#: reciprocity, a share of the displacement; the current is its rate, which lags faster than the
+#: sampling move most.
+COLUMNS: Mapping[str, Shown] = {
+    "monitor_voltage": Shown("V", ("monitor_voltage",), sensor=MONITOR, scale="monitor_scale"),
+    "charge": Shown("C", ("charge", "displacement"), straight=1e-2),
+    "current": Shown("A", ("current", "velocity"), straight=5e-2),
+    "displacement_2": Shown("m", ("displacement_2",), sensor=SECOND_SENSOR, scale="sensor_2_scale"),
+    "strain": Shown("1", ("strain",), sensor=STRAIN_GAUGE, scale="strain_scale"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Further:
+    """The fit of one further column, in its SI unit; samples of all records that have it, stacked.
+
+    `residuals` (n,) are measured minus predicted; `jacobian` (n, size) d prediction / d theta, both
+    without what offsets and factors can follow: `basis` (n, k) is orthonormal. `factors` belong to
+    the outputs, `level` weighted the column, `spread` is its rms about the offsets, `lengths` are
+    the samples of each record.
+    """
+
+    column: str
+    level: float
+    spread: float
+    residuals: FloatArray
+    jacobian: FloatArray
+    basis: FloatArray
+    factors: FloatArray
+    lengths: tuple[int, ...]
+
+    def left_of(self, change: FloatArray) -> FloatArray:
+        """Return what offsets and factors leave of a change of the prediction (n,)."""
+        left: FloatArray = change - self.basis @ (self.basis.T @ change)
+        return left
+
+    @property
+    def straight(self) -> float:
+        """Rms error below which nothing is known of the column, in its unit."""
+        return COLUMNS[self.column].straight * self.spread
+
+    @property
+    def sentence(self) -> str:
+        """What is left of the column, and what is odd about it, in words."""
+        unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
+        named = "" if unit == "1" else f" {unit}"
+        return (
+            f"{self.column}: fitted beside the displacement; {self.rms:.3g}{named} rms of it are"
+            f" missed, {share:.2g} % of its own rms.{' ' + self.turned if self.turned else ''}"
+        )
+
+    @property
+    def turned(self) -> str:
+        """Say so where a column falls while what it shows rises, else ""."""
+        if COLUMNS[self.column].scale is not None or self.factors[0] >= 0.0:
+            return ""
+        return f"{self.column} falls where the model's rises: its sign is probably turned."
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+
+def further_of(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    *,
+    way: Way,
+) -> tuple[Further, ...]:
+    """Return the fit of every further column at theta, at the used samples. Raises PsaError."""
+    levels = experiments[0].further if experiments else ()
+    return tuple(
+        _further(model, experiments, unknowns, theta, level.column, level.value, way)
+        for level in levels
+    )
+
+
+def _further(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    column: str,
+    level: float,
+    way: Way,
+) -> Further:
+    records = with_column(experiments, column)
+    outputs, slopes = COLUMNS[column].outputs, unknowns.slopes(theta)
+
+    def one(task: tuple[int, str]) -> tuple[FloatArray, FloatArray]:
+        index, output = task
+        e = experiments[index]
+        shown, by_theta, _ = traced_by_theta(
+            model, e.record, unknowns, theta, index,
+            stop=e.stop, way=way, slopes=slopes, output=output,
+        )  # fmt: skip
+        used = e.used[: e.stop]
+        return shown[used], by_theta[used]
+
+    runs = side_by_side(one, [(k, output) for output in outputs for k in records])
+    count = len(records)
+    per_output = [runs[k : k + count] for k in range(0, len(runs), count)]
+    given = np.concatenate([measured_in(experiments[k], column) for k in records])
+    lengths = tuple(int(experiments[k].used.sum()) for k in records)
+    shown = np.column_stack([np.concatenate([x for x, _ in own]) for own in per_output])
+    centred, target = _centred(shown, lengths), _centred(given, lengths)
+    size = np.maximum(np.linalg.norm(centred, axis=0), 1e-300)
+    factors = np.linalg.lstsq(centred / size, target, rcond=1e-10)[0] / size
+    basis = _basis(centred / size, lengths)
+    moved = sum(
+        f * np.vstack([j for _, j in own]) for f, own in zip(factors, per_output, strict=True)
+    )
+    return Further(
+        column=column,
+        level=level,
+        spread=float(np.sqrt(np.mean(target**2))),
+        residuals=target - basis @ (basis.T @ target),
+        jacobian=moved - basis @ (basis.T @ moved),
+        basis=basis,
+        factors=factors,
+        lengths=lengths,
+    )
+
+
+def with_column(experiments: Sequence[Experiment], column: str) -> list[int]:
+    """Return the experiments that have a column and samples of it to fit."""
+    return [
+        k
+        for k, e in enumerate(experiments)
+        if getattr(e.record, column) is not None and e.used.any()
+    ]
+
+
+def measured_in(experiment: Experiment, column: str) -> FloatArray:
+    """Return the used samples of a column (n,)."""
+    values: FloatArray = getattr(experiment.record, column)[experiment.used]
+    return values
+
+
+def scaled(model: Model, found: Sequence[Further]) -> tuple[Model, tuple[Further, ...]]:
+    """Return a model whose sensors have the scales that were found, and the factors beside it."""
+    values, beside = {}, []
+    for each in found:
+        name, factors = COLUMNS[each.column].scale, each.factors
+        if name is not None and factors[0] != 0.0:
+            low, high = model.parameter(name).bounds
+            values[name] = float(np.clip(factors[0] * model.values[name], low, high))
+            factors = factors * model.values[name] / values[name]
+        beside.append(replace(each, factors=factors))
+    return model.with_values(values), tuple(beside)
+
+
+def predicted_further(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    fitted: Further,
+    *,
+    way: Way,
+) -> dict[int, FloatArray]:
+    """Return a further column of whole records (n,) as predicted, by the index of the record.
+
+    Factors are those of the fit, offsets those of the used samples. Raises PsaError.
+    """
+    slopes = unknowns.slopes(theta)
+    found = {}
+    for k in with_column(experiments, fitted.column):
+        e = experiments[k]
+        total = np.zeros(e.record.n)
+        for factor, output in zip(fitted.factors, COLUMNS[fitted.column].outputs, strict=True):
+            shown, _, _ = traced_by_theta(
+                model, e.record, unknowns, theta, k,
+                stop=e.record.n, way=way, slopes=slopes, output=output,
+            )  # fmt: skip
+            total += factor * shown
+        found[k] = total + np.mean(measured_in(e, fitted.column) - total[e.used])
+    return found
+
+
+def _centred(values: FloatArray, lengths: Sequence[int]) -> FloatArray:
+    """Return values (n,) or columns less their mean in every record."""
+    parts = np.split(values, np.cumsum(lengths)[:-1])
+    return np.concatenate([part - np.mean(part, axis=0) for part in parts])
+
+
+def _basis(shown: FloatArray, lengths: Sequence[int]) -> FloatArray:
+    """Return an orthonormal basis of the records' offsets and of what is shown (n, k)."""
+    n = sum(lengths)
+    ones = np.zeros((n, len(lengths)))
+    first = 0
+    for k, length in enumerate(lengths):
+        ones[first : first + length, k] = 1.0 / np.sqrt(length)
+        first += length
+    u, s, _ = np.linalg.svd(shown, full_matrices=False)
+    return np.hstack([ones, u[:, s > 1e-10 * max(float(s[0]), 1e-300)]])

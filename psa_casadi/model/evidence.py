@@ -1,0 +1,138 @@
+"""What a model is good for: records, errors, ranges and covariance, kept with the model."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+from psa_casadi.variables import Interval
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Error over samples that no fit has seen [m], with the 95 % interval of its rms.
+
+    `nrmse_percent` is in percent of each record's range. `records` is the number of held-out
+    records that the interval is taken over, 0 where it is blocks of fewer ones.
+    """
+
+    rms_m: float
+    interval_m: Interval
+    max_m: float
+    nrmse_percent: float
+    records: int = 0
+
+
+@dataclass(frozen=True)
+class ErrorShare:
+    """What a cause or an unnamed correction removes of the base model's error, 0 to 1."""
+
+    what: str
+    share: float
+    interval: Interval
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """Where the base model's held-out error above the noise goes [m].
+
+    `unnamed` is the correction without a name that the model does not hold, and what it would
+    remove; `remains_m` is what the model leaves above the noise.
+    """
+
+    base_m: float
+    noise_m: float
+    remains_m: float
+    remains_percent: float
+    causes: tuple[ErrorShare, ...] = ()
+    unnamed: ErrorShare | None = None
+
+
+@dataclass(frozen=True)
+class SeenRange:
+    """What the records have shown: voltage [V], its largest rate [V/s], longest duration [s].
+
+    `temperature` [K] is None where no record has one.
+    """
+
+    voltage: Interval
+    rate: float
+    duration: float
+    temperature: Interval | None = None
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance (k, k) of the free parameters in SI units, in the order of `names`."""
+
+    names: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    def of(self, wanted: Collection[str]) -> "Covariance":
+        """Return that of some parameters, whatever the others are."""
+        kept = [k for k, n in enumerate(self.names) if n in wanted]
+        names = tuple(self.names[k] for k in kept)
+        return Covariance(names, tuple(tuple(self.matrix[i][k] for k in kept) for i in kept))
+
+
+@dataclass(frozen=True)
+class RecordRun:
+    """How a record is played again: from these states, its time counted from its first sample.
+
+    What the sensor shows is the model's displacement plus `offset_m`. `samples` counts those after
+    blocks of `averaged` samples were averaged (1: none were). `held_out` lists stretches [first,
+    stop) of samples that no fit has seen, which have the error `held_out_m` (rms, None without
+    them); `fitted_m` is that of the others.
+    """
+
+    record: str
+    sha256: str
+    start: Mapping[str, float]
+    offset_m: float
+    samples: int
+    averaged: int
+    fitted_m: float
+    held_out_m: float | None = None
+    held_out: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass(frozen=True)
+class ReferenceRun:
+    """The first part of a record in few samples: inputs, and the displacement that was measured.
+
+    `time` (n,) [s] counts from its first sample, where `start` and `offset_m` are those of the
+    record's `RecordRun`; `inputs` has columns (n,) that are linear in between. A displacement [m]
+    that was not measured is None.
+    """
+
+    record: str
+    time: tuple[float, ...]
+    inputs: Mapping[str, tuple[float, ...]]
+    displacement: tuple[float | None, ...]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What stands behind the values of an identified or diagnosed model.
+
+    `by` is what found them. `fitted_m` is the error over the samples of the fit [m]. `outside`
+    names components of sensor and environment that the errors count with, and that an exported
+    plant leaves out. `unnamed` says which correction without a name the model holds, if any.
+    """
+
+    by: str
+    fitted_m: float
+    seen: SeenRange
+    covariance: Covariance
+    runs: tuple[RecordRun, ...] = ()
+    reference: ReferenceRun | None = None
+    held_out: HeldOut | None = None
+    budget: ErrorBudget | None = None
+    outside: tuple[str, ...] = ()
+    unnamed: tuple[str, ...] = ()
+
+    def of_parameters(self, wanted: Collection[str]) -> "Evidence":
+        """Return the evidence with the covariance of some parameters only."""
+        return replace(self, covariance=self.covariance.of(wanted))
+
+    def run_of(self, record: str) -> RecordRun | None:
+        """Return how the record of that name is played again."""
+        return next((r for r in self.runs if r.record == record), None)

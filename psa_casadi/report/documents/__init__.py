@@ -1,0 +1,1 @@
+"""What commands write as JSON, and the schemas of it."""

@@ -1,0 +1,102 @@
+"""What DIAGNOSIS.json holds (`Diagnosis.to_dict` makes it)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from psa_casadi.diagnosis.budget import Budget
+from psa_casadi.diagnosis.held_out.errors import Errors, Gain
+from psa_casadi.diagnosis.result import (
+    BlindSpot,
+    Candidate,
+    Cause,
+    Decision,
+    NextExperiment,
+    Remaining,
+    Verdict,
+)
+
+
+@dataclass(frozen=True)
+class BothErrors:
+    """The noise floor [m], and the errors of the base and the extended model."""
+
+    noise_floor_rms_m: float
+    base: Errors
+    extended: Errors
+
+
+@dataclass(frozen=True)
+class UnnamedCorrection:
+    """An unnamed correction that helps: its kind and place, evidence, and what else it may be."""
+
+    kind: str
+    port: str
+    sentence: str
+    evidence: float
+    open_to: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class OtherModel:
+    """The extended model with another effect instead of a cause; how much the two differ."""
+
+    cause: str
+    instead: str
+    rms_ratio: float
+    plant_differs_m: float
+    plant_differs_percent: float
+
+
+@dataclass(frozen=True)
+class RecordNoise:
+    """The noise of one record: its rms [m], where that is known from, and a sentence."""
+
+    record: str
+    rms: float
+    source: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class RecordMisfit:
+    """What a model gets wrong in one record: rms, excess over the noise [m], shares of views."""
+
+    record: str
+    rms: float
+    excess: float
+    views: Mapping[str, float]
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RecordUsed:
+    """A record that was diagnosed, with the SHA-256 of its file."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class DiagnosisFile:
+    """A diagnosis: verdict, causes, errors before and after, and what remains."""
+
+    format: Literal["psa_casadi.diagnosis/1"]
+    verdict: Verdict
+    doubt: str
+    causes: tuple[Cause, ...]
+    candidates: tuple[Candidate, ...]
+    errors: BothErrors
+    gain: Gain
+    budget: Budget | None
+    patch: UnnamedCorrection | None
+    alternatives: tuple[OtherModel, ...]
+    columns: tuple[Decision, ...]
+    blind_to: tuple[BlindSpot, ...]
+    remaining: Remaining
+    next_experiment: NextExperiment
+    notes: tuple[str, ...]
+    noise: tuple[RecordNoise, ...]
+    misfit: tuple[RecordMisfit, ...]
+    remainder: tuple[RecordMisfit, ...]
+    records: tuple[RecordUsed, ...]

@@ -1,0 +1,188 @@
+"""What stands behind a model's values is kept with it, in MODEL.json, and only while it is true."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.evidence import evidence_of
+from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import Evidence
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.records.decimate import decimated
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import divided, whole
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import Interval
+from tests.evidence_models import NOISE, OFFSET, evident_model, noisy_record
+from tests.mutations import sentences
+
+
+def evidence_in(model: Model) -> Evidence:
+    assert model.evidence is not None
+    return model.evidence
+
+
+def test_it_says_what_the_record_has_shown_and_what_the_model_errs_by() -> None:
+    record, told = noisy_record(), evidence_in(evident_model())
+    rates = np.abs(np.diff(record.voltage) / np.diff(record.time))
+    assert told.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
+    assert told.seen.rate == pytest.approx(rates.max())
+    assert told.seen.duration == record.duration
+    assert told.seen.temperature is None
+    held = told.held_out
+    assert held is not None
+    assert held.interval_m.low < NOISE < held.interval_m.high
+    assert held.rms_m == pytest.approx(NOISE, rel=0.15)
+    (played,) = told.runs
+    assert (played.sha256, played.samples, played.averaged) == (record.sha256, 640, 1)
+    assert played.offset_m == pytest.approx(OFFSET, abs=1e-8)
+    (split,) = divided([record], ())
+    held_out = [k for first, stop in played.held_out for k in range(first, stop)]
+    assert held_out == np.flatnonzero(split.held_out).tolist()
+
+
+def test_the_covariance_is_that_of_the_intervals() -> None:
+    model = evident_model()
+    told, known = evidence_in(model).covariance, model.provenance.intervals
+    assert told.names == ("k_L", "A", "tau")
+    for k, name in enumerate(told.names):
+        half = 0.5 * (known[name].high - known[name].low)
+        assert 1.96 * told.matrix[k][k] ** 0.5 == pytest.approx(half, rel=0.02), name
+
+
+def test_a_record_is_played_again_from_what_is_said_of_it() -> None:
+    """The start, the offset and the stretches are enough to find the held-out error again."""
+    model, record = evident_model(), noisy_record()
+    (said,) = evidence_in(model).runs
+    x0 = np.array([said.start[n] for n in model.state_names])
+    inputs = record_inputs(model, record, record.n)
+    y = run(model, record.time - record.time[0], inputs, x0, rtol=1e-9).y
+    found = y[:, model.output_names.index("measured_displacement")] + said.offset_m
+    error = np.concatenate([(measured(record) - found)[a:b] for a, b in said.held_out])
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(said.held_out_m, rel=1e-4)
+
+
+def test_the_reference_run_tells_the_voltage_in_few_samples() -> None:
+    """A record of 6000 samples, whose voltage moves for a moment only: every eighth tells it."""
+    time = np.asarray(np.arange(6000) * 1e-3, dtype=np.float64)
+    voltage = 50.0 - 50.0 * np.cos(6.0 * time)
+    record = Record(name="long", time=time, voltage=voltage, displacement=1e-7 * voltage)
+    model = psa.stack_model("demo")
+    experiments = (whole(record),)
+    found = fit(model, experiments, ["k_L"], sigma=[1e-8])
+    told = evidence_of(
+        found, determinacy(found, experiments), experiments, found.predicted(experiments), by="test"
+    )
+    reference = told.reference
+    assert reference is not None
+    assert told.held_out is None
+    assert len(reference.time) == 300
+    step = reference.time[1] - reference.time[0]
+    assert step >= 8e-3
+    known = time <= reference.time[-1]
+    lines = np.interp(time[known], reference.time, reference.inputs["voltage"])
+    assert np.max(np.abs(lines - voltage[known])) <= 2e-3 * 100.0 + 1e-4
+
+
+def test_averaged_records_are_said_to_be() -> None:
+    time = np.asarray(np.arange(8000) * 1e-4, dtype=np.float64)
+    voltage = 50.0 - 50.0 * np.cos(8.0 * time)
+    noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
+    record = Record(name="fast", time=time, voltage=voltage, displacement=1e-7 * voltage + noise)
+    shorter, factor = decimated(record, 1e-7, 1e-7)
+    assert factor > 1
+    experiments = (whole(shorter),)
+    found = fit(psa.stack_model("demo"), experiments, ["k_L"], sigma=[1e-7])
+    told = evidence_of(
+        found, determinacy(found, experiments), experiments, found.predicted(experiments),
+        by="test", sampled=[record],
+    )  # fmt: skip
+    (said,) = told.runs
+    assert (said.averaged, said.samples) == (factor, shorter.n)
+
+
+def test_a_file_keeps_it_exactly() -> None:
+    model = evident_model()
+    again = loads(dumps(model))
+    assert again.evidence == model.evidence
+    assert dumps(again) == dumps(model)
+    assert max(len(line) for line in dumps(model).splitlines()) > 1000  # a list on one line
+    assert loads(dumps(replace(model, evidence=None))).evidence is None
+
+
+def test_other_values_or_physics_have_no_evidence() -> None:
+    model = evident_model()
+    same = model.with_values({"k_L": model.values["k_L"]})
+    assert same.evidence is model.evidence
+    assert model.with_values({"k_L": 1.01 * model.values["k_L"]}).evidence is None
+    assert model.with_effect(EFFECTS["slow_creep"]).evidence is None
+    assert model.without(["creep_lag"]).evidence is None
+    assert model.with_starts({"u": 1.0}).evidence is model.evidence
+
+
+def test_a_plant_keeps_it_with_the_covariance_of_its_own_parameters() -> None:
+    model = evident_model()
+    drift = EFFECTS["offset_drift"]
+    gain = drift.gain or ""
+    told = evidence_in(model)
+    names = ("k_L", gain)
+    wider = replace(told.covariance, names=names, matrix=((4.0, 1.0), (1.0, 9.0)))
+    both = replace(
+        model.with_effect(drift), evidence=replace(told, covariance=wider, outside=(drift.name,))
+    )
+    plant = loads(dumps(both)).plant()
+    assert evidence_in(plant).covariance.names == ("k_L",)
+    assert evidence_in(plant).covariance.matrix == ((4.0,),)
+    assert loads(dumps(plant)).evidence == plant.evidence
+
+
+def _edited(change: Callable[[dict[str, Any]], object]) -> str:
+    content = json.loads(dumps(evident_model()))
+    change(content["evidence"])
+    return json.dumps(content)
+
+
+MISTAKES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "'evidence' has the unknown names ['more']": lambda e: e.update(more=1),
+    "'evidence' lacks seen": lambda e: e.pop("seen"),
+    "'evidence.fitted_m' is 'x'; give a number": lambda e: e.update(fitted_m="x"),
+    "'evidence.fitted_m' is True; give a number": lambda e: e.update(fitted_m=True),
+    "an error, a rate or a duration below 0": lambda e: e.update(fitted_m=-1.0),
+    "'evidence.seen.voltage' is [2, 1]; give [low, high]": lambda e: e["seen"].update(
+        voltage=[2, 1]
+    ),
+    "'evidence.runs[0].samples' is 2.5; give a whole number": lambda e: e["runs"][0].update(
+        samples=2.5
+    ),
+    "must have held-out stretches that follow each other": lambda e: e["runs"][0].update(
+        held_out=[[5, 9], [8, 12]]
+    ),
+    "must have a held-out error and held-out samples": lambda e: e["runs"][0].update(held_out=[]),
+    "must have samples, each of at least one": lambda e: e["runs"][0].update(averaged=0),
+    "must name parameters, none twice; not ['warp']": lambda e: e["covariance"].update(
+        names=["k_L", "A", "warp"]
+    ),
+    "must have a row and a column for each name": lambda e: e["covariance"]["matrix"].pop(),
+    "must be symmetric": lambda e: e["covariance"]["matrix"][0].__setitem__(1, 7.0),
+    "must have two or more increasing times": lambda e: e["reference"].update(time=[0.0]),
+    "and a value of each column for each time": lambda e: e["reference"]["inputs"].clear(),
+    "which is not among the runs": lambda e: e["reference"].update(record="other"),
+    "'evidence.reference.displacement' is 3; give a list": lambda e: e["reference"].update(
+        displacement=3
+    ),
+}
+
+
+@pytest.mark.parametrize("expected", MISTAKES)
+def test_a_mistake_in_a_file_is_named(expected: str) -> None:
+    assert expected in "\n".join(sentences(lambda: loads(_edited(MISTAKES[expected]))))

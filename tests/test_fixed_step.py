@@ -1,0 +1,222 @@
+"""The fixed step in C: its error, its form, what it refuses, and the command that writes it."""
+
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.component import Component
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.fixed_step.expressions import PRECISIONS
+from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
+from psa_casadi.export.fixed_step.probe import VOLTAGES, Probe, played_inputs
+from psa_casadi.model.compose import compose
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.scratch import temporary_folder
+from psa_casadi.simulation.compiler import compiler_command, has_zig, run_compiler, zig_command
+from psa_casadi.simulation.simulate import simulate
+from tests.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect
+from tests.stack_models import stack
+from tests.tiers import slow
+
+STEP = 1e-5
+STRICT = (
+    "-std=c99", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic",
+    "-Werror",
+)  # fmt: skip
+CALLS = {"exp", "log", "sqrt", "fabs", "sin", "cos", "tan", "atan", "tanh"}
+OUTPUT = "displacement"
+
+
+@cache
+def base(precision: str = "double", hold: str = "linear", substeps: int | None = 1) -> FixedStep:
+    return fixed_step(
+        stack("P-885.51").plant(),
+        name="stack",
+        step=STEP,
+        precision=precision,
+        hold=hold,
+        substeps=substeps,
+    )
+
+
+def errors(found: FixedStep) -> dict[str, float]:
+    return {e.voltage: e.error for e in found.errors}
+
+
+def play(found: FixedStep, voltage: FloatArray) -> FloatArray:
+    """Return the displacement after each step of voltages (n,), the first one the start's."""
+    model = found.plan.model
+    u = played_inputs(model, np.zeros(len(voltage)))
+    u[:, model.input_names.index("voltage")] = voltage
+    return Probe(found.plan, found.texts).play(u)[:, model.output_names.index(OUTPUT)]
+
+
+def test_the_base_errs_by_what_its_header_says() -> None:
+    found = errors(base())
+    assert set(found) == set(VOLTAGES)
+    assert all(0.0 < e <= 2e-4 for e in found.values())
+    assert max(found["sine"], found["ramps and holds"]) <= 1e-6
+    header = base().texts["stack.h"]
+    assert all(f"{name:16} {value:.1e}" in header for name, value in found.items())
+
+
+def test_the_measured_error_is_the_one_against_simulate() -> None:
+    share = np.linspace(0.0, 1.0, 1001)
+    voltage = stack("P-885.51").values["u_rated"] * VOLTAGES["tones"][1](share)
+    model = base().plan.model
+    true = simulate(model, STEP * np.arange(1001), voltage, as_exported=True, rtol=1e-9)
+    own = error(play(base(), voltage), true.outputs[OUTPUT][1:])
+    assert own == pytest.approx(errors(base())["tones"], rel=0.02)
+
+
+@slow
+def test_substeps_of_half_the_length_err_far_less() -> None:
+    one, two = errors(base()), errors(base(substeps=2))
+    for name in ("triangle", "tones", "jumps"):
+        assert two[name] < 0.3 * one[name]
+
+
+@slow
+def test_held_inputs_are_those_of_a_zero_order_hold() -> None:
+    assert all(0.0 < e <= 1e-3 for e in errors(base(hold="zero")).values())
+    assert errors(base(hold="zero")) != errors(base())
+
+
+@slow
+def test_single_precision_rests_in_a_hold() -> None:
+    """Half a second of rest after a ramp, where a rounded rate would go on for ever."""
+    ramp = np.linspace(0.0, 87.3, 2000)
+    voltage = np.concatenate([ramp, np.full(50_000, ramp[-1])])
+    double, single = (play(base(precision), voltage) for precision in PRECISIONS)
+    assert error(single, double) <= 2e-6
+    assert np.ptp(single[-10_000:]) <= 1e-6 * np.ptp(single)
+
+
+@slow
+def test_slow_ramps_are_not_lost_in_single_precision() -> None:
+    """A step of the ramp is a third of what the precision resolves of the voltage.
+
+    Without the asymmetry delta, which tells a ramp this slow from a hold, and stairs from a ramp.
+    """
+    voltage = np.concatenate([np.linspace(0.0, 80.0, 2000), np.linspace(80.0, 80.5, 200_000)])
+    model = stack("P-885.51", delta=0.0).plant()
+    gains = []
+    for precision in PRECISIONS:
+        found = fixed_step(model, name="stack", step=STEP, precision=precision, substeps=1)
+        gains.append(np.diff(play(found, voltage)[[5000, -1]])[0])
+    assert gains[0] > 2e-8
+    assert gains[1] == pytest.approx(gains[0], rel=0.05)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str) -> None:
+    found = base(precision)
+    source, suffix = found.texts["stack.c"], PRECISIONS[precision].suffix
+    assert re.findall(r"#include (.*)", found.texts["stack.h"] + source) == [
+        '"stack.h"',
+        "<math.h>",
+    ]
+    own = {"advance", "outputs", "gain", "stack_init", "stack_step"}
+    code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+    assert set(re.findall(r"(\w+)\(", code)) <= own | {name + suffix for name in CALLS}
+    assert not re.search(r"\b(for|while|do|if|goto|static \w+ \w+\[)\b", code)
+    commands = [compiler_command(), *([zig_command()] if has_zig() else [])]
+    with temporary_folder() as folder:
+        for name, text in found.texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        for command in commands:
+            run_compiler([*command, *STRICT, "-c", "stack.c", "-o", "stack.o"], folder)
+
+
+@slow
+def test_a_start_voltage_is_at_rest() -> None:
+    model = psa.settled_at(stack("P-885.51").plant(), 60.0, (120.0,))
+    found = fixed_step(model, name="stack", step=STEP, substeps=1)
+    held = play(found, np.full(500, 60.0))
+    first = simulate(model, [0.0, STEP], [60.0, 60.0]).outputs[OUTPUT][0]
+    assert first > 5e-6
+    assert np.max(np.abs(held - first)) <= 1e-6 * first
+
+
+@pytest.mark.parametrize(
+    ("component", "reason"),
+    [(KINK, "kink of their own"), (JUMP, "equations jump"), (FEEDBACK, "voltage_reversal")],
+    ids=["kink", "jump", "feedback"],
+)
+def test_an_effect_that_does_not_fit_is_named(component: Component, reason: str) -> None:
+    model = compose((*BASE, component), stack("P-885.51").values)
+    with pytest.raises(psa.InputError, match=f"'{component.name}' does not fit.*{reason}"):
+        fixed_step(model, name="stack", step=STEP)
+
+
+def test_a_clock_in_single_precision_is_refused() -> None:
+    with pytest.raises(psa.InputError, match=r"'ageing' does not fit.*double precision"):
+        fixed_step(with_effect("ageing"), name="stack", step=STEP, precision="single")
+
+
+def test_a_sampled_part_is_refused_as_a_whole() -> None:
+    with pytest.raises(psa.InputError, match=r"'position_controller'.*sampled states"):
+        fixed_step(psa.part_model("position_controller"), name="part", step=STEP)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"name": "2x"}, "cannot name functions"),
+        ({"step": 0.0}, "above 0"),
+        ({"step": float("nan")}, "above 0"),
+        ({"precision": "half"}, "double or single"),
+        ({"hold": "cubic"}, "linear or zero"),
+        ({"substeps": 0}, "from 1 to 1000"),
+        ({"step": 2e-3, "substeps": 1}, "too\\s+long"),
+    ],
+)
+def test_wrong_wishes_end_in_a_sentence(wrong: dict[str, object], said: str) -> None:
+    given = {"name": "stack", "step": STEP, **wrong}
+    model = with_effect("backlash") if "substeps" in wrong else stack("P-885.51")
+    with pytest.raises(psa.InputError, match=said):
+        fixed_step(model, **given)  # type: ignore[arg-type]  # wrong on purpose
+
+
+def test_the_command_writes_two_files_and_tells_the_error(tmp_path: Path) -> None:
+    arguments = ["export", "c", "--stack", "P-885.51", "--step", "10us", "--name", "stack"]
+    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "code")])
+    assert done.exit_code == 0, done.output
+    assert sorted(p.name for p in (tmp_path / "code").iterdir()) == ["stack.c", "stack.h"]
+    assert "step: 1e-05 s, 1 substep, double precision" in done.output
+    assert "left out: sensor" in done.output
+    assert f"{errors(base())['jumps']:.1e}" in done.output
+    wrong = CliRunner().invoke(app, [*arguments[:5], "3V", "-o", str(tmp_path / "code")])
+    assert wrong.exit_code != 0
+
+
+def limit(name: str) -> float:
+    """Return the error that is allowed: these two move faster than any step of this length."""
+    return 5e-3 if name in ("current_limit", "rate_dependent_hysteresis") else 1e-3
+
+
+CASES = [
+    *(("base", name) for name in STACKS),
+    *((name, sorted(STACKS)[k % len(STACKS)]) for k, name in enumerate(EFFECTS)),
+]
+
+
+@slow
+def test_every_effect_and_every_stack_is_exported_and_compared() -> None:
+    """Effects at an ordinary size, on the stacks and in the precisions in turn, sensor included."""
+    far = {}
+    for k, (name, stack_name) in enumerate(CASES):
+        clock = name in ("ageing", "mains_hum", "offset_drift")
+        precision = "double" if k % 2 or clock else "single"
+        model = with_effect(name, stack_name)
+        found = fixed_step(model, name="stack", step=STEP, precision=precision)
+        if not found.worst.error <= limit(name):
+            far[name, stack_name] = (found.plan.substeps, found.worst)
+    assert not far

@@ -1,0 +1,74 @@
+"""Pages that are made when the site is built: commands, effects, recipes."""
+
+import pytest
+import yaml  # type: ignore[import-untyped]
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from build_scripts import copied_pages
+from build_scripts.commands_page import commands
+from build_scripts.effects_page import PICTURES, overview, section
+from build_scripts.measured_data import ROOT
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.examples.index import examples
+
+
+def _options(group: TyperGroup, name: str) -> dict[str, list[str]]:
+    """Return the options of every command below a group."""
+    found: dict[str, list[str]] = {}
+    for word, command in group.commands.items():
+        if isinstance(command, TyperGroup):
+            found |= _options(command, f"{name} {word}")
+        else:
+            found[f"{name} {word}"] = [o for p in command.params for o in p.opts if o[:2] == "--"]
+    return found
+
+
+def test_the_page_of_commands_holds_every_command_and_option() -> None:
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    parts = dict(part.split("`\n", 1) for part in commands().split("# `")[1:])
+    options = _options(group, "psa")
+    assert len(options) >= 15
+    for name, given in options.items():
+        lines = [line for line in parts[name].splitlines() if line.startswith("* `")]
+        assert [o for o in given if not any(o in line for line in lines)] == [], name
+    assert "Example: `psa demo my_demo`" in parts["psa demo"]
+
+
+def test_the_gallery_lists_every_effect() -> None:
+    assert [row[0] for row in overview().rows] == [f"[`{name}`](#{name})" for name in EFFECTS]
+
+
+def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> None:
+    effect = EFFECTS["backlash"]
+    text = section(effect)
+    assert effect.equation_text.split(",  ", maxsplit=1)[0] in text
+    assert f"]({PICTURES}/backlash.png)" in text
+    assert effect.source[1:] in text
+    assert all(f"| {p.name} | {p.unit} |" in text for p in effect.parameters)
+
+
+@pytest.mark.parametrize("name", copied_pages.RECIPES)
+def test_a_recipe_is_a_page_with_its_scripts(name: str) -> None:
+    page = copied_pages.recipe_page(name)
+    for script in examples()[name].scripts:
+        assert f'```{script.language} title="{script.name}"\n{script.text}```' in page
+    assert f"`psa examples {name} -o FOLDER`" in page
+
+
+def test_every_page_is_in_the_menu() -> None:
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("nav:\n")[2]
+    names = yaml.safe_load(f"nav:\n{menu}")["nav"]
+    pages = {p for section in names for entry in section.values() for p in _pages(entry)}
+    written = {p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")}
+    assert written <= pages
+
+
+def _pages(entry: object) -> list[str]:
+    if isinstance(entry, str):
+        return [entry]
+    entries = entry.values() if isinstance(entry, dict) else entry
+    assert not isinstance(entries, str)
+    return [page for e in entries for page in _pages(e)]  # type: ignore[attr-defined]

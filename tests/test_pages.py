@@ -1,0 +1,90 @@
+"""What every page says of its making, its one unit for errors, and the page that is small."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.command_line import typed
+from psa_casadi.diagnosis.held_out.errors import Errors
+from psa_casadi.report.page.design_page import write_design_page
+from psa_casadi.report.page.fit_page import write_fit_report
+from psa_casadi.report.words.phrases import handy_scale, length_scale, one_unit
+from tests.html_page import Page, figures
+from tests.report_cases import diagnosis, identification
+
+
+def test_every_page_tells_date_version_command_and_the_records_hashes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
+    token = typed.set("psa diagnose 'my record.csv'")
+    try:
+        d, found = diagnosis("cause_named"), identification()
+        paths = [tmp_path / f"{k}.html" for k in range(3)]
+        psa.write_report(d, paths[0])
+        write_fit_report(found, paths[1])
+        write_design_page(paths[2], title="A design", summary=["It moves."])
+    finally:
+        typed.reset(token)
+    for path in paths:
+        text = Page(path.read_text(encoding="utf-8")).text
+        assert f"Written 2026-09-21 14:13 UTC by psa_casadi {psa.__version__}." in text
+        assert "Command: psa diagnose 'my record.csv'" in text
+    for path, experiments in zip(paths, (d.experiments, found.experiments), strict=False):
+        for e in experiments:
+            assert e.record.sha256 in path.read_text(encoding="utf-8")
+
+
+def test_a_page_without_a_command_tells_none(tmp_path: Path) -> None:
+    write_design_page(tmp_path / "a.html", title="A design", summary=["It moves."])
+    assert "Command" not in Page((tmp_path / "a.html").read_text(encoding="utf-8")).text
+
+
+@pytest.mark.parametrize("kind", ["diagnosis", "fit"])
+def test_a_small_page_is_below_a_megabyte_and_says_the_same(kind: str, tmp_path: Path) -> None:
+    result = diagnosis("cause_named") if kind == "diagnosis" else identification()
+    result.report(tmp_path / "large.html")
+    result.report(tmp_path / "small.html", small=True)
+    large, small = ((tmp_path / f"{n}.html").read_text("utf-8") for n in ("large", "small"))
+    assert len(small) < 1e6 < len(large)
+    assert "data:image/png;base64," in small
+    assert figures(small) == []
+    assert len(figures(large)) > 5
+    tables = [re.findall(r"<table>.*?</table>", text, re.DOTALL) for text in (large, small)]
+    assert tables[0] == tables[1]
+
+
+def test_the_library_and_each_record_are_there_once(tmp_path: Path) -> None:
+    diagnosis("cause_named").report(tmp_path / "a.html")
+    text = (tmp_path / "a.html").read_text("utf-8")
+    assert text.count("plotly.js v") == 1
+    drawn = re.findall(r'<script type="application/json">(.*?)</script>', text, re.DOTALL)
+    large = [data for data in drawn if len(data) > 10_000]  # a view of the data may come again
+    assert len(large) == len(set(large)) > 3
+    assert text.count("Displacement, and residual") == 0
+    assert "at the top of the page" in text
+
+
+def test_the_errors_of_a_page_have_one_unit(tmp_path: Path) -> None:
+    d = replace(
+        diagnosis("cause_named"),
+        base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
+        extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
+    )
+    d.report(tmp_path / "a.html", small=True)
+    text = Page((tmp_path / "a.html").read_text("utf-8")).text.replace("\u00a0", " ")
+    start = text.index("base model, held-out rms")
+    tiles = text[start : start + 400]
+    assert "2.50 µm" in tiles
+    assert "0.0500 µm" in tiles
+    assert " nm" not in tiles
+
+
+def test_a_unit_of_a_page_ends_with_it() -> None:
+    with one_unit(handy_scale(2e-6)):
+        assert length_scale(3e-9).unit == "µm"
+        assert length_scale(3e-9, counts=True).unit == "counts"
+    assert length_scale(3e-9).unit == "nm"
