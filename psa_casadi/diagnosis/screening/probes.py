@@ -17,7 +17,7 @@ from psa_casadi.component import (
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column
-from psa_casadi.identification.fitting.prediction import measured, predict_record, trace_record
+from psa_casadi.identification.fitting.prediction import measured, trace_record
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import among_harmonics
 from psa_casadi.records.quality.filtering import peaks as highest_peaks
@@ -274,10 +274,12 @@ def _beside(
         e, states = experiments[k], dict.fromkeys(names, 0.0) | memory[k]
         total = -measured_in(e, f.column) if step else np.zeros(int(e.used.sum()))
         for factor, output in zip(f.factors, COLUMNS[f.column].outputs, strict=True):
-            y, by_gain, _ = predict_record(
-                changed, e.record, states, [gain], stop=e.stop, rtol=rtol, output=output
-            )
-            total = total + factor * (y if step else by_gain[:, 0] * scale)[e.used[: e.stop]]
+            found = trace_record(
+                changed, e.record, states, () if step else (gain,),
+                stop=e.stop, way=Way(rtol, rtol), by_start=False, output=output,
+            )  # fmt: skip
+            moved = found.output if step else found.sensitivity[:, 0] * scale
+            total = total + factor * moved[e.used[: e.stop]]
         return total
 
     found = []

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.components import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
-from psa_casadi.identification.fitting.prediction import traced_by_theta
+from psa_casadi.identification.fitting.prediction import trace_record, traced_by_theta
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
@@ -208,17 +208,16 @@ def predicted_further(
 
     Factors are those of the fit, offsets those of the used samples. Raises PsaError.
     """
-    slopes = unknowns.slopes(theta)
+    current = model.with_values(unknowns.values(theta))
     found = {}
     for k in with_column(experiments, fitted.column):
-        e = experiments[k]
+        e, start = experiments[k], unknowns.start(theta, k)
         total = np.zeros(e.record.n)
         for factor, output in zip(fitted.factors, COLUMNS[fitted.column].outputs, strict=True):
-            shown, _, _ = traced_by_theta(
-                model, e.record, unknowns, theta, k,
-                stop=e.record.n, way=way, slopes=slopes, output=output,
-            )  # fmt: skip
-            total += factor * shown
+            total += factor * trace_record(
+                current, e.record, start, (),
+                stop=e.record.n, way=way, by_start=False, output=output,
+            ).output  # fmt: skip
         found[k] = total + np.mean(measured_in(e, fitted.column) - total[e.used])
     return found
 
