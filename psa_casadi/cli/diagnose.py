@@ -11,6 +11,7 @@ import typer
 from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
+    HysteresisOption,
     Origin,
     OriginOption,
     Quiet,
@@ -49,6 +50,7 @@ def diagnose(
     stiffness: Annotated[
         float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
     ] = None,
+    hysteresis: HysteresisOption = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="MODEL.json of the extended model.")
     ] = None,
@@ -120,6 +122,7 @@ def diagnose(
                     holdout=found[count:],
                     model=start,
                     stiffness=stiffness,
+                    hysteresis=hysteresis.value if hysteresis else None,
                     effects=tuple(known_effects(given.effects).values()),
                     progress=progress,
                 )

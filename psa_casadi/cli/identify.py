@@ -10,6 +10,8 @@ import typer
 from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
+    Form,
+    HysteresisOption,
     Origin,
     OriginOption,
     Quiet,
@@ -48,6 +50,7 @@ def identify(
     stiffness: Annotated[
         float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
     ] = None,
+    hysteresis: HysteresisOption = None,
     method: Annotated[
         Method, typer.Option(help="How the parameters are found.")
     ] = Method.PREDICTION_ERROR,
@@ -78,6 +81,8 @@ def identify(
         given.add("--method paper has no likelihood; leave --profile or --method out.")
     if method is Method.PAPER and model is not None:
         given.add("--method paper starts from no model; leave --model or --method out.")
+    if method is Method.PAPER and hysteresis not in (None, Form.BOUC_WEN):
+        given.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
     given.stiffness(stiffness)
     given.outputs({"--output": output, "--json": json, "--report": report}, [*records, model])
     measured = given.records(records, columns=columns, sample_time=sample_time)
@@ -87,7 +92,13 @@ def identify(
         if method is Method.PAPER:
             found = by_paper(measured, stiffness=stiffness, progress=progress)
         else:
-            found = run(measured, model=start, stiffness=stiffness, progress=progress)
+            found = run(
+                measured,
+                model=start,
+                stiffness=stiffness,
+                hysteresis=hysteresis.value if hysteresis else None,
+                progress=progress,
+            )
         profiles = _finish(
             found, output, (json, report, small), profile or (), origin.value, progress
         )

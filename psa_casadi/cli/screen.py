@@ -67,6 +67,24 @@ SampleTimeOption = Annotated[
 ]
 
 
+class Form(StrEnum):
+    """Forms of the base's hysteresis."""
+
+    BOUC_WEN = "bouc-wen"
+    SPECTRUM = "spectrum"
+    BEST = "best"
+
+
+HysteresisOption = Annotated[
+    Form | None,
+    typer.Option(
+        "--hysteresis",
+        help="Form of the base's hysteresis; best is the one that the records prefer. By default"
+        " Bouc-Wen, or as the model has it.",
+        show_default=False,
+    ),
+]
+
 HistoryOption = Annotated[
     str | None,
     typer.Option(

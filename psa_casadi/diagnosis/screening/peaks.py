@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.drive import among_harmonics
+from psa_casadi.records.drive import among_harmonics, mains_line
 from psa_casadi.records.quality.filtering import peaks as highest_peaks
 from psa_casadi.records.split import Experiment
 
@@ -25,7 +25,7 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     """Frequencies [Hz] of the highest peaks in the spectrum of the first record's residual.
 
     Samples that do not count are 0, so that a line keeps its phase across them. The range of a
-    periodic drive's harmonics is left out: it may be distortion.
+    periodic drive's harmonics is left out, since it may be distortion, but for the mains.
     """
     experiment = experiments[0]
     count = experiment.stop
@@ -37,7 +37,12 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     frequency = np.fft.rfftfreq(_FINER * count, experiment.record.sample_time)
     lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
     order = highest_peaks(power[lowest:], apart, 5 * _PEAKS) + lowest
-    tones = [k for k in order if not among_harmonics(frequency[k], experiment.record)]
+    record = experiment.record
+    tones = [
+        k
+        for k in order
+        if not among_harmonics(frequency[k], record) or mains_line(frequency[k], record)
+    ]
     strongest = np.array(tones[:_PEAKS], dtype=int)
     return tuple(float(f) for f in np.sort(frequency[strongest])) or (
         0.1 / experiment.record.sample_time,

@@ -24,6 +24,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column
 from psa_casadi.identification.fitting.prediction import OUTPUT, measured, trace_record
 from psa_casadi.model.compose import Model
+from psa_casadi.records.drive import among_harmonics
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import memory_names
@@ -92,7 +93,11 @@ def _probe_values(
             grids.append((longest,))
         elif isinstance(grid, str):
             low, high = next(p.bounds for p in effect.parameters if p.name == name)
-            grids.append(tuple(f for f in peaks[grid] if low < f < high))
+            places = [f for f in peaks[grid] if low < f < high]
+            if grid == SPECTRAL_PEAKS and effect.belongs_to != "environment":
+                first = experiments[0].record  # a resonance answers at the drive's harmonics only
+                places = [f for f in places if not among_harmonics(f, first)]
+            grids.append(tuple(places))
         else:
             grids.append(grid)
     for point in product(*grids):

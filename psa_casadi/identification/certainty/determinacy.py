@@ -138,7 +138,7 @@ def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | N
     if "k_P" not in p or "k_P" in free:
         return None
     softer = 1.0 / (1.0 + p["k_P"] / p["k_B"])  # d ln force / d ln k_P at the same displacement
-    forces = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
+    forces = [n for n in ("k_L", "A", "beta", "gamma", "delta", "h_ref") if n in p]
     change = {n: softer * p[n] for n in forces} | {n: p[n] for n in ("k_P", "c_P", "m_P")}
     curvature = np.diag(1.0 / fit.unknowns.prior**2)
     pull = np.zeros(fit.unknowns.size)

@@ -120,7 +120,13 @@ def ordinary_values(model: Model, records: Sequence[Record]) -> dict[str, float]
     """
     k_l = max(abs(static_slope(records)), 1e-12) / static_compliance(model.values)
     loop = {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
-    return {"k_L": k_l, **loop, **_lags(model.values, min(r.sample_time for r in records))}
+    shape = loop if has_loop(model) else {}
+    return {"k_L": k_l, **shape, **_lags(model.values, min(r.sample_time for r in records))}
+
+
+def has_loop(model: Model) -> bool:
+    """Whether the model's hysteresis is Bouc-Wen's, whose shapes of loop are known."""
+    return "A" in model.values
 
 
 def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:
