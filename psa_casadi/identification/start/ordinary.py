@@ -26,9 +26,11 @@ _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
 _HYSTERESIS_SHARE = 0.1
 
-#: Shapes of loop to start from: A, beta, gamma over k_L, and n.
+#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The second saturates early, far
+#: within the range; from the others a fit of such a loop ends with a steep A and no bend.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
     {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
+    {"A": -0.35, "beta": 0.6, "gamma": 0.02, "n": 1.4},
     {"A": -0.15, "beta": 0.05, "gamma": 0.05, "n": 1.1},
     {"A": -0.3, "beta": 0.1, "gamma": 0.1, "n": 1.05},
 )
