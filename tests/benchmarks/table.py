@@ -53,6 +53,12 @@ BENCHES: dict[str, Bench] = {
             on_folder=True,
         ),
         _later(
+            "mirror",
+            "mirror",
+            "models of one axis of the steering mirror by its authors' score (--folder)",
+            on_folder=True,
+        ),
+        _later(
             "hidden",
             "diagnose",
             "hidden causes on independent plants: what is named, how surely, and how often rightly",
