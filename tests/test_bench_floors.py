@@ -71,7 +71,7 @@ def test_the_floor_of_a_plant_of_its_kind_is_the_noise() -> None:
     v = triangles(rng)
     record = Record(
         name="own",
-        time=1e-3 * np.arange(N),
+        time=np.linspace(0.0, 1e-3 * (N - 1), N),
         voltage=40.0 + 30.0 * v,
         displacement=1e-6 * plant(v, rng),
     )
@@ -84,6 +84,7 @@ def test_the_floor_of_a_plant_of_its_kind_is_the_noise() -> None:
     assert np.std((shown - line)[experiments[0].held_out]) > 30.0 * errors.holdout_rms_m
 
 
+@pytest.mark.slow
 def test_modes_are_found_in_a_broadband_record() -> None:
     rng = np.random.default_rng(2)
     v = np.clip(0.25 * rng.standard_normal(700), -1.0, 1.0)
@@ -103,6 +104,21 @@ def test_modes_are_found_in_a_broadband_record() -> None:
     assert np.std((y - found.predicted[0])[held]) < 1.4 * noise
 
 
+@pytest.mark.slow
+def test_a_line_of_the_mains_is_found_and_noise_is_none() -> None:
+    rng = np.random.default_rng(8)
+    v, k = triangles(rng), np.arange(N)
+    held = k % 100 >= 75
+    noise = 0.01 * rng.standard_normal(N)
+    hum = 0.02 * np.sin(2 * np.pi * 0.2531 * k + 1.0)
+    found = floor_of([Part(v, v + hum + noise, ~held)])
+    (line,) = [m for m in found.modes if m.damping == 0.0]
+    assert line.frequency == pytest.approx(0.2531, abs=1e-5)
+    assert np.std((v + hum + noise - found.predicted[0])[held]) < 1.1 * np.std(noise)
+    assert not floor_of([Part(v, v + noise, ~held)]).modes
+
+
+@pytest.mark.slow
 def test_where_a_record_comes_from_is_found() -> None:
     rng = np.random.default_rng(5)
     v = 0.4 * triangles(rng)

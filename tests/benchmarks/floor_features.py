@@ -30,7 +30,10 @@ class Columns:
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of a sampled system: frequency over the sampling rate, and damping ratio."""
+    """A mode of a sampled system: frequency over the sampling rate, and damping ratio.
+
+    One without damping is a line, as the mains leave it: no voltage drives it.
+    """
 
     frequency: float
     damping: float
@@ -86,15 +89,16 @@ def taps(v: FloatArray) -> Columns:
 
 
 def modal(v: FloatArray, mode: Mode) -> Columns:
-    """Return the answer of a mode to the voltage, in both phases."""
+    """Return the answer of a damped mode to the voltage, in both phases."""
     s = lfilter([1.0], [1.0, -mode.pole], v.astype(complex))
     return Columns("modes", np.column_stack([s.real, s.imag]))
 
 
 def ringing(n: int, mode: Mode) -> Columns:
-    """Return what is left of a mode's motion before the record, in both phases."""
+    """Return the motion that a mode has by itself, in both phases."""
     s = mode.pole ** np.arange(n)
-    return Columns("modes' start", np.column_stack([s.real, s.imag]))
+    kind = "start of modes" if mode.damping else "start of lines"
+    return Columns(kind, np.column_stack([s.real, s.imag]))
 
 
 def fine_curve(displacement: FloatArray, low: float, high: float, knots: int) -> Columns:
@@ -102,6 +106,16 @@ def fine_curve(displacement: FloatArray, low: float, high: float, knots: int) ->
     at = np.clip((displacement - low) / (high - low), 0.0, 1.0) * (knots - 1)
     hats = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(knots)))
     return Columns("fine curve", hats)
+
+
+def apart(values: Sequence[FloatArray]) -> FloatArray:
+    """Return blocks one under the other, each in columns of its own."""
+    whole = np.zeros((sum(len(v) for v in values), sum(v.shape[1] for v in values)))
+    row = column = 0
+    for v in values:
+        whole[row : row + len(v), column : column + v.shape[1]] = v
+        row, column = row + len(v), column + v.shape[1]
+    return whole
 
 
 def _lagging(v: FloatArray, time: float) -> FloatArray:

@@ -1,4 +1,8 @@
-"""The floor of records: the held-out error that a linear fit of many features reaches."""
+"""The floor of records: the held-out error that a linear fit of many features reaches.
+
+What has no prior size (the history before a record, how many knots a curve has, how many modes
+there are) is chosen by the evidence of the fitted samples.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -10,6 +14,7 @@ import numpy.typing as npt
 from tests.benchmarks.floor_features import (
     Columns,
     Mode,
+    apart,
     fine_curve,
     memory,
     modal,
@@ -29,10 +34,10 @@ History = tuple[float, ...]
 #: Where the voltage may have gone before a record, in half its range from its middle.
 HISTORIES: tuple[History, ...] = ((), (1.0,), (-1.0,), (1.0, -1.0), (-1.0, 1.0))
 #: Most modes; the log evidence that one has to add, the price of its frequency and damping.
-_MODES, _WORTH = 14, 12.0
+_MODES, _WORTH = 14, 25.0
 #: The play that relaxations follow beside the voltage; knots that a curve over the displacement may
-#: have, and its rounds.
-_FOLLOWED, _KNOTS, _ROUNDS = 0.3, (6, 10, 20, 40), 3
+#: have (0: no curve), and its rounds.
+_FOLLOWED, _KNOTS, _ROUNDS = 0.3, (0, 6, 10, 20, 40, 80), 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,21 +51,22 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """The fit of records: predicted displacements, modes, histories, log evidence."""
+    """The fit of records: predicted displacements, modes and lines, histories, curve's knots."""
 
     predicted: tuple[FloatArray, ...]
     modes: tuple[Mode, ...]
     histories: tuple[History, ...]
-    evidence: float
+    knots: int
 
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Weights of features (samples, count) of all parts, and the displacement they give."""
+    """A fit: features (samples, count) of all parts, the displacement, the curve's columns."""
 
     found: Ridge
     features: FloatArray
     shown: FloatArray
+    curves: Sequence[Sequence[Columns]]
 
 
 @dataclass(eq=False)
@@ -68,21 +74,19 @@ class _Problem:
     parts: Sequence[Part]
     made: dict[tuple[int, History], list[Columns]] = field(default_factory=dict)
 
-    @property
-    def used(self) -> BoolArray:
-        return np.concatenate([p.used for p in self.parts])
-
-    @property
-    def y(self) -> FloatArray:
-        return np.concatenate([p.displacement for p in self.parts])
+    def __post_init__(self) -> None:
+        self.used = np.concatenate([p.used for p in self.parts])
+        self.y = np.concatenate([p.displacement for p in self.parts])
 
     def columns(self, histories: Sequence[History], modes: Sequence[Mode]) -> list[list[Columns]]:
-        """Return the columns of every part."""
+        """Return the columns of every part, an offset first."""
         every = []
         for k, (part, history) in enumerate(zip(self.parts, histories, strict=True)):
             v = part.voltage
-            more = [c for m in modes for c in (modal(v, m), ringing(len(v), m))]
-            every.append([*self._slow(k, history), *more])
+            offset = Columns("offset of its start", np.ones((len(v), 1)))
+            driven = [modal(v, m) for m in modes if m.damping]
+            free = [ringing(len(v), m) for m in modes]
+            every.append([offset, *self._slow(k, history), *driven, *free])
         return every
 
     def _slow(self, k: int, history: History) -> list[Columns]:
@@ -93,17 +97,48 @@ class _Problem:
             self.made[k, history] = [*memory(v, history), taps(v), *lags]
         return self.made[k, history]
 
-    def fitted(self, columns: Sequence[Sequence[Columns]]) -> _Fitted:
-        """Fit the used samples: an offset of each record, and the columns."""
-        offsets = [Columns("offset of its start", np.ones((len(p.voltage), 1))) for p in self.parts]
-        features, kinds = stacked([[o, *c] for o, c in zip(offsets, columns, strict=True)])
-        found = ridge(features[self.used], kinds, self.y[self.used])
-        return _Fitted(found, features, features @ found.weights)
+    def fitted(
+        self, columns: Sequence[Sequence[Columns]], curves: Sequence[Sequence[Columns]] = ()
+    ) -> _Fitted:
+        """Fit the used samples with the columns, and with curves over the displacement."""
+        features, kinds = stacked(joined(columns, curves))
+        used = self.used
+        found = ridge(features[used], kinds, self.y[used])
+        return _Fitted(found, features, features @ found.weights, curves)
+
+    def with_curve(self, columns: Sequence[Sequence[Columns]], knots: int) -> _Fitted:
+        """Fit with a curve over what the other columns say that the displacement is."""
+        fitted = self.fitted(columns)
+        under = fitted.shown
+        for _ in range(_ROUNDS if knots else 0):
+            low, high = float(under.min()), float(under.max())
+            curves = [[fine_curve(y, low, high, knots)] for y in self.split(under)]
+            fitted = self.fitted(columns, curves)
+            hats = np.vstack([c.values for of in curves for c in of])
+            under = fitted.shown - hats @ fitted.found.weights[-knots:]
+        return fitted
+
+    def best_curve(self, columns: Sequence[Sequence[Columns]]) -> tuple[_Fitted, int]:
+        """Return the fit with the knots of most evidence, and their number."""
+        tried = [(self.with_curve(columns, knots), knots) for knots in _KNOTS]
+        return max(tried, key=lambda pair: pair[0].found.evidence)
 
     def split(self, shown: FloatArray) -> list[FloatArray]:
         """Return an array of all samples as one for each part."""
         edges = np.cumsum([0, *(len(p.voltage) for p in self.parts)])
         return [shown[a:b] for a, b in pairwise(edges)]
+
+
+def floor_of(parts: Sequence[Part], progress: Callable[[str], None] = lambda _: None) -> Floor:
+    """Fit the parts' used samples and predict all: history, curve, modes, and the curve again."""
+    problem = _Problem(parts)
+    progress("histories")
+    histories = _histories(problem)
+    fitted = problem.best_curve(problem.columns(histories, ()))[0]
+    modes = _modes(problem, histories, fitted, progress)
+    progress("fine curve")
+    fitted, knots = problem.best_curve(problem.columns(histories, modes))
+    return Floor(tuple(problem.split(fitted.shown)), modes, histories, knots)
 
 
 def stacked(every: Sequence[Sequence[Columns]]) -> tuple[FloatArray, IntArray]:
@@ -115,39 +150,17 @@ def stacked(every: Sequence[Sequence[Columns]]) -> tuple[FloatArray, IntArray]:
     for same in zip(*every, strict=True):
         values = [c.values for c in same]
         own = "start" in same[0].kind
-        blocks.setdefault(same[0].kind, []).append(_apart(values) if own else np.vstack(values))
+        blocks.setdefault(same[0].kind, []).append(apart(values) if own else np.vstack(values))
     counts = [sum(b.shape[1] for b in of) for of in blocks.values()]
-    return np.hstack([b for of in blocks.values() for b in of]), np.repeat(
-        np.arange(len(counts)), counts
-    )
+    kinds = np.repeat(np.arange(len(counts)), counts)
+    return np.hstack([b for of in blocks.values() for b in of]), kinds
 
 
-def floor_of(parts: Sequence[Part], progress: Callable[[str], None] = lambda _: None) -> Floor:
-    """Fit the parts' used samples and predict all: history, then modes, then the fine curve."""
-    problem = _Problem(parts)
-    progress("histories")
-    histories = _histories(problem)
-    modes = _modes(problem, histories, progress)
-    columns = problem.columns(histories, modes)
-    progress("fine curve")
-    plain = problem.fitted(columns)
-    curved = [_with_curve(problem, columns, plain, knots) for knots in _KNOTS]
-    best = max((plain, *curved), key=lambda f: f.found.evidence)
-    return Floor(tuple(problem.split(best.shown)), modes, histories, best.found.evidence)
-
-
-def _with_curve(
-    problem: _Problem, columns: Sequence[Sequence[Columns]], plain: _Fitted, knots: int
-) -> _Fitted:
-    """Return the fit with a curve over what the other columns say that the displacement is."""
-    under, curved = plain.shown, plain
-    for _ in range(_ROUNDS):
-        low, high = float(under.min()), float(under.max())
-        curves = [fine_curve(y, low, high, knots) for y in problem.split(under)]
-        curved = problem.fitted([[*c, f] for c, f in zip(columns, curves, strict=True)])
-        hats = np.vstack([c.values for c in curves])
-        under = curved.shown - hats @ curved.found.weights[-knots:]
-    return curved
+def joined(
+    columns: Sequence[Sequence[Columns]], more: Sequence[Sequence[Columns]]
+) -> list[list[Columns]]:
+    """Return the columns of every part with more of them, if there are any."""
+    return [[*c, *m] for c, m in zip(columns, more or [()] * len(columns), strict=True)]
 
 
 def _histories(problem: _Problem) -> tuple[History, ...]:
@@ -160,35 +173,23 @@ def _histories(problem: _Problem) -> tuple[History, ...]:
 
 
 def _modes(
-    problem: _Problem, histories: Sequence[History], progress: Callable[[str], None]
+    problem: _Problem,
+    histories: Sequence[History],
+    fitted: _Fitted,
+    progress: Callable[[str], None],
 ) -> tuple[Mode, ...]:
-    """Return modes found one by one, all tuned again after each, as long as the evidence grows."""
-    used, y = problem.used, problem.y[problem.used]
+    """Return modes and lines found one by one, all tuned again, while the evidence grows."""
+    used, y, curves = problem.used, problem.y[problem.used], fitted.curves
     search = Search([p.voltage for p in problem.parts], used)
-
-    def without(modes: Sequence[Mode], k: int) -> list[Mode]:
-        return [m for j, m in enumerate(modes) if j != k]
-
     modes: list[Mode] = []
-    fitted = problem.fitted(problem.columns(histories, modes))
     while len(modes) < _MODES:
         progress(f"mode {len(modes) + 1}")
         tried = [*modes, search.next(beside(fitted.features[used], y))]
         for k, mode in enumerate(tried[:-1]):
-            others = stacked(problem.columns(histories, without(tried, k)))[0]
-            tried[k] = search.tuned(mode, beside(np.c_[fitted.features[:, :1], others][used], y))
-        wider = problem.fitted(problem.columns(histories, tried))
+            without = problem.columns(histories, [*tried[:k], *tried[k + 1 :]])
+            tried[k] = search.tuned(mode, beside(stacked(joined(without, curves))[0][used], y))
+        wider = problem.fitted(problem.columns(histories, tried), curves)
         if wider.found.evidence < fitted.found.evidence + _WORTH:
             break
         modes, fitted = tried, wider
     return tuple(modes)
-
-
-def _apart(values: Sequence[FloatArray]) -> FloatArray:
-    """Return blocks one under the other, each in columns of its own."""
-    whole = np.zeros((sum(len(v) for v in values), sum(v.shape[1] for v in values)))
-    row = column = 0
-    for v in values:
-        whole[row : row + len(v), column : column + v.shape[1]] = v
-        row, column = row + len(v), column + v.shape[1]
-    return whole

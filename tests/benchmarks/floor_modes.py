@@ -1,20 +1,27 @@
-"""Modes of a sampled system, found one by one in what other features leave of an output."""
+"""Modes and lines, found one by one in what other features leave of an output."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 
-from tests.benchmarks.floor_features import Mode, modal
+from tests.benchmarks.floor_features import Mode, apart, modal, ringing
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-#: Frequencies over the sampling rate and dampings that a mode is looked for at.
-_FREQUENCIES, _DAMPINGS = np.linspace(0.005, 0.495, 99), (0.005, 0.02, 0.08)
+#: Frequencies over the sampling rate and dampings that a mode is looked for at, and their limits:
+#: slower and less damped ones imitate loops of the voltage's own frequency.
+_FREQUENCIES, _DAMPINGS = np.linspace(0.02, 0.495, 96), (0.005, 0.02, 0.08)
+_SLOWEST, _FASTEST, _LEAST, _MOST = 0.02, 0.4999, 4e-3, 0.7
+#: A line is so many times larger than the median of so many neighbours in the spectrum; of noise
+#: alone the largest of 10,000 is 3.6 times as large.
+_STANDS_OUT, _NEIGHBOURS = 5.0, 101
 #: Relative size of a ridge that only keeps the projections regular; steps of a refinement.
 _REGULAR, _STEPS = 1e-9, 60
 
@@ -28,9 +35,9 @@ class Beside:
     factor: tuple[FloatArray, bool]
 
     def gain(self, columns: FloatArray) -> float:
-        """Return by how much two columns more lessen the sum of squares that is left."""
+        """Return by how much more columns lessen the sum of squares that is left."""
         own = columns - self.features @ cho_solve(self.factor, self.features.T @ columns)
-        gram = own.T @ own + _REGULAR * np.eye(2) * float(np.sum(columns**2))
+        gram = own.T @ own + _REGULAR * np.eye(columns.shape[1]) * float(np.sum(columns**2))
         cross = own.T @ self.left
         return float(cross @ np.linalg.solve(gram, cross))
 
@@ -54,27 +61,42 @@ class Search:
         ]
 
     def next(self, others: Beside) -> Mode:
-        """Return the mode that explains most of what is left, refined."""
+        """Return the mode or the line that explains most of what is left, refined."""
         mode = max(self._grid, key=lambda pair: others.gain(pair[1]))[0]
-        return self.tuned(mode, others)
+        found = [self.tuned(m, others) for m in (mode, *self._line(others))]
+        return max(found, key=lambda m: others.gain(self._answer(m)))
 
     def tuned(self, mode: Mode, others: Beside) -> Mode:
-        """Return a mode with the frequency and the damping that explain most."""
+        """Return a mode with the frequency, and the damping unless it is 0, that explain most."""
+        line = mode.damping == 0.0
+        step = 0.3 / len(self._used) if line else 0.002
 
-        def loss(x: FloatArray) -> float:
-            return -others.gain(self._answer(_mode(x)))
+        def made(x: FloatArray) -> Mode:
+            frequency = float(np.clip(x[0], _SLOWEST, _FASTEST))
+            if line:
+                return Mode(frequency, 0.0)
+            return Mode(frequency, float(np.exp(np.clip(x[1], np.log(_LEAST), np.log(_MOST)))))
 
-        begin = np.array([mode.frequency, np.log(mode.damping)])
-        simplex = begin + np.array([[0.0, 0.0], [0.002, 0.0], [0.0, 0.7]])
+        begin = np.array([mode.frequency] if line else [mode.frequency, np.log(mode.damping)])
+        moves = np.vstack([np.zeros(len(begin)), np.diag([step, 0.7][: len(begin)])])
+        options: Any = {"maxfev": _STEPS, "initial_simplex": begin + moves}
         found = minimize(
-            loss, begin, method="Nelder-Mead",
-            options={"maxfev": _STEPS, "initial_simplex": simplex},
+            lambda x: -others.gain(self._answer(made(x))), begin, method="Nelder-Mead",
+            options=options,
         )  # fmt: skip
-        return _mode(found.x)
+        return made(found.x)
+
+    def _line(self, others: Beside) -> list[Mode]:
+        """Return the largest line that stands out of the spectrum of what is left, if one does."""
+        left = np.zeros(len(self._used))
+        left[self._used] = others.left
+        size = np.abs(np.fft.rfft(left))
+        frequency = np.arange(len(size)) / len(left)
+        out = size > _STANDS_OUT * median_filter(size, _NEIGHBOURS)
+        out &= (frequency > _SLOWEST) & (frequency < _FASTEST)
+        return [Mode(float(frequency[np.argmax(size * out)]), 0.0)] if out.any() else []
 
     def _answer(self, mode: Mode) -> FloatArray:
+        if mode.damping == 0.0:
+            return apart([ringing(len(v), mode).values for v in self._voltages])[self._used]
         return np.vstack([modal(v, mode).values for v in self._voltages])[self._used]
-
-
-def _mode(x: FloatArray) -> Mode:
-    return Mode(float(np.clip(x[0], 1e-4, 0.4999)), float(np.exp(np.clip(x[1], -7.0, -0.1))))

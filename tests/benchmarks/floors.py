@@ -25,7 +25,7 @@ _HEAD = ("record", "base", "extended", "floor", "extended / floor", "verdict", "
 _NOTE = (
     "Held-out rms, percent of range, in the samples that `psa diagnose` holds out. The floor: plays"
     " with squares and cubes, relaxations over decades, modes, a fine curve over the displacement,"
-    " linear in their weights, their prior sizes by evidence."
+    " linear in their weights, their prior sizes and their number by evidence."
 )
 
 

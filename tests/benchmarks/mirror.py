@@ -36,9 +36,9 @@ _PUBLISHED = (
 )
 _NOTE = (
     "Percent of the standard deviation of the whole output; rms error in um in brackets. Ours take"
-    " what the other two actuators do from the linear response of the same level's training signals;"
-    " the authors' simulate all three. The mean of a simulation is taken off, as the records have"
-    " none."
+    " what the other two actuators do from the linear response of the same level's training"
+    " signals; the authors' simulate all three. The mean of a simulation is taken off, as the"
+    " records have none."
 )
 
 
