@@ -77,10 +77,10 @@ class Search:
                 return Mode(frequency, 0.0)
             return Mode(frequency, float(np.exp(np.clip(x[1], np.log(_LEAST), np.log(_MOST)))))
 
-        begin = np.array([mode.frequency] if line else [mode.frequency, np.log(mode.damping)])
+        begin: Any = np.array([mode.frequency] if line else [mode.frequency, np.log(mode.damping)])
         moves = np.vstack([np.zeros(len(begin)), np.diag([step, 0.7][: len(begin)])])
         options: Any = {"maxfev": _STEPS, "initial_simplex": begin + moves}
-        found = minimize(
+        found: Any = minimize(
             lambda x: -others.gain(self._answer(made(x))), begin, method="Nelder-Mead",
             options=options,
         )  # fmt: skip

@@ -60,11 +60,11 @@ MICROMANIPULATOR = _dataset(
 
 MICROMANIPULATOR_RESTS = _dataset(
     "micromanipulator_rests",
-    "the same micromanipulator: what follows its minor loops in the same file, of which it was the"
-    " test of a compensation, so that the voltage of the two later groups is no sine",
+    "the same micromanipulator: what follows its minor loops in the same file; the voltage of the"
+    " loops was corrected beforehand so that the displacement is a sine, and is none itself",
     DatasetFile(
         "groups_and_rests.csv",
-        "a rest of 6.5 s, a group of loops of 1 Hz that grow and shrink, a rest of 5 s, a group",
+        "a rest of 6.0 s, loops of 1 Hz that grow and shrink, a rest of 4.6 s, loops that grow",
         "ef407e6dd3153b5e87251226f2868e8dcb2c17caf76041e7dec3e3e91adf7aa2",
         (_TEST,),
         _taken(3700, 10455),
