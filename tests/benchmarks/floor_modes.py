@@ -77,13 +77,13 @@ class Search:
                 return Mode(frequency, 0.0)
             return Mode(frequency, float(np.exp(np.clip(x[1], np.log(_LEAST), np.log(_MOST)))))
 
-        begin: Any = np.array([mode.frequency] if line else [mode.frequency, np.log(mode.damping)])
+        def loss(x: FloatArray) -> float:
+            return -others.gain(self._answer(made(x)))
+
+        begin = np.array([mode.frequency] if line else [mode.frequency, np.log(mode.damping)])
         moves = np.vstack([np.zeros(len(begin)), np.diag([step, 0.7][: len(begin)])])
         options: Any = {"maxfev": _STEPS, "initial_simplex": begin + moves}
-        found: Any = minimize(
-            lambda x: -others.gain(self._answer(made(x))), begin, method="Nelder-Mead",
-            options=options,
-        )  # fmt: skip
+        found: Any = minimize(loss, begin, method="Nelder-Mead", options=options)
         return made(found.x)
 
     def _line(self, others: Beside) -> list[Mode]:
