@@ -3,7 +3,7 @@
 import hashlib
 import http.server
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -91,6 +91,34 @@ def test_a_table_becomes_a_record(
     assert record.sha256 == DATASETS["small"].files[0].sha256
     assert datasets.originals("small")["table.dat"].read_bytes() == TABLE
     assert Path(record.source).is_relative_to(tmp_path / "cache")
+
+
+class Halves:
+    """Makes the record of a table that is published in two files."""
+
+    words = "both halves of the table"
+
+    def csv(self, originals: Sequence[bytes]) -> bytes:
+        first, second = originals
+        return PART.csv([first + second])
+
+
+def test_a_record_may_be_made_of_several_originals(
+    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    dataset = publish(served, TABLE)
+    (file,) = dataset.files
+    halves = []
+    for name, part in (("first.dat", TABLE[:700]), ("second.dat", TABLE[700:])):
+        (tmp_path / "published" / name).write_bytes(part)
+        url = served.replace("table.dat", name)
+        halves.append(replace(file.originals[0], name=name, url=url, sha256=sha(part)))
+    split = replace(file, originals=tuple(halves), conversion=Halves())
+    monkeypatch.setitem(DATASETS, "small", replace(dataset, files=(split,)))
+    assert datasets.paths("small")[0].read_bytes() == PART.csv([TABLE])
+    text = datasets.origin_text(DATASETS["small"])
+    assert "From first.dat, second.dat: both halves of the table." in text
 
 
 def test_what_was_downloaded_is_kept_and_what_was_spoilt_is_made_again(
