@@ -71,8 +71,8 @@ def _several(name: str, schema: Schema) -> str:
     if "prefixItems" in schema:
         return f"[{', '.join(kind(name, s) for s in schema['prefixItems'])}]"
     if schema.get("type") == "array":
-        inner = kind(name, schema["items"])
-        return f"list of {inner}{'s' if inner in _COUNTED else ''}"
+        kinds = [kind(name, s) for s in schema["items"].get("anyOf", [schema["items"]])]
+        return f"list of {' or '.join(k + 's' * (k in _COUNTED) for k in kinds)}"
     named = schema.get("additionalProperties")
     return f"by name: {kind(name, named)}" if named else ""
 
@@ -80,10 +80,10 @@ def _several(name: str, schema: Schema) -> str:
 def _members(name: str, schema: Schema) -> Table:
     needed = schema.get("required", ())
     rows = tuple(
-        (f"`{member}`", kind(name, inner), "always" if member in needed else "")
+        (f"`{member}`", kind(name, inner), "yes" if member in needed else "")
         for member, inner in schema["properties"].items()
     )
-    return Table(("member", "value", "there"), rows)
+    return Table(("member", "value", "always there"), rows)
 
 
 def _anchor(name: str, record: str) -> str:

@@ -1,6 +1,7 @@
 """`psa demo`: the whole story on a synthetic record that ships with the package."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -67,15 +68,16 @@ def demo(
         compiled_ahead(_searched(record), first=[make_compiler_ready]),
     ):
         save_model(identify([record], progress=progress).model, paths["model.json"])
-    with working("diagnosing", quiet, DIAGNOSE) as progress:
+    with ThreadPoolExecutor(1) as beside, working("diagnosing", quiet, DIAGNOSE) as progress:
         d = diagnose([record], progress=progress)
+        exported = beside.submit(export_fmu, d.model, paths["extended.fmu"])
         save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
         write_report(d, paths["report.html"], origin=_ORIGIN)
         save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
     show(f"\n{story(d, origin=_ORIGIN, width=width())}\n", quiet)
     with working("exporting and checking the FMU", quiet):
-        export_fmu(d.model, paths["extended.fmu"])
+        exported.result()
         checked = check_fmu(paths["extended.fmu"], d.model)
     show_table(check_table(checked), quiet)
     files = "\n".join(f"  {name:<20}  {meaning}" for name, meaning in FILES.items())
