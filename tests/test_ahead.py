@@ -1,6 +1,7 @@
 """Models are compiled on free cores before they are asked for."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier, Event
 
 import pytest
@@ -60,13 +61,13 @@ def test_what_has_not_begun_at_the_end_is_left_out(
 
     monkeypatch.setattr(ahead, "why_not", lambda *given: compiled_models.append(given))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    shutdown = ahead.ThreadPoolExecutor.shutdown
+    shutdown = ThreadPoolExecutor.shutdown
 
-    def ended(pool: ahead.ThreadPoolExecutor, **how: bool) -> None:
+    def ended(pool: ThreadPoolExecutor, **how: bool) -> None:
         shutdown(pool, **how)
         over.set()
 
-    monkeypatch.setattr(ahead.ThreadPoolExecutor, "shutdown", ended)
+    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", ended)
     with compiled_ahead([base], first=[long]):
         assert begun.wait(PATIENCE)
     assert over.is_set()

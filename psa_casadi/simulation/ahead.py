@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from contextvars import copy_context
+from contextvars import Context, copy_context
 from functools import partial
 
 from psa_casadi.errors import MachineError, PsaError
@@ -31,13 +31,18 @@ def compiled_ahead(
     if cores == 1:
         yield
         return
+    works: list[Callable[[], object]] = [*first, *(partial(_compile, m) for m in models)]
     with ThreadPoolExecutor(cores - 1) as pool:
-        for work in (*first, *(partial(_compile, m) for m in models)):
-            pool.submit(copy_context().run, work)
+        for work in works:
+            pool.submit(_in_context(copy_context(), work))
         try:
             yield
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _in_context(context: Context, work: Callable[[], object]) -> Callable[[], object]:
+    return lambda: context.run(work)
 
 
 def compiled(models: Iterable[Model]) -> None:
