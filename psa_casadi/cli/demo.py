@@ -59,6 +59,7 @@ def demo(
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence, story
     from psa_casadi.simulation.ahead import compiled_ahead
+    from psa_casadi.simulation.stepper import make_ready
 
     paths = _prepared(directory)
     record = read_record(paths[RECORD], need_excitation=True)
@@ -71,6 +72,7 @@ def demo(
     with ThreadPoolExecutor(1) as beside, working("diagnosing", quiet, DIAGNOSE) as progress:
         d = diagnose([record], progress=progress)
         exported = beside.submit(export_fmu, d.model, paths["extended.fmu"])
+        beside.submit(make_ready, d.model.plant())  # the check simulates with it
         save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
         write_report(d, paths["report.html"], origin=_ORIGIN)
