@@ -61,7 +61,7 @@ def picture(name: str) -> tuple[bytes, str]:
 def overview() -> Table:
     """Return what every effect looks like, in a line each."""
     rows = tuple(
-        (f"[`{e.name}`](#{e.name})", e.belongs_to, _sentence(e.looks_like))
+        (f"[<code>{_breaking(e.name)}</code>](#{e.name})", e.belongs_to, _sentence(e.looks_like))
         for e in EFFECTS.values()
     )
     return Table(("effect", "in the", "what it looks like"), rows)
@@ -89,6 +89,11 @@ def markdown_table(table: Table) -> str:
     rows = [table.head, ["---"] * len(table.head), *table.rows]
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in cells)
+
+
+def _breaking(name: str) -> str:
+    """Return a name that a narrow column may break behind an underscore."""
+    return name.replace("_", "_<wbr>")
 
 
 def _sentence(text: str) -> str:

@@ -11,7 +11,7 @@ from psa_casadi.command_line import typed
 from psa_casadi.diagnosis.held_out.errors import Errors
 from psa_casadi.report.page.design_page import write_design_page
 from psa_casadi.report.page.fit_page import write_fit_report
-from psa_casadi.report.words.phrases import handy_scale, length_scale, one_unit
+from psa_casadi.report.words.phrases import handy_scale, in_page_unit, length_scale, one_unit
 from tests.html_page import Page, figures
 from tests.report_cases import diagnosis, identification
 
@@ -88,3 +88,14 @@ def test_a_unit_of_a_page_ends_with_it() -> None:
         assert length_scale(3e-9).unit == "µm"
         assert length_scale(3e-9, counts=True).unit == "counts"
     assert length_scale(3e-9).unit == "nm"
+
+
+def test_a_sentence_has_the_unit_of_its_page() -> None:
+    sentence = "-0.29 um at 0.17 s, +60 nm at 12 um; 3 mm, 5 umbrellas."
+    assert in_page_unit(sentence) == "-0.29 µm at 0.17 s, +60 nm at 12 µm; 3 mm, 5 umbrellas."
+    with one_unit(handy_scale(2e-9)):
+        assert in_page_unit(sentence).startswith("-290 nm at 0.17 s, +60 nm at 12 µm; 3 mm")
+    with one_unit(handy_scale(2e-6)):
+        assert in_page_unit(sentence).startswith("-0.29 µm at 0.17 s, +0.06 µm at 12 µm; 3 mm")
+    with one_unit(length_scale(1.0, counts=True)):
+        assert in_page_unit(sentence).startswith("-0.29 µm at 0.17 s, +60 nm at 12 µm")

@@ -50,7 +50,8 @@ ColumnsOption = Annotated[
     typer.Option(
         "--columns",
         help="Which array of the file is which column, if the names differ:"
-        " time=t:ms,voltage=log.u,displacement=m.2:um",
+        " time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:"
+        " displacement=CH2:10um",
     ),
 ]
 

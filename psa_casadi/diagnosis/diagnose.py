@@ -32,6 +32,7 @@ from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, in_one_order
+from psa_casadi.simulation.ahead import compiled_ahead
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
 
@@ -95,7 +96,9 @@ def diagnose(
         so_far: list[Fit] = []
         task = Task(experiments, tuple(table), method, progress, so_far.append, hidden)
         try:
-            found = _diagnose(start, task, scale_given)
+            # from the end: the screening begins at the front
+            with compiled_ahead(start.with_effect(e) for e in reversed(table)):
+                found = _diagnose(start, task, scale_given)
             return replace(found, notes=(*found.notes, *said))
         except KeyboardInterrupt:
             if not so_far:

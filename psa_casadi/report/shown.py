@@ -78,7 +78,7 @@ def cell(result: Diagnosis | Identification | Trajectory) -> str:
     plot(result).savefig(buffer, format="png", dpi=60)
     picture = base64.b64encode(buffer.getvalue()).decode("ascii")
     return (
-        f'<pre style="white-space: pre-wrap">{escape(words)}</pre>'
+        f'<pre style="white-space: pre; overflow-x: auto">{escape(words)}</pre>'
         f'<img style="max-width: 100%" alt="{escape(line(result))}"'
         f' src="data:image/png;base64,{picture}">'
     )

@@ -26,6 +26,7 @@ from psa_casadi.identification.fitting.prediction import OUTPUT, measured, trace
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import among_harmonics
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.ahead import compiled
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.ways import Way
@@ -80,6 +81,8 @@ def directions(
         model = composed[effect.name].with_values(values)
         return list(_directions_at(fit, experiments, effect, model, values, finite_steps))
 
+    # else all cores wait for the first one's model, of which there are several tasks
+    compiled(fit.model.with_effect(e) for e in effects)
     return [d for found in side_by_side(one, tasks) for d in found]
 
 

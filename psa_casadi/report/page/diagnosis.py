@@ -17,9 +17,9 @@ from psa_casadi.report.words.phrases import (
     VERDICTS,
     added,
     gain_sentence,
+    in_page_unit,
     length_scale,
     listing,
-    micro,
     number,
     one_unit,
     percent,
@@ -154,6 +154,6 @@ def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str
         page.paragraph(note, "note")
     if d.noise:
         page.section("Noise")
-        page.bullets(micro(n.sentence) for n in d.noise)
+        page.bullets(in_page_unit(n.sentence) for n in d.noise)
     page.section("Records")
     page.table(record_table(d.experiments, origin))
