@@ -43,7 +43,7 @@ def png_size(path: Path) -> tuple[int, int]:
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict) -> None:
     d = diagnosis(verdict)
-    write_report(d, tmp_path / "r.html", origin="synthetic")
+    write_report(d, tmp_path / "r.html", origin="synthetic", still=True)
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     page = Page(text)
     assert page.loaded == []
@@ -58,7 +58,7 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
     # at the top 1, views 3, evidence 1, record 6; signature and data 2
     assert len(figures(text)) == (13 if verdict in ADDED else 11)
     assert "The residual of the" in page.text
-    shown = story(d, origin="synthetic")
+    shown = story(d, origin="synthetic", still=True)
     assert SENTENCES[verdict] in " ".join(shown.split())
     assert ("extended" in shown) == (verdict in ADDED)
     assert 8 <= len(shown.splitlines()) <= 15
@@ -69,7 +69,7 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
 @pytest.mark.parametrize("verdict", ["cause_named", "unexplained"])
 def test_the_picture_has_its_size_and_shows_something(tmp_path: Path, verdict: Verdict) -> None:
     path = tmp_path / "d.png"
-    save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic")
+    save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic", still=True)
     assert png_size(path) == (1600, 1000)
     assert path.stat().st_size > 50_000
     assert [p.name for p in tmp_path.iterdir()] == ["d.png"]
@@ -83,7 +83,9 @@ def test_a_report_that_cannot_be_written_is_the_users_problem(tmp_path: Path) ->
 
 @slow
 def test_long_records_stay_small(tmp_path: Path) -> None:
-    write_report(diagnosis("cause_named", tuple("abcdefgh"), 60_000), tmp_path / "r.html")
+    write_report(
+        diagnosis("cause_named", tuple("abcdefgh"), 60_000), tmp_path / "r.html", still=True
+    )
     assert (tmp_path / "r.html").stat().st_size < 8e6
 
 

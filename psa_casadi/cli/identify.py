@@ -15,6 +15,7 @@ from psa_casadi.cli.screen import (
     Quiet,
     SampleTimeOption,
     SmallOption,
+    StillOption,
     show,
     tell_written,
     width,
@@ -60,6 +61,7 @@ def identify(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
     small: SmallOption = False,
+    still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -89,7 +91,7 @@ def identify(
         else:
             found = run(measured, model=start, stiffness=stiffness, progress=progress)
         profiles = _finish(
-            found, output, (json, report, small), profile or (), origin.value, progress
+            found, output, (json, report, small, still), profile or (), origin.value, progress
         )
     show(identification_text(found, origin=origin.value, width=width()), quiet)
     for found_profile in profiles:
@@ -107,14 +109,14 @@ def identify(
 def _finish(
     found: "Identification",
     output: Path,
-    more: tuple[Path | None, Path | None, bool],
+    more: tuple[Path | None, Path | None, bool, bool],
     wanted: Sequence[str],
     origin: str,
     progress: Callable[[str], None],
 ) -> "list[Profile]":
     """Write the files and return the profiles; at an interrupt the model is kept, which it says.
 
-    `more` are the JSON file, the page, and whether that is small.
+    `more` are the JSON file, the page, and whether that is small, and still.
     """
     from psa_casadi.cli.interrupts import kept
     from psa_casadi.files import atomic_write
@@ -124,7 +126,7 @@ def _finish(
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.strict_json import json_text
 
-    json, report, small = more
+    json, report, small, still = more
     done = [output]
     try:
         save_model(found.model, output)
@@ -135,7 +137,9 @@ def _finish(
             done.append(json)
         if report is not None and not found.interrupted:
             progress("writing the report")
-            write_fit_report(found, report, origin=origin, profiles=profiles, small=small)
+            write_fit_report(
+                found, report, origin=origin, profiles=profiles, small=small, still=still
+            )
         ended = found.interrupted
     except KeyboardInterrupt:
         save_model(found.model, output)
