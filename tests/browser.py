@@ -126,8 +126,11 @@ def without_policy(text: str) -> str:
     return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text, count=1)
 
 
-def driven(browser: Browser, page: Path, script: str, *flags: str) -> Any:
-    """Run a script in a copy of a page when all is drawn, and return what it passes to `tell`."""
+def driven(browser: Browser, page: Path, script: str, *flags: str, silent: bool = True) -> Any:
+    """Run a script in a copy of a page when all is drawn, and return what it passes to `tell`.
+
+    Where it is to be `silent`, a word on the console fails the test.
+    """
     copy = page.with_name(f"{page.stem}-driven.html")
     call = (
         "<pre id='driven'></pre><script>window.addEventListener('load', function () {"
@@ -140,7 +143,7 @@ def driven(browser: Browser, page: Path, script: str, *flags: str) -> Any:
     document, console = browser.document(copy, *flags)
     copy.unlink()
     found = re.search(r"<pre id=.driven.>(.*?)</pre>", document, re.DOTALL)
-    if found is None or not found[1] or console:
+    if found is None or not found[1] or (silent and console):
         pytest.fail(f"the script in {page} did not come to its end: {console}")
     return json.loads(unescape(found[1]))
 

@@ -58,7 +58,7 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
     # at the top 1, views 3, evidence 1, record 6; signature and data 2
     assert len(figures(text)) == (13 if verdict in ADDED else 11)
     assert "The residual of the" in page.text
-    shown = story(d, origin="synthetic", still=True)
+    shown = story(d, origin="synthetic")
     assert SENTENCES[verdict] in " ".join(shown.split())
     assert ("extended" in shown) == (verdict in ADDED)
     assert 8 <= len(shown.splitlines()) <= 15
@@ -69,7 +69,7 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
 @pytest.mark.parametrize("verdict", ["cause_named", "unexplained"])
 def test_the_picture_has_its_size_and_shows_something(tmp_path: Path, verdict: Verdict) -> None:
     path = tmp_path / "d.png"
-    save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic", still=True)
+    save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic")
     assert png_size(path) == (1600, 1000)
     assert path.stat().st_size > 50_000
     assert [p.name for p in tmp_path.iterdir()] == ["d.png"]

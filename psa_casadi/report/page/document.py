@@ -25,8 +25,12 @@ from psa_casadi.version import __version__
 _FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
 _HASH = re.compile(r"[0-9a-f]{64}")
 _WIDE = 28
-#: The scripts of a model that runs in a page, in the order in which they stand there.
-LIVE_SCRIPTS = ("live_model.js", "live_plot.js", "live_zoom.js", "live_knobs.js", "live.js")
+#: The scripts of a model that runs in a page, by what it does there, in their order.
+_LIVE = ("live_model.js", "live_plot.js", "live_zoom.js", "live_knobs.js")
+LIVE_SCRIPTS = {
+    "report": (*_LIVE, "live.js", "live_start.js"),
+    "playground": (*_LIVE, "voltages.js", "playground.js", "live_start.js"),
+}
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Document:
     """
 
     def __init__(self, title: str, badges: Sequence[str], *, small: bool = False) -> None:
-        self._title, self.small, self._alive = title, small, False
+        self._title, self.small, self._alive = title, small, ""
         marks = "".join(
             f'<span class="badge {_text(b.split()[0])}">{_text(b)}</span>' for b in badges
         )
@@ -143,7 +147,7 @@ class Document:
             found = told()
             if isinstance(found, str):
                 return f'<p class="note">{_text(found)}</p>'
-            self._alive = True
+            self._alive = found["kind"]
             return (
                 f'<div class="live">{_json(found)}<p class="note still-note">With scripts on, the'
                 " model runs here: sliders for its parameters, switches for its effects.</p></div>"
@@ -161,7 +165,7 @@ class Document:
         style = _source("page.css") + (_source("live.css") if self._alive else "")
         library = [] if self.small else [get_plotlyjs()]
         scripts = [] if self.small else [_source("page.js")]
-        scripts += ["\n".join(map(_source, LIVE_SCRIPTS))] if self._alive else []
+        scripts += ["\n".join(map(_source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
         return (
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
             + _policy([*library, *scripts])

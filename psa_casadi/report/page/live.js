@@ -206,13 +206,3 @@ psaLive.report = function (box, told, run) {
     }, answer: function (quick) { return answer(record, quick); }, file: function () { return psaLive.file(told, values); }
   };
 };
-
-Array.prototype.forEach.call(document.querySelectorAll('.live'), function (box, number) {
-  'use strict';
-  var told = JSON.parse(box.querySelector('script').textContent), still = box.querySelector('.still-note');
-  told.number = number;
-  psaLive.load(told).then(function (run) {
-    still.hidden = true;
-    psaLive[told.kind](box, told, run);
-  }).catch(function (error) { still.textContent = 'This browser does not run the model: ' + error.message; });
-});

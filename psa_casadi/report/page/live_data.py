@@ -20,6 +20,8 @@ from psa_casadi.variables import Parameter
 _DECADES = 10.0
 #: A slider reaches so many half widths of the 95 % interval to both sides, at least.
 _HALF_WIDTHS = 2.0
+#: And from 0 so many ordinary changes.
+_TYPICAL = 4.0
 
 
 def doubles(values: npt.ArrayLike) -> str:
@@ -72,7 +74,7 @@ def _file(model: Model) -> str | None:
 
 def _variable(name: str, unit: str, display: str | None, description: str) -> dict[str, Any]:
     shown = display or unit
-    return {"name": name, "description": description, **_scale(unit, shown)}
+    return {"name": name, "description": description, "si": unit, **_scale(unit, shown)}
 
 
 def _scale(unit: str, display: str) -> dict[str, Any]:
@@ -105,7 +107,8 @@ def _ends(model: Model, p: Parameter) -> tuple[float, float]:
     interval = model.provenance.intervals.get(p.name)
     half = 0.5 * (interval.high - interval.low) if interval is not None else 0.0
     reach = max(abs(value), min(_HALF_WIDTHS * half, 10.0 * abs(value)))
-    reach = max(reach, p.typical({**model.values, p.name: 0.0}) if value == 0.0 else 0.0)
+    if value == 0.0:
+        reach = max(reach, _TYPICAL * p.typical({**model.values, p.name: 0.0}))
     return max(low, value - reach), min(high, value + reach)
 
 

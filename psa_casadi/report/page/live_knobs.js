@@ -95,13 +95,13 @@ psaLive.knobs = function (told, values, changed) {
 
   return {
     // Switches, then the sliders that `first` chooses, then all others behind a fold.
-    nodes: function (first, more) {
+    nodes: function (first, more, open) {
       var near = told.parameters.filter(first), far = told.parameters.filter(function (p) { return !first(p); });
-      var fold = group('All other parameters', far.map(knob));
+      var fold = far.length ? make('fieldset', {'aria-label': 'other parameters'}, far.map(knob)) : null;
       return [
         group('Effects', told.effects.map(effect).concat(more || [])),
         group('Parameters', near.map(knob)),
-        fold && make('details', {}, [make('summary', {text: 'All other parameters (' + far.length + ')'}), fold])
+        fold && make('details', {open: Boolean(open)}, [make('summary', {text: 'All other parameters (' + far.length + ')'}), fold])
       ].filter(Boolean);
     },
     // Move all sliders; to values that count as not moved, if `settled`.
@@ -109,6 +109,7 @@ psaLive.knobs = function (told, values, changed) {
       if (settled) { started = given.slice(); }
       told.parameters.forEach(function (p, i) { put(p.name, given[i]); });
     },
+    row: function (name) { return rows[name].knob; },
     moved: function () { return told.parameters.filter(function (p, i) { return values[i] !== started[i]; }); }
   };
 };

@@ -96,7 +96,7 @@ psaLive.plot = (function () {
       canvas.height = Math.round(height * ratio);
     }
     var pen = canvas.getContext('2d');
-    var area = {left: 58, top: 22, width: width - 66, height: height - 60};
+    var area = {left: 58, top: 22, width: width - 78, height: height - 60};
     var reach = {x: told.reach || ends(told.curves, 'x', told.logx), y: ends(told.curves, 'y', told.logy, told.reach)};
     var ink = {text: colour(canvas, '--quiet'), grid: colour(canvas, '--line'), axis: colour(canvas, '--quiet')};
     function along(range, begin, size, log) {
