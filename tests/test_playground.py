@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.model.model_file import save_model
+from psa_casadi.model.model_file import loads, save_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.page.playground_page import playground
 from psa_casadi.simulation.simulate import simulate
@@ -43,6 +43,7 @@ setTimeout(function () {
   found.effect = box.querySelector('output').textContent;
   found.values = box.psa.values.slice();
   found.csv = box.psa.csv();
+  found.file = box.psa.file();
   found.knobs = Array.prototype.filter.call(box.querySelectorAll('.knob'), function (k) {
     return !k.hidden && !k.closest('details'); }).length;
   pick(selects[0], 'PTBS200');
@@ -105,6 +106,15 @@ def test_what_it_downloads_is_what_python_simulates(played: dict[str, Any]) -> N
     wanted = simulate(model, t, v).displacement
     shown = table[:, head.index("measured_displacement [m]")]
     assert np.max(np.abs(shown - wanted)) < 2e-6 * np.ptp(wanted)
+
+
+@slow
+def test_its_model_file_has_what_is_switched_on(played: dict[str, Any]) -> None:
+    model = loads(played["file"])
+    base = stack_model("P-885.51")
+    assert [c.name for c in model.effects] == ["slow_creep"]
+    assert {n: model.values[n] for n in base.values} == base.values
+    assert (model.name, model.description) == (base.name, base.description)
 
 
 @slow

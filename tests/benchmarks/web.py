@@ -23,7 +23,9 @@ from psa_casadi.report.words.series import EXTENDED_COLOUR, Curve, Series
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
+from psa_casadi.variables import Interval, Provenance
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.web_strip import strip
 from tests.browser import Browser, driven, find_browser
 from tests.live_pages import case, run_in_browser
 from tests.report_cases import NOISE, fit_of
@@ -36,6 +38,8 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "creep, memory, load": ("slow_creep", "hysteresis_memory", "load_stiffness"),
     "every effect": tuple(EFFECTS),
 }
+#: Effects of the page in the strip of pictures.
+_STRIP = ("slow_creep", "hysteresis_memory")
 #: Moves a slider over and over; a pixel that is read back makes the browser finish its picture.
 _DRAG = """
 var box = document.querySelector('.live'), rows = [];
@@ -65,13 +69,15 @@ def run(progress: Progress, quick: bool) -> Outcome:
                 page = Path(folder) / "page.html"
                 page.write_text(_page(model, n), encoding="utf-8")
                 drag = _DRAG.format(times=6 if quick else 25, value=model.values["k_L"])
-                times.append(_times(name, n, driven(browser, page, drag, silent=False)))
+                times.append(_times(name, n, driven(browser, page, drag, silent=False, timed=True)))
             errors.append(_error(name, model, browser))
         progress("playground")
         whole_page = Path(folder) / "playground.html"
         whole_page.write_text(playground(), encoding="utf-8")
         drag = _DRAG.format(times=6 if quick else 25, value=7.3)
-        times.append(_times("playground", 2000, driven(browser, whole_page, drag, silent=False)))
+        times.append(
+            _times("playground", 2000, driven(browser, whole_page, drag, silent=False, timed=True))
+        )
         sizes.append(("playground", "", "", number(whole_page.stat().st_size / 1e3), ""))
     return Outcome(
         (
@@ -93,7 +99,8 @@ def run(progress: Progress, quick: bool) -> Outcome:
                 Table(("model", "one run", "as psa.simulate, against it"), tuple(errors)),
                 "One run is what a slider shows; its error is against a tolerance of 1e-8.",
             ),
-        )
+        ),
+        lambda: strip(_page(_as_fitted(_model(_STRIP)), 2000)),
     )  # fmt: skip
 
 
@@ -122,13 +129,20 @@ def _page(model: Model, n: int) -> str:
     module.set_result(web_module(model))
     curves = (Curve("model", EXTENDED_COLOUR, y),)
     series = Series("record", t, v, measured, curves, np.zeros(n, dtype=bool), NOISE, False)
-    page = Document("Redraws", [], small=True)
+    page = Document("A model in a page", [], small=True)
     live = LiveModel(
         model=model, fit=fit_of(model, 1), experiments=[whole(record)], series=[series],
         base=[0.0], extended=False, correction="", added=[], module=module,
     )  # fmt: skip
     add_live(page, live)
     return page.text()
+
+
+def _as_fitted(model: Model) -> Model:
+    """Return the model as a fit leaves it: some values are free, each with an interval."""
+    free = ("k_L", "A", "beta", "tau", *(c.gain or "" for c in model.effects))
+    sure = {n: Interval(*sorted((0.9 * model.values[n], 1.1 * model.values[n]))) for n in free}
+    return model.with_values({}, provenance=Provenance(free=free, intervals=sure))
 
 
 def _size(name: str, model: Model, folder: Path) -> tuple[str, ...]:

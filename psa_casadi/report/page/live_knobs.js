@@ -137,7 +137,8 @@ psaLive.copy = function (text, told) {
 };
 
 // MODEL.json with other values: what no longer holds of it (intervals, evidence) goes.
-psaLive.file = function (told, values) {
+// Where a `stack` is given, the model is called after it, and effects that are switched off are left out.
+psaLive.file = function (told, values, stack) {
   'use strict';
   var content = JSON.parse(told.file), changed = false;
   told.parameters.forEach(function (p, i) {
@@ -148,6 +149,16 @@ psaLive.file = function (told, values) {
     entry.free = false;
     changed = true;
   });
+  if (stack) {
+    var off = told.effects.filter(function (e) { return content.parameters[e.gain].value === 0; });
+    off.forEach(function (e) { e.parameters.forEach(function (name) { delete content.parameters[name]; }); });
+    content.effects = content.effects.filter(function (e) {
+      return !off.some(function (o) { return o.name === (e.name || e); });
+    });
+    content.name = stack.name.replace(/\W/g, '_');
+    content.description = stack.description;
+    content.identified_from = [];
+  }
   if (changed) {
     delete content.evidence;
     content.notes = (content.notes || []).concat('Values were changed by hand in a page.');

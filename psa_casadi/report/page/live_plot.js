@@ -39,7 +39,7 @@ psaLive.plot = (function () {
   function stroke(pen, c, place) {
     var down = false, column = NaN, least = 0, most = 0, last = 0;
     function flush() { if (most > least) { pen.lineTo(column, least); pen.lineTo(column, most); pen.lineTo(column, last); } }
-    var dense = c.x.length > 6000;
+    var dense = c.x.length > 1500;
     for (var k = 0; k < c.x.length; k += 1) {
       var x = place.x(c.x[k]), y = place.y(c.y[k]);
       if (!isFinite(x) || !isFinite(y)) { flush(); least = most = 0; down = false; continue; }
@@ -54,9 +54,13 @@ psaLive.plot = (function () {
   }
 
   function dots(pen, c, place) {
+    var lastX = NaN, lastY = NaN;
     for (var k = 0; k < c.x.length; k += 1) {
-      var x = place.x(c.x[k]), y = place.y(c.y[k]);
-      if (isFinite(x) && isFinite(y)) { pen.rect(x - 1, y - 1, 2, 2); }
+      var x = Math.round(place.x(c.x[k])), y = Math.round(place.y(c.y[k]));
+      if ((x === lastX && y === lastY) || !isFinite(x) || !isFinite(y)) { continue; }
+      pen.rect(x - 1, y - 1, 2, 2);
+      lastX = x;
+      lastY = y;
     }
   }
 

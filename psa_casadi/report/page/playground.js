@@ -206,8 +206,10 @@ psaLive.playground = function (box, told, run) {
     make('div', {className: 'bar'}, [
       field('or corners (s V, s V, ...)', corners), field('or a CSV file', file),
       button('Reset', function () { setStack(told.stacks.indexOf(stack), true); }),
-      button('Download CSV', function () { psaLive.save('trajectory.csv', csv(), 'text/csv'); }), status
-    ])
+      button('Download CSV', function () { psaLive.save('trajectory.csv', csv(), 'text/csv'); })
+    ].concat(told.file ? [button('Download MODEL.json', function () {
+      psaLive.save('MODEL.json', psaLive.file(told, values, stack), 'application/json');
+    })] : [], [status]))
   ];
   bars.concat([about, make('p', {className: 'note', text: 'Draw over the voltage to change it.'}), legend,
     make('div', {className: 'pair'}, figures.slice(0, 2)), make('div', {className: 'pair'}, figures.slice(2, 4)),
@@ -222,7 +224,9 @@ psaLive.playground = function (box, told, run) {
   });
   window.addEventListener('resize', later);
   window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', later);
-  box.psa = {values: values, last: function () { return last; }, csv: csv, set: function (name, value) {
+  box.psa = {values: values, last: function () { return last; }, csv: csv, file: function () {
+    return psaLive.file(told, values, stack);
+  }, set: function (name, value) {
     values[told.parameters.findIndex(function (p) { return p.name === name; })] = value;
     waiting = true;
     redraw();
