@@ -95,7 +95,7 @@ def with_periodic(d: Diagnosis, *, counts: bool = False) -> Diagnosis:
                    base=(base,), extended=(y,))  # fmt: skip
 
 
-def fit_of(model: Model, records: int) -> Fit:
+def _fit(model: Model, records: int) -> Fit:
     unknowns = unknowns_of(model, ("k_L", "tau"), [{}] * records, [0.0] * records, 1e-6)
     empty, levels = np.zeros((0, unknowns.size)), (NOISE,) * records
     return Fit(model, unknowns, np.zeros(unknowns.size), np.zeros(0), empty, levels, 0.0, True,
@@ -138,8 +138,8 @@ def diagnosis(
         next_experiment=NextExperiment(None, (), "Hold the voltage for a minute."),
         notes=("Forces are assumed.",),
         experiments=tuple(p[0] for p in parts),
-        base_fit=fit_of(compose(BASE), len(names)),
-        extended_fit=fit_of(model, len(names)),
+        base_fit=_fit(compose(BASE), len(names)),
+        extended_fit=_fit(model, len(names)),
         base=base,
         extended=tuple(p[2] for p in parts) if added else base,
         model=model,

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psa_casadi.design.tracking.verification import respond
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.model_file import loads
+from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page import live_part
+from psa_casadi.report.page.design_page import write_design_page
 from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.page.live_part import thinned
+from psa_casadi.report.page.live_part import live_design, thinned
 from psa_casadi.simulation.simulate import simulate_record
 from tests.browser import DARK, Browser, driven, find_browser
 from tests.html_page import Page
@@ -160,6 +163,27 @@ def test_names_are_text_and_no_foreign_script_runs(
     assert len(console) == 1
     assert "Content Security Policy" in console[0]
     assert 'class="knob' in document  # the page's own scripts did
+
+
+@slow
+def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -> None:
+    model = stack_model("P-885.51").plant()
+    t = np.linspace(0.0, 0.02, 400)
+    played = respond(model, t, 60.0 - 50.0 * np.cos(2.0 * np.pi * 100.0 * t))
+    record = (t, played.voltage, played.displacement)
+    path = played.displacement + 50e-9
+    live = live_design(model, record, path, rest=True)
+    write_design_page(tmp_path / "d.html", title="A design", summary=["It moves."], live=live)
+    said = driven(browser, tmp_path / "d.html", """
+      var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
+      box.psa.set('k_L', 8);
+      tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
+    assert said[0].startswith("Off the path by 50 nm rms")
+    changed = respond(model.with_values({"k_L": 8.0}), t, played.voltage).displacement
+    off = 1e9 * float(np.sqrt(np.mean((path - changed) ** 2)))
+    found = re.search(r"by ([\d.]+) (nm|µm) rms", said[1])
+    assert found is not None
+    assert float(found[1]) * (1e3 if found[2] == "µm" else 1.0) == pytest.approx(off, rel=6e-3)
 
 
 @slow

@@ -76,10 +76,10 @@ static double first_rate(int input) {
     return up == count || down == count ? least : 0.0;
 }
 
-/* The state where the first inputs and their rates put the model, with the deviations */
-static int begin(void) {
+/* The state where the first inputs and their rates, or these inputs at rest, put it, with the deviations */
+static int begin(int at_rest) {
     double rate[PSA_NU + 1];
-    for (int j = 0; j < PSA_NU; ++j) rate[j] = first_rate(j);
+    for (int j = 0; j < PSA_NU; ++j) rate[j] = at_rest ? 0.0 : first_rate(j);
     const psa_beginning at = {record.t[0], record.u, rate, parameters, deviation, nominal};
     if (psa_settle(&at, start)) return NO_EQUILIBRIUM;
     for (int i = 0; i < PSA_STATES; ++i)
@@ -195,11 +195,12 @@ static int exactly(double rtol, int hold, int quick, double shown_nominal) {
 
 /* Run the record that was written: 0, or why it could not be.
 
-   `settle` lets it start where its first inputs put it, with the deviations; else it starts at `page_start`.
+   `settle` lets it start where its first inputs put it, with the deviations: moving (1) or at rest (2); at 0 it
+   starts at `page_start`.
    `quick` is one run of exact steps, whose error nothing has measured. */
 EXPORT int page_run(double rtol, int hold, int settle, int quick, double shown_nominal) {
     const size_t mark = page_mark();
-    int status = settle ? begin() : 0;
+    int status = settle ? begin(settle == 2) : 0;
 #if PAGE_EXACT
     if (status == 0 && rtol >= PAGE_TIGHTEST && exactly(rtol, hold, quick, shown_nominal)) return 0;
 #else

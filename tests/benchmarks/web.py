@@ -13,13 +13,10 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.export.web.module import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record
-from psa_casadi.records.split import whole
 from psa_casadi.report.page.document import Document
-from psa_casadi.report.page.live_part import LiveModel, add_live
+from psa_casadi.report.page.live_part import LiveModel, LiveRecord, add_live
 from psa_casadi.report.page.playground_page import playground
 from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.series import EXTENDED_COLOUR, Curve, Series
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
@@ -28,7 +25,7 @@ from tests.benchmarks.outcome import Outcome, Progress, TitledTable
 from tests.benchmarks.web_strip import strip
 from tests.browser import Browser, driven, find_browser
 from tests.live_pages import case, run_in_browser
-from tests.report_cases import NOISE, fit_of
+from tests.report_cases import NOISE
 
 #: What a redraw of so many samples may take [ms].
 SAMPLES, ALLOWED = 5000, 50.0
@@ -124,16 +121,14 @@ def _page(model: Model, n: int) -> str:
     t, v = _voltage(n)
     y = simulate(model, t, v).displacement
     measured = y + NOISE * np.random.default_rng(1).standard_normal(n)
-    record = Record(name="record", time=t, voltage=v, displacement=measured)
     module: Future[bytes | None] = Future()
     module.set_result(web_module(model))
-    curves = (Curve("model", EXTENDED_COLOUR, y),)
-    series = Series("record", t, v, measured, curves, np.zeros(n, dtype=bool), NOISE, False)
-    page = Document("A model in a page", [], small=True)
-    live = LiveModel(
-        model=model, fit=fit_of(model, 1), experiments=[whole(record)], series=[series],
-        base=[0.0], extended=False, correction="", added=[], module=module,
+    row = LiveRecord(
+        name="record", time=t, inputs={"voltage": v}, measured=measured,
+        held_out=np.zeros(n, dtype=bool), residual=measured - y, deviation={}, noise=NOISE,
     )  # fmt: skip
+    page = Document("A model in a page", [], small=True)
+    live = LiveModel(model, module, [row])
     add_live(page, live)
     return page.text()
 

@@ -6,11 +6,10 @@ psaLive.report = function (box, told, run) {
 
   told.records.forEach(function (r) {
     r.t = r.t ? psaLive.doubles(r.t) : Float64Array.from({length: r.n}, function (_, k) { return k * r.step; });
-    r.voltage = psaLive.doubles(r.voltage);
     r.measured = psaLive.singles(r.measured);
     r.correction = r.correction ? psaLive.singles(r.correction) : null;
     Object.keys(r.inputs).forEach(function (n) { r.inputs[n] = psaLive.doubles(r.inputs[n]); });
-    r.inputs.voltage = r.voltage;
+    r.voltage = r.inputs.voltage;
     r.time = r.t.map(function (t) { return told.time.factor * t; });
     r.shown = r.measured.map(function (y) { return told.length.factor * y; });
     r.judged = judged(r);
@@ -40,7 +39,7 @@ psaLive.report = function (box, told, run) {
   }
 
   function simulate(r, at, quick) {
-    var found = run({values: at, t: r.t, inputs: r.inputs, deviation: r.deviation, settle: true, quick: quick});
+    var found = run({values: at, t: r.t, inputs: r.inputs, deviation: r.deviation, settle: true, rest: r.rest, quick: quick});
     if (found.status) { return found; }
     var y = found.outputs[told.shown];
     for (var k = 0; k < y.length; k += 1) { y[k] += corrected.checked && r.correction ? r.correction[k] : 0; }
@@ -53,7 +52,7 @@ psaLive.report = function (box, told, run) {
   function answer(r, quick) {
     var now = simulate(r, values, quick);
     if (now.status) { return now; }
-    var shift = mean(r, missed(r, now.y)) - r.center;
+    var shift = told.design ? 0 : mean(r, missed(r, now.y)) - r.center;
     now.y = now.y.map(function (y) { return y + shift; });
     now.residual = missed(r, now.y);
     r.fitted = r.fitted || now.y; // the first run is at the fitted values
@@ -81,6 +80,11 @@ psaLive.report = function (box, told, run) {
     if (now.status) { output.textContent = 'With these values the model cannot be run: ' + now.reason + '.'; return; }
     var which = record.judged.any ? 1 : null, size = rms(record, now.residual, which);
     var was = rms(record, missed(record, record.fitted), which);
+    if (told.design) {
+      output.textContent = 'Off the ' + told.aim + ' by ' + length(size) + ' rms, ' +
+        +(100 * size / record.range).toPrecision(2) + ' % of its range. As it was: ' + length(was) + '.';
+      return;
+    }
     var text = (record.judged.any ? 'Error on held-out samples' : 'Error') + ': ' + length(size) + ' rms, ' +
       +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.noise) + '.';
     if (record.base > record.noise && told.extended) {
@@ -109,9 +113,9 @@ psaLive.report = function (box, told, run) {
     });
     var ends = [r.time[0], r.time[r.time.length - 1]];
     psaLive.plot(plots[2], {
-      x: 'time [' + told.time.unit + ']', y: 'measured minus model [' + told.error.unit + ']', bands: held, reach: zoom.reach,
+      x: 'time [' + told.time.unit + ']', y: told.aim + ' minus model [' + told.error.unit + ']', bands: held, reach: zoom.reach,
       curves: [{x: r.time, y: now.residual.map(function (e) { return g * e; }), colour: '--model', width: 1}]
-        .concat([2, -2].map(function (k) {
+        .concat((r.noise > 0 ? [2, -2] : []).map(function (k) {
           return {x: ends, y: [k * g * r.noise, k * g * r.noise], colour: '--measured', dash: [5, 4], width: 1};
         }))
     });

@@ -37,7 +37,7 @@ psaLive.load = function (told) {
       for (var k = 0; k < n; k += 1) { inputs[k * nu + j] = given ? given[k] : input.start; }
     });
     var settle = !asked.start && (asked.settle || !told.starts_itself);
-    var status = page.page_run(asked.rtol || 1e-6, asked.hold === 'zero' ? 1 : 0, settle ? 1 : 0,
+    var status = page.page_run(asked.rtol || 1e-6, asked.hold === 'zero' ? 1 : 0, settle ? (asked.rest ? 2 : 1) : 0,
       asked.quick ? 1 : 0, told.shown_nominal);
     function columns(at, names) {
       var all = view(at, n * names.length), found = {};

@@ -17,72 +17,136 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_data import doubles, live_data, singles
-from psa_casadi.report.words.phrases import added, length_scale
-from psa_casadi.report.words.series import Series, spans
+from psa_casadi.report.words.phrases import added, handy_scale, length_scale
+from psa_casadi.report.words.series import Series, spans, time_scale
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 #: Samples of all records in a page, and records; of more, those that the model misses most.
 _SAMPLES, _RECORDS = 12_000, 6
 #: Left-out samples may be off the line between their neighbours by this share of the range.
 _BENT = 5e-3
 
-_LEGEND = [["--measured", "measured"], ["--model", "model"], ["--fitted", "as fitted"]]
-_CAPTIONS = {
-    "time": "Displacement over time",
-    "loop": "Displacement over voltage",
-    "residual": "Residual: measured minus model",
-}
+
+@dataclass(frozen=True, eq=False)
+class LiveRecord:
+    """A record that a model runs on, arrays (n,) in SI units: what it is compared with, and how.
+
+    `deviation` holds the start of states off where the voltage puts them, `center` the residual of
+    the model as it was fitted, `base` the base model's rms error, `correction` what an unnamed
+    correction adds. It begins in motion, or at `rest`.
+    """
+
+    name: str
+    time: FloatArray
+    inputs: Mapping[str, FloatArray]
+    measured: FloatArray
+    held_out: BoolArray
+    residual: FloatArray
+    deviation: Mapping[str, float]
+    noise: float
+    base: float = 0.0
+    correction: FloatArray | None = None
+    rest: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class LiveModel:
     """A model that a page is to hold, with the compilation of its module that has begun.
 
-    `added` are what an unnamed correction adds to each record [m], empty without one.
+    `aim` is what it is compared with; a `design` has neither noise nor a sensor with an offset.
     """
 
     model: Model
-    fit: Fit
-    experiments: Sequence[Experiment]
-    series: Sequence[Series]
-    base: Sequence[float]
-    extended: bool
-    correction: str
-    added: Sequence[FloatArray]
     module: "Future[bytes | None]"
+    records: Sequence[LiveRecord]
+    aim: str = "measured"
+    design: bool = False
+    extended: bool = False
+    correction: str = ""
+    counts: bool = False
 
 
 def live_diagnosis(d: Diagnosis, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of a diagnosis alive; `rows` are its `series_of`."""
     patch = d.patch
+    beyond = (
+        [] if patch is None else [p - x for p, x in zip(patch.predicted, d.extended, strict=True)]
+    )
     return LiveModel(
         model=d.model,
-        fit=d.extended_fit,
-        experiments=d.experiments,
-        series=rows,
-        base=[_judged_rms(s, s.measured - s.curves[0].values) for s in rows],
+        module=begun_module(d.model),
+        records=_fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond),
         extended=added(d),
         correction="" if patch is None else f"{patch.name}, as it was found: it does not follow",
-        added=(
-            [p - x for p, x in zip(patch.predicted, d.extended, strict=True)]
-            if patch is not None
-            else []
-        ),
-        module=begun_module(d.model),
+        counts=any(s.counts for s in rows),
     )
 
 
 def live_fit(found: Identification, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of an identification alive; `rows` are its `series_of_fit`."""
     return LiveModel(
-        model=found.model, fit=found.fit, experiments=found.experiments, series=rows,
-        base=[0.0] * len(rows), extended=False, correction="", added=[],
+        model=found.model,
         module=begun_module(found.model),
+        records=_fitted_records(found.model, found.fit, found.experiments, rows, []),
+        counts=any(s.counts for s in rows),
+    )
+
+
+def live_design(
+    model: Model,
+    record: tuple[FloatArray, FloatArray, FloatArray],
+    wanted: FloatArray | None = None,
+    *,
+    rest: bool = False,
+) -> LiveModel:
+    """Begin what lets a model run on a designed voltage.
+
+    `record` is time [s], voltage [V] and the model's displacement [m]; `wanted` the path that it is
+    to follow, where there is one. The model begins in motion, or at `rest`.
+    """
+    time, voltage, shown = record
+    aim = shown if wanted is None else wanted
+    row = LiveRecord(
+        name="design", time=time, inputs={"voltage": voltage}, measured=aim,
+        held_out=np.zeros(len(time), dtype=bool), residual=aim - shown, deviation={}, noise=0.0,
+        rest=rest,
     )  # fmt: skip
+    words = "design" if wanted is None else "path"
+    return LiveModel(model, begun_module(model), [row], aim=words, design=True)
+
+
+def _fitted_records(
+    model: Model,
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    series: Sequence[Series],
+    beyond: Sequence[FloatArray],
+) -> list[LiveRecord]:
+    """Return the records of a fit; `beyond` is what an unnamed correction adds to each."""
+    theta = shared_starts(model, fit.unknowns, fit.theta, experiments)[0]
+    rows = []
+    for k, (e, s) in enumerate(zip(experiments, series, strict=True)):
+        columns = {n: getattr(e.record, n, None) for n in model.input_names}
+        rows.append(
+            LiveRecord(
+                name=s.name,
+                time=s.time,
+                inputs={n: v for n, v in columns.items() if v is not None},
+                measured=s.measured,
+                held_out=s.held_out,
+                residual=s.residual(s.curves[-1]),
+                deviation=fit.unknowns.start(theta, k),
+                noise=s.noise,
+                base=_judged_rms(s.residual(s.curves[0]), s.held_out),
+                correction=beyond[k] if beyond else None,
+            )
+        )
+    return rows
 
 
 def add_live(page: Document, live: LiveModel) -> None:
@@ -104,75 +168,72 @@ def add_live(page: Document, live: LiveModel) -> None:
 
 
 def _told(live: LiveModel, module: bytes) -> dict[str, Any]:
-    order = _worst(live.series)
-    theta = shared_starts(live.model, live.fit.unknowns, live.fit.theta, live.experiments)[0]
-    rows = [
-        _record(live, k, live.fit.unknowns.start(theta, k), _SAMPLES // len(order)) for k in order
-    ]
-    first = live.series[order[0]]
-    error = length_scale(
-        max(float(np.nanmax(np.abs(live.series[k].residual(live.series[k].curves[-1]))))
-            for k in order),
-        counts=first.counts,
-    )  # fmt: skip
+    shown = sorted(live.records, key=_miss, reverse=True)[:_RECORDS]
+    first, counts = shown[0], live.counts
+    time = time_scale(float(first.time[-1] - first.time[0]))
+    length = handy_scale(_range(first), counts=counts)
+    largest = max(float(np.nanmax(np.abs(r.residual))) for r in shown)
+    error = length_scale(largest or 1e-2 * _range(first), counts=counts)
+    legend = [["--measured", live.aim], ["--model", "model"], ["--fitted", "as it was"]]
     return {
         "kind": "report",
         **live_data(live.model, module),
-        "records": rows,
-        "time": {"unit": first.time_scale.unit, "factor": first.time_scale.factor},
-        "length": {"unit": first.scale.unit, "factor": first.scale.factor},
-        "error": {"unit": error.unit, "factor": error.factor},
+        "records": [_record(r, _SAMPLES // len(shown)) for r in shown],
+        **{
+            name: {"unit": scale.unit, "factor": scale.factor}
+            for name, scale in (("time", time), ("length", length), ("error", error))
+        },
         "extended": live.extended,
+        "design": live.design,
+        "aim": live.aim,
         "correction": live.correction,
-        "legend": _LEGEND,
-        "captions": _CAPTIONS,
+        "legend": legend,
+        "captions": {
+            "time": "Displacement over time",
+            "loop": "Displacement over voltage",
+            "residual": f"{live.aim} minus model".capitalize(),
+        },
     }
 
 
-def _worst(series: Sequence[Series]) -> list[int]:
-    """Return the records to show, the one that the model misses by the largest share first."""
-
-    def miss(k: int) -> float:
-        s = series[k]
-        spread = float(np.nanstd(s.measured)) or 1.0
-        return float(np.sqrt(np.nanmean(s.residual(s.curves[0]) ** 2))) / spread
-
-    return sorted(range(len(series)), key=miss, reverse=True)[:_RECORDS]
+def _miss(r: LiveRecord) -> float:
+    """Return the error over the spread, by which records are chosen."""
+    return float(np.sqrt(np.nanmean(r.residual**2))) / (float(np.nanstd(r.measured)) or 1.0)
 
 
-def _judged_rms(s: Series, residual: FloatArray) -> float:
+def _range(r: LiveRecord) -> float:
+    return float(np.nanmax(r.measured) - np.nanmin(r.measured))
+
+
+def _judged_rms(residual: FloatArray, held_out: BoolArray) -> float:
     """Return the rms of a residual over the samples held out, or all if none is."""
-    counted = s.held_out if s.held_out.any() else np.ones(len(residual), dtype=bool)
+    counted = held_out if held_out.any() else np.ones(len(residual), dtype=bool)
     return float(np.sqrt(np.nanmean(residual[counted] ** 2)))
 
 
-def _record(live: LiveModel, k: int, start: Mapping[str, float], limit: int) -> dict[str, Any]:
+def _record(r: LiveRecord, limit: int) -> dict[str, Any]:
     """Return a record as a page holds it, in SI units, its time from its own first sample on."""
-    s, record = live.series[k], live.experiments[k].record
-    part, note = thinned(record.time, record.voltage, limit)
-    t = record.time[part] - record.time[0]
-    residual = s.residual(s.curves[-1])[part]
-    fitted = np.isfinite(residual) & ~s.held_out[part]
-    others = {n: getattr(record, n, None) for n in live.model.input_names if n != "voltage"}
-    even = len(t) > 2 and np.ptp(np.diff(t)) <= ALIKE * t[1]
+    part, note = thinned(r.time, r.inputs["voltage"], limit)
+    t = r.time[part] - r.time[0]
+    residual = r.residual[part]
+    fitted = np.isfinite(residual) & ~r.held_out[part]
+    even = len(t) > 2 and float(np.ptp(np.diff(t))) <= ALIKE * float(t[1])
     return {
-        "name": s.name,
+        "name": r.name,
         "note": note,
-        **(
-            {"n": len(t), "step": float(t[-1] / (len(t) - 1)), "t": None}
-            if even
-            else {"t": doubles(t)}
-        ),
-        "voltage": doubles(record.voltage[part]),
-        "inputs": {n: doubles(v[part]) for n, v in others.items() if v is not None},
-        "measured": singles(s.measured[part]),
-        "held": spans(s.held_out[part]),
+        "t": None if even else doubles(t),
+        "n": len(t),
+        "step": float(t[-1] / (len(t) - 1)),
+        "inputs": {n: doubles(v[part]) for n, v in r.inputs.items()},
+        "measured": singles(r.measured[part]),
+        "held": spans(r.held_out[part]),
         "center": float(np.mean(residual[fitted])) if fitted.any() else 0.0,
-        "deviation": dict(start),
-        "noise": s.noise,
-        "range": float(np.nanmax(s.measured) - np.nanmin(s.measured)),
-        "base": live.base[k],
-        "correction": singles(live.added[k][part]) if live.added else None,
+        "deviation": dict(r.deviation),
+        "noise": r.noise,
+        "rest": r.rest,
+        "range": _range(r),
+        "base": r.base,
+        "correction": None if r.correction is None else singles(r.correction[part]),
     }
 
 
