@@ -43,6 +43,8 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     return "\n\n".join(
         [
             markdown,
+            f"In the [playground]({PLAYGROUND}) each effect has a switch and sliders, under any"
+            " voltage ([how](web.md)).",
             markdown_table(overview()),
             *sections,
             "## Several modes",

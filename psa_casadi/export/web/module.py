@@ -43,7 +43,8 @@ _EXPORTS = (
     "outputs", "steps", "way", "run",
 )  # fmt: skip
 _STACK = 1 << 20
-_FLAGS = (
+#: For the compiler, of every module.
+WEB_FLAGS = (
     "--target=wasm32-freestanding", "-std=gnu99", "-O2", "-ffp-contract=off", "-fno-math-errno",
     "-fbuiltin", "-msimd128", "-mbulk-memory",
 )  # fmt: skip
@@ -90,8 +91,8 @@ def _compiled(structure: Structure) -> Callable[[], bytes]:
         raise InputError(
             [f"A page cannot run sampled states ({names}); leave the sampled components out."]
         )
-    command = [*zig_command(), *_FLAGS]  # before anything is made: raises where there is none
-    texts = _texts(structure)
+    command = [*zig_command(), *WEB_FLAGS]  # before anything is made: raises where there is none
+    texts = module_texts(structure)
     folder = sources_directory()
     digest = hashlib.sha256(repr((version("ziglang"), command[1:])).encode())
     digest.update(repr(sorted(texts.items())).encode())
@@ -101,7 +102,7 @@ def _compiled(structure: Structure) -> Callable[[], bytes]:
     return lambda: cached("web", name, lambda work: _compile(work, texts)).read_bytes()
 
 
-def _texts(structure: Structure) -> Mapping[str, str]:
+def module_texts(structure: Structure) -> Mapping[str, str]:
     """Return the generated files of a module by their names."""
     s = structure
     outputs = [o.name for o in s.outputs]
@@ -161,7 +162,7 @@ def _compile(work: Path, texts: Mapping[str, str]) -> Path:
     folder = sources_directory()
     sources = [*_PAGE_SOURCES, *SOURCES, *(["exact.c"] if "exact_model.h" in texts else [])]
     command = [
-        *zig_command(), *_FLAGS, "-I.", f"-I{folder / 'page'}", f"-I{folder}",
+        *zig_command(), *WEB_FLAGS, "-I.", f"-I{folder / 'page'}", f"-I{folder}",
         *(str(folder / name) for name in sources), "model.c", "by_input.c",
         "-Wl,--no-entry", "-Wl,--strip-all", f"-Wl,-z,stack-size={_STACK}",
         *(f"-Wl,--export=page_{name}" for name in _EXPORTS), "-o", "model.wasm",
