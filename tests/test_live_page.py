@@ -1,5 +1,7 @@
 """A page whose model is alive: moved as people move it, and still what Python simulates."""
 
+import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psa_casadi.component import Component, Equations
 from psa_casadi.design.tracking.verification import respond
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.fitting.prediction import measured
@@ -16,8 +19,10 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page import live_part
 from psa_casadi.report.page.design_page import write_design_page
 from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.page.live_data import live_data
 from psa_casadi.report.page.live_part import live_design, thinned
 from psa_casadi.simulation.simulate import simulate_record
+from psa_casadi.variables import Interval, Parameter, Provenance
 from tests.browser import DARK, Browser, driven, find_browser
 from tests.html_page import Page
 from tests.report_cases import diagnosis
@@ -200,6 +205,23 @@ def test_without_compiler_a_page_says_so(
     write_report(shown, tmp_path / "page.html", small=True)
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
     assert "the model does not run. It takes a compiler" in text
+
+
+def test_what_json_cannot_hold_stays_out_of_a_page() -> None:
+    free = Component(
+        name="free_gain", description="a test", source="none", gain="g",
+        equations=lambda _: Equations(),
+        parameters=(Parameter("g", 0.0, "1", (-math.inf, math.inf), "any", scale=2.0),),
+    )  # fmt: skip
+    sure = Provenance(intervals={"k_L": Interval(1.0, math.inf), "tau": Interval(1e-5, 1e-3)})
+    model = stack_model("P-885.51").with_effect(free).with_values({}, provenance=sure)
+    told = {p["name"]: p for p in live_data(model, b"")["parameters"]}
+    json.dumps(told, allow_nan=False)
+    assert told["k_L"]["interval"] is None
+    assert told["tau"]["interval"] == [1e-5, 1e-3]
+    assert told["g"]["ends"] == [-8.0, 8.0]
+    low, high = told["k_L"]["ends"]
+    assert low < model.values["k_L"] < high
 
 
 def test_a_long_record_is_thinned_only_where_the_voltage_stays_the_same() -> None:

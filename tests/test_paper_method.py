@@ -278,7 +278,7 @@ def test_the_command(tmp_path: Path, with_step: bool) -> None:
         columns = {"time [s]": r.time, "voltage [V]": r.voltage}
         write_record(paths[-1], {**columns, "displacement [m]": np.asarray(r.displacement)})
     out, page = tmp_path / "m.json", tmp_path / "fit.html"
-    arguments = ["identify", *paths, "--method", "paper", "-o", out, "--report", page, "--still"]
+    arguments = ["identify", *paths, "--method", "paper", "-o", out, "--report", page]
     result = CliRunner().invoke(app, [str(a) for a in [*arguments, "--stiffness", 5e7]])
     assert result.exit_code == 0, result.output
     said = " ".join(result.stdout.split())

@@ -22,6 +22,8 @@ _DECADES = 10.0
 _HALF_WIDTHS = 2.0
 #: And from 0 so many ordinary changes.
 _TYPICAL = 4.0
+#: What stands for an infinite bound: JSON has none.
+_NO_BOUND = 1e300
 
 
 def doubles(values: npt.ArrayLike) -> str:
@@ -85,16 +87,17 @@ def _scale(unit: str, display: str) -> dict[str, Any]:
 def _parameter(model: Model, p: Parameter) -> dict[str, Any]:
     unit, display = shown_in(model, p.name)
     interval = model.provenance.intervals.get(p.name)
+    sure = [interval.low, interval.high] if interval is not None else []
     ends = _ends(model, p)
     return {
         "name": p.name,
         "description": p.description,
         **_scale(unit, display),
         "value": model.values[p.name],
-        "bounds": list(p.bounds),
+        "bounds": np.clip(p.bounds, -_NO_BOUND, _NO_BOUND).tolist(),
         "ends": list(ends),
         "log": p.log and ends[0] > 0.0,
-        "interval": [interval.low, interval.high] if interval is not None else None,
+        "interval": sure if np.isfinite(sure).all() and sure else None,
         "free": p.name in model.provenance.free,
     }
 
@@ -106,7 +109,8 @@ def _ends(model: Model, p: Parameter) -> tuple[float, float]:
         return max(low, value / _DECADES), min(high, value * _DECADES)
     interval = model.provenance.intervals.get(p.name)
     half = 0.5 * (interval.high - interval.low) if interval is not None else 0.0
-    reach = max(abs(value), min(_HALF_WIDTHS * half, 10.0 * abs(value)))
+    wide = _HALF_WIDTHS * half if np.isfinite(half) else 0.0
+    reach = max(abs(value), min(wide, 10.0 * abs(value)))
     if value == 0.0:
         reach = max(reach, _TYPICAL * p.typical({**model.values, p.name: 0.0}))
     return max(low, value - reach), min(high, value + reach)
