@@ -128,6 +128,8 @@ def test_a_moved_slider_shows_what_python_simulates(
     assert told_rms(moved["moved"]) == pytest.approx(rms_of(shown, changed), rel=6e-3)
     assert told_rms(moved["first"]) == pytest.approx(rms_of(shown, {}), rel=6e-3)
     assert moved["changed"]
+    assert "% is removed" in moved["first"]
+    assert "more than the base model leaves" in moved["moved"]
 
 
 @slow

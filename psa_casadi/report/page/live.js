@@ -89,7 +89,9 @@ psaLive.report = function (box, told, run) {
       +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.noise) + '.';
     if (record.base > record.noise && told.extended) {
       var left = Math.max(0, size * size - record.noise * record.noise) / (record.base * record.base - record.noise * record.noise);
-      text += ' Of the base model\u2019s error above the noise (in power) ' + Math.round(100 * (1 - left)) + ' % is removed.';
+      text += left < 1
+        ? ' Of the base model\u2019s error above the noise (in power) ' + Math.round(100 * (1 - left)) + ' % is removed.'
+        : ' That is more than the base model leaves, which was fitted by itself: ' + length(record.base) + '.';
     }
     output.textContent = text;
   }
