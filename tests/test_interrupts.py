@@ -187,7 +187,7 @@ def test_a_command_says_what_it_kept(
         monkeypatch.setattr(module, "diagnose", lambda *given, **options: finished)
     write_record(tmp_path / "r.csv", columns(record))
     m, j, r = (tmp_path / n for n in ("m.json", "d.json", "r.html"))
-    given = [command, str(tmp_path / "r.csv"), "-o", str(m), "--report", str(r)]
+    given = [command, str(tmp_path / "r.csv"), "-o", str(m), "--report", str(r), "--still"]
     if command == "diagnose":
         given += ["--json", str(j)]
     ended = CliRunner().invoke(app, given)
@@ -246,7 +246,15 @@ def interrupted(
     word: str, record: Path, folder: Path, command: str, times: int = 1
 ) -> tuple[subprocess.Popen[str], float, str]:
     """Run a command, interrupt it so many times after a step began; return how long that took."""
-    given = [command, str(record), "-o", str(folder / "m.json"), "--report", str(folder / "r.html")]
+    given = [
+        command,
+        str(record),
+        "-o",
+        str(folder / "m.json"),
+        "--report",
+        str(folder / "r.html"),
+        "--still",
+    ]
     process = subprocess.Popen(
         [sys.executable, "-m", "psa_casadi.cli", *given],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,

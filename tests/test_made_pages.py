@@ -53,6 +53,7 @@ def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> Non
     text = section(effect)
     assert effect.equation_text.split(",  ", maxsplit=1)[0] in text
     assert f"]({PICTURES}/backlash.png)" in text
+    assert "](playground.html#backlash)" in text
     assert effect.source[1:] in text
     assert all(f"| {p.name} | {p.unit} |" in text for p in effect.parameters)
 

@@ -17,6 +17,7 @@ from psa_casadi.cli.screen import (
     Quiet,
     SampleTimeOption,
     SmallOption,
+    StillOption,
     show,
     show_table,
     tell_written,
@@ -78,6 +79,7 @@ def diagnose(
         ),
     ] = False,
     small: SmallOption = False,
+    still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -129,7 +131,7 @@ def diagnose(
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = following or _beside(json or report)
-            d, unpatched = _finish(d, place, outputs, (origin.value, small), progress)
+            d, unpatched = _finish(d, place, outputs, (origin.value, small, still), progress)
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
@@ -149,24 +151,24 @@ def _finish(
     d: "Diagnosis",
     following: Path | None,
     outputs: Mapping[str, Path | None],
-    page: tuple[str, bool],
+    page: tuple[str, bool, bool],
     progress: Callable[[str], None],
 ) -> "tuple[Diagnosis, str]":
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
-    `page` says what the page calls the records, and whether it is small.
+    `page` says what the page calls the records, and whether it is small, and still.
     """
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
 
     written: list[Path] = []
-    origin, small = page
+    origin, small, still = page
     try:
         with stage("next experiment"):
             d = _with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
-            files.write(d, {**outputs, "--patch": None}, origin, written, small=small)
+            files.write(d, {**outputs, "--patch": None}, origin, written, small=small, still=still)
         with stage("unnamed correction"):
             return d, _write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:

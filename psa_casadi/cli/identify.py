@@ -17,6 +17,7 @@ from psa_casadi.cli.screen import (
     Quiet,
     SampleTimeOption,
     SmallOption,
+    StillOption,
     show,
     tell_written,
     width,
@@ -63,6 +64,7 @@ def identify(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
     small: SmallOption = False,
+    still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -100,7 +102,7 @@ def identify(
                 progress=progress,
             )
         profiles = _finish(
-            found, output, (json, report, small), profile or (), origin.value, progress
+            found, output, (json, report, small, still), profile or (), origin.value, progress
         )
     show(identification_text(found, origin=origin.value, width=width()), quiet)
     for found_profile in profiles:
@@ -118,14 +120,14 @@ def identify(
 def _finish(
     found: "Identification",
     output: Path,
-    more: tuple[Path | None, Path | None, bool],
+    more: tuple[Path | None, Path | None, bool, bool],
     wanted: Sequence[str],
     origin: str,
     progress: Callable[[str], None],
 ) -> "list[Profile]":
     """Write the files and return the profiles; at an interrupt the model is kept, which it says.
 
-    `more` are the JSON file, the page, and whether that is small.
+    `more` are the JSON file, the page, and whether that is small, and still.
     """
     from psa_casadi.cli.interrupts import kept
     from psa_casadi.files import atomic_write
@@ -135,7 +137,7 @@ def _finish(
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.strict_json import json_text
 
-    json, report, small = more
+    json, report, small, still = more
     done = [output]
     try:
         save_model(found.model, output)
@@ -146,7 +148,9 @@ def _finish(
             done.append(json)
         if report is not None and not found.interrupted:
             progress("writing the report")
-            write_fit_report(found, report, origin=origin, profiles=profiles, small=small)
+            write_fit_report(
+                found, report, origin=origin, profiles=profiles, small=small, still=still
+            )
         ended = found.interrupted
     except KeyboardInterrupt:
         save_model(found.model, output)

@@ -57,7 +57,14 @@ ColumnsOption = Annotated[
 
 SmallOption = Annotated[
     bool,
-    typer.Option("--small", help="Page below 1 MB, for mail: one picture in place of the plots."),
+    typer.Option("--small", help="Page below 1.5 MB, for mail: one picture in place of the plots."),
+]
+
+StillOption = Annotated[
+    bool,
+    typer.Option(
+        "--still", help="Page without the model that runs in it: nothing is compiled for it."
+    ),
 ]
 
 SampleTimeOption = Annotated[

@@ -32,6 +32,11 @@ BENCHES: dict[str, Bench] = {
             "exact steps against the stepper: error against time, lanes, effects, whole diagnoses",
         ),
         _later(
+            "web",
+            "web",
+            "models in pages: sizes, redraw times in a headless browser, errors",
+        ),
+        _later(
             "coverage",
             "coverage",
             "identified parameters and their intervals against the truth, over seeds and stacks",
