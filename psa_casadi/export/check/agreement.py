@@ -11,10 +11,12 @@ import numpy.typing as npt
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.export.check.rows import BREAKDOWNS
 from psa_casadi.export.check.truth import Run, Truth
+from psa_casadi.export.common.variable_table import starts_at_voltage
 from psa_casadi.export.fmu.model_description import time_scale
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
+from psa_casadi.simulation.history import settled_at
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value
 
@@ -110,6 +112,7 @@ def truth_of(model: Model, version: int) -> Truth:
         tuple(s.switches), s.f, switches, _starts(model), bool(model.sampled_names), names,
         "reference" if has_reference(model) else "simulator", np.ones(len(names)), (),
     )  # fmt: skip
+    truth = _with_settled_start(truth, model)
     try:
         return _with_runs(truth, model, held=version == 3)
     except BREAKDOWNS as error:
@@ -125,6 +128,21 @@ def _starts(model: Model) -> dict[str, float]:
     names = (model.state_names, model.input_names, model.output_names)
     values = (*groups, y)
     return {n: float(v) for k, own in enumerate(names) for n, v in zip(own, values[k], strict=True)}
+
+
+def _with_settled_start(truth: Truth, model: Model) -> Truth:
+    """Add the start at another voltage than that of the export, where there is one."""
+    if not starts_at_voltage(model):
+        return truth
+    voltage = next(i for i in model.structure.inputs if i.name == "voltage")
+    usual = nominal_value(voltage.nominal, model.values)
+    chosen = max((0.4 * usual, 0.6 * usual), key=lambda v: abs(v - voltage.start))
+    try:
+        settled = settled_at(model, chosen).structure
+    except BREAKDOWNS:  # it does not rest there
+        return truth
+    starts = {q.name: q.start for q in settled.states} | {"voltage": chosen}
+    return replace(truth, start_voltage=chosen, settled_starts=starts)
 
 
 def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:

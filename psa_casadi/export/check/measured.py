@@ -21,6 +21,7 @@ from psa_casadi.export.check.structure import (
     directional_error,
     equation_error,
     incomplete_dependencies,
+    settled_start_error,
     wrong_start,
 )
 from psa_casadi.export.check.task import Task
@@ -32,6 +33,8 @@ _DIRECTIONAL_LIMIT = 1e-5
 _ADJOINT_LIMIT = 1e-10
 _EQUATION_LIMIT = 1e-9
 _LINE_LIMIT = 0.05
+#: Both starts come of runs at tolerances of 1e-6 and less.
+_START_LIMIT = 1e-5
 
 #: The name of a check that begins now, or the row of the one that began last.
 Progress = Iterator[str | CheckRow]
@@ -82,6 +85,9 @@ def _of_instances(fmu: Fmu, task: Task) -> Progress:
 def _of_model(fmu: Fmu, truth: Truth) -> Progress:
     yield "start of a run"
     yield count("start of a run", wrong_start, fmu, truth)
+    if truth.settled_starts:
+        yield "settled start"
+        yield figure("settled start", _START_LIMIT, settled_start_error, fmu, truth)
     yield "event indicators of the model"
     yield count("event indicators of the model", wrong_indicators, fmu, truth)
     yield "equations"

@@ -9,7 +9,7 @@ import casadi as ca
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.archive import DESCRIPTIONS
-from psa_casadi.export.fmu.dependencies import Key, dependencies, without_sampled
+from psa_casadi.export.fmu.dependencies import Key, at_the_start, dependencies, without_sampled
 from psa_casadi.export.fmu.sources import FROM_CASADI, compiled_files, source_files, token_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.model.compose import Model
@@ -32,12 +32,16 @@ def wrong_start_values(archive: Archive, model: Model) -> Iterator[str]:
 def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
     """The dependencies are the sparsity of the model's Jacobian: none missing, none superfluous."""
     names = {(v.kind, v.index): v.name for v in variable_table(model)}
-    found = {names[unknown]: known for unknown, known in dependencies(model.structure).items()}
-    initial = {n: {names[k]: kind for k, kind in known.items()} for n, known in found.items()}
-    truth = {
-        n: {names[k]: kind for k, kind in without_sampled(known).items()}
-        for n, known in found.items()
-    }
+
+    def named(found: dict[Key, dict[Key, str]]) -> dict[str, dict[str, str]]:
+        return {
+            names[unknown]: {names[k]: kind for k, kind in known.items()}
+            for unknown, known in found.items()
+        }
+
+    found = dependencies(model.structure)
+    truth = named({unknown: without_sampled(known) for unknown, known in found.items()})
+    initial = named(at_the_start(model))
     yield from _listed(archive, names)
     described = archive.description
     indicators = described.eventIndicators if archive.version == 3 else []

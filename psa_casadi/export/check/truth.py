@@ -30,8 +30,9 @@ class Truth:
     """The equations of a model, the runs to compare with, and why there are no more of them.
 
     `f` and `switches` take time and the vectors of states, inputs, parameters and sampled states.
-    `starts` are the values of states, inputs and outputs before anything is set. `compared` names
-    what the runs compare, `scale` (ny,) its size, `by` who computed it.
+    `starts` are the values of states, inputs and outputs before anything is set, `settled_starts`
+    those of states and voltage once `start_voltage` is `start_voltage` [V]; None if they are not
+    known. `compared` names what the runs compare, `scale` (ny,) its size, `by` who computed it.
     """
 
     state_names: tuple[str, ...]
@@ -48,3 +49,5 @@ class Truth:
     scale: FloatArray
     runs: tuple[Run, ...]
     problem: str = ""
+    start_voltage: float = 0.0
+    settled_starts: dict[str, float] | None = None

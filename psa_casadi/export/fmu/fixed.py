@@ -11,6 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import number, xml_text
+from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.fixed_step.planning import FixedStep
 from psa_casadi.export.fixed_step.probe import STEPS, shown_output
 from psa_casadi.export.fixed_step.source import function_code
@@ -94,7 +95,7 @@ def _constants(root: ET.Element, *, third: bool) -> None:
     for place, variable in enumerate(variables, start=1):
         if third:
             variable.attrib.pop("intermediateUpdate", None)
-        if variable.get("causality") == "parameter" and variable.get("name") != "input_line":
+        if variable.get("causality") == "parameter" and variable.get("name") not in OPTIONS:
             variable.set("causality", "local")
             variable.set("variability", "constant")
             variable.set("initial", "exact")

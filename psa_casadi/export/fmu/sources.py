@@ -15,7 +15,11 @@ import numpy as np
 from psa_casadi.component import Expression
 from psa_casadi.export.common.markup import xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
-from psa_casadi.export.common.variable_table import Variable, variable_table
+from psa_casadi.export.common.variable_table import (
+    Variable,
+    starts_at_voltage,
+    variable_table,
+)
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.validity import seen_duration, seen_inputs
@@ -28,7 +32,7 @@ from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
 LOGIC = (
     "derivatives.c", "instance.c", "instants.c", "linear.c", "log.c", "model_adjoint.c",
     "model_casadi.c", "model_directional.c", "sampling.c", "snapshot.c", "snapshot_fault.c",
-    "solver.c", "step_derivatives.c", "validity.c", "values.c",
+    "solver.c", "start.c", "step_derivatives.c", "validity.c", "values.c",
     "fmi_data.h", "instance.h", "instants.h", "linear.h", "model.h", "solver.h",
 )  # fmt: skip
 #: The files of `fmu_src` that speak one version of FMI.
@@ -94,7 +98,7 @@ def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dic
     texts |= {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[fmi]}
     texts |= generate_c(structure, sensitivities=False)
     texts["model_derivatives.c"] = _c_code(derivatives)
-    texts["fmi_config.h"] = _config(derivatives)
+    texts["fmi_config.h"] = _config(model, derivatives)
     texts["fmi_data.c"] = _data(model, variable_table(model), identifier, token)
     names = compiled_files(texts)
     flags = " ".join(OPTIMISE)
@@ -158,7 +162,7 @@ def _c_code(functions: Sequence[ca.Function]) -> str:
     return _GENERATED_HEAD + str(generator.dump())
 
 
-def _config(functions: Sequence[ca.Function]) -> str:
+def _config(model: Model, functions: Sequence[ca.Function]) -> str:
     sizes = {
         "ARG": max(8, *(f.sz_arg() for f in functions)),
         "RES": max(4, *(f.sz_res() for f in functions)),
@@ -166,6 +170,8 @@ def _config(functions: Sequence[ca.Function]) -> str:
         "W": max(1, *(f.sz_w() for f in functions)),
     }
     lines = [f"#define PSA_DERIVATIVES_SZ_{name} {size}" for name, size in sizes.items()]
+    place = model.input_names.index("voltage") if starts_at_voltage(model) else -1
+    lines.append(f"#define PSA_VOLTAGE ({place})")
     return "\n".join(["#ifndef PSA_FMI_CONFIG_H", "#define PSA_FMI_CONFIG_H", *lines, "#endif", ""])
 
 
@@ -184,6 +190,21 @@ def _row(variable: Variable) -> str:
 def _vector(name: str, size: str, values: Sequence[float]) -> str:
     body = ", ".join(_number(v) for v in [*values, 0.0])
     return f"const double {name}[{size} + 1] = {{{body}}};"
+
+
+def _settling(model: Model) -> list[str]:
+    """Return what a settled start needs to know of states and parameters."""
+    kinds = ["MEMORY_SETTLES" if q.settles else "MEMORY_STAYS" for q in model.structure.states]
+    memory = [
+        f"PSA_{kind if q.memory else 'MEMORY_NONE'}"
+        for kind, q in zip(kinds, model.structure.states, strict=True)
+    ]
+    gains = {c.gain for c in model.effects}
+    flags = [str(int(name in gains)) for name in model.parameter_names]
+    return [
+        f"const int psa_memory[PSA_NX + 1] = {{{', '.join([*memory, '0'])}}};",
+        f"const int psa_gains[PSA_NP + 1] = {{{', '.join([*flags, '0'])}}};",
+    ]
 
 
 def _switch_scales(model: Model, nominals: Sequence[float]) -> list[float]:
@@ -221,6 +242,7 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         _vector("psa_start_inputs", "PSA_NU", starts("input")),
         _vector("psa_start_parameters", "PSA_HELD", held),
         _vector("psa_state_nominals", "PSA_NX", nominals or [1.0]),
+        *_settling(model),
         _vector("psa_switch_scales", "PSA_NZ", scales),
         *_seen(model),
         "",
