@@ -60,7 +60,7 @@ def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatA
     take their samples after it, those after it.
     """
     if not has_reference(model):
-        return _simulated(model, times, inputs)
+        return simulated(model, times, inputs)
     cascade = "k_B" in model.values
     signals = {name: _signal(inputs, i) for i, name in enumerate(inputs.names)}
     found = simulate(
@@ -88,7 +88,8 @@ def _signal(inputs: Signals, column: int) -> Signal:
     return lambda t: float(values[max(bisect_left(times, t) - 1, 0)])
 
 
-def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+def simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+    """Return the same by the simulator."""
     quiet = not model.output_names
     grid = np.union1d(times, inputs.times[inputs.times <= times[-1]])
     start = np.array([s.start for s in model.structure.states])
@@ -104,6 +105,15 @@ def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
 
 def truth_of(model: Model, version: int) -> Truth:
     """Return what an FMU of a version of FMI is compared with; runs that fail are a problem."""
+    truth = bare_truth(model)
+    try:
+        return _with_runs(truth, model, held=version == 3)
+    except BREAKDOWNS as error:
+        return replace(truth, problem=str(error))
+
+
+def bare_truth(model: Model) -> Truth:
+    """Return what an FMU is compared with, without runs."""
     s = model.structure
     switches = ca.Function("z", s.arguments, [ca.vertcat(*s.switches.values())])
     names = model.output_names or model.state_names
@@ -112,11 +122,7 @@ def truth_of(model: Model, version: int) -> Truth:
         tuple(s.switches), s.f, switches, _starts(model), bool(model.sampled_names), names,
         "reference" if has_reference(model) else "simulator", np.ones(len(names)), (),
     )  # fmt: skip
-    truth = _with_settled_start(truth, model)
-    try:
-        return _with_runs(truth, model, held=version == 3)
-    except BREAKDOWNS as error:
-        return replace(truth, problem=str(error))
+    return _with_settled_start(truth, model)
 
 
 def _starts(model: Model) -> dict[str, float]:

@@ -13,7 +13,7 @@ class Run:
     """One run: where its inputs and points are, what must come of it, how far off it may be.
 
     `expected` (n, ny) at `times` (n,); `integrated` says that model exchange is used; a `tolerance`
-    of None is the importer's.
+    of None is the importer's. `scale` (ny,) and `by` are those of the truth unless given.
     """
 
     name: str
@@ -23,6 +23,8 @@ class Run:
     limit: float
     tolerance: float | None = None
     integrated: bool = False
+    scale: FloatArray | None = None
+    by: str = ""
 
 
 @dataclass(frozen=True)

@@ -66,11 +66,13 @@ def use_of(fixed: FixedStep) -> str:
     """Return what the page of the FMU says of its steps."""
     found = ", ".join(f"{e.voltage} {e.error:.1e}" for e in fixed.errors)
     output = shown_output(fixed.plan.model)
+    line = "held" if fixed.plan.held else "linear"
     return (
         f"Co-simulation takes steps of {fixed.plan.step:g} s: the same operations each time,"
         " without iteration or allocation. A communication step is a multiple of it; another one is"
         " an error. Parameters are constants, for whose values the step was made. Largest errors of"
-        f" {output} over its range, measured at export on voltages of {STEPS} steps: {found}."
+        f" {output} over its range, measured at export on voltages of {STEPS} steps, {line} over"
+        f" each: {found}."
     )
 
 

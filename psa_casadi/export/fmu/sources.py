@@ -1,12 +1,9 @@
 """The C sources of an exported model: hand-written logic, generated functions and data."""
 
-import hashlib
 import itertools
 import math
-import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import casadi as ca
@@ -20,10 +17,7 @@ from psa_casadi.export.common.variable_table import (
     starts_at_voltage,
     variable_table,
 )
-from psa_casadi.export.fmu.model_description import model_description
-from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.fmu.validity import seen_duration, seen_inputs
-from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import c_arguments, c_slopes, generate_c
 from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
@@ -71,23 +65,6 @@ Make each model a library of its own: two of them have functions of the same nam
 """
 
 
-def write_sources(
-    model: Model, directory: Path, *, name: str | None = None, fmi: int = 2
-) -> list[Path]:
-    """Write all sources of a model's FMU to a folder and return the paths, sorted.
-
-    The folder is made if it does not exist. The sources compile alone; its README.txt has the line.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    identifier = name or model.name
-    written = []
-    texts = source_files(model, identifier, export_token(model, identifier, fmi), fmi)
-    for file_name, text in sorted(texts.items()):
-        atomic_write(directory / file_name, text)
-        written.append(directory / file_name)
-    return written
-
-
 def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dict[str, str]:
     """Return the text of every file in the folder sources, by its name; `fmi` is 2 or 3."""
     structure = model.structure
@@ -111,20 +88,6 @@ def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dic
 def compiled_files(texts: Iterable[str]) -> list[str]:
     """Return the names that are C files, sorted."""
     return sorted(n for n in texts if n.endswith(".c"))
-
-
-def export_token(model: Model, identifier: str, fmi: int = 2) -> str:
-    """Return the token (GUID) of an export: a hash of its description and its sources."""
-    return token_of(model, identifier, source_files(model, identifier, "", fmi), fmi)
-
-
-def token_of(model: Model, identifier: str, texts: Mapping[str, str], fmi: int) -> str:
-    """Return the token of an export with these sources, which were made with an empty token."""
-    describe = model_description if fmi == 2 else model_description3
-    digest = hashlib.sha256(describe(model, identifier, "", compiled_files(texts)).encode("utf-8"))
-    for name, text in sorted(texts.items()):
-        digest.update(name.encode("utf-8") + b"\0" + text.encode("utf-8") + b"\0")
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16])) + "}"
 
 
 def _derivatives(structure: Structure) -> tuple[ca.Function, ca.Function]:

@@ -124,6 +124,10 @@ class Archive:
         """Return the names of the parameters that may be set between steps."""
         return [v.name for v in self.description.modelVariables if v.variability == "tunable"]
 
+    def constants(self) -> list[str]:
+        """Return the names of the constants."""
+        return [v.name for v in self.description.modelVariables if v.variability == "constant"]
+
     def names(self, causality: str) -> list[str]:
         """Return the names of the variables of one causality, in the order of the description."""
         return [v.name for v in self.description.modelVariables if v.causality == causality]
