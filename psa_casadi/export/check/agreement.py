@@ -147,7 +147,9 @@ def _with_settled_start(truth: Truth, model: Model) -> Truth:
         settled = settled_at(model, chosen).structure
     except BREAKDOWNS:  # it does not rest there
         return truth
-    starts = {q.name: q.start for q in settled.states} | {"voltage": chosen}
+    sizes = model.state_nominals().tolist()
+    starts = {q.name: (q.start, v) for q, v in zip(settled.states, sizes, strict=True)}
+    starts["voltage"] = chosen, usual
     return replace(truth, start_voltage=chosen, settled_starts=starts)
 
 

@@ -182,16 +182,15 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
 def settled_start_error(fmu: Fmu, truth: Truth) -> float:
     """Return how far states and voltage are from those of a start at another `start_voltage`.
 
-    In nominal values; they are those of the model settled there after a rise from 0 V.
+    In usual sizes; they are those of the model settled there after a rise from 0 V.
     """
-    expected = truth.settled_starts or {}
-    names = list(expected)
-    size = np.array([fmu.nominals[n] for n in names])
+    names = list(truth.settled_starts or {})
+    expected, size = np.array(list((truth.settled_starts or {}).values())).T
     worst = 0.0
     for interface in fmu.interfaces():
         values = {START_VOLTAGE: truth.start_voltage}
         with fmu.start(interface, values=values) as instance:
-            error = np.abs(instance.get(names) - list(expected.values())) / size
+            error = np.abs(instance.get(names) - expected) / size
         worst = max(worst, float(np.max(error)))
     return worst
 

@@ -33,8 +33,9 @@ class Truth:
 
     `f` and `switches` take time and the vectors of states, inputs, parameters and sampled states.
     `starts` are the values of states, inputs and outputs before anything is set, `settled_starts`
-    those of states and voltage once `start_voltage` is `start_voltage` [V]; None if they are not
-    known. `compared` names what the runs compare, `scale` (ny,) its size, `by` who computed it.
+    those of states and voltage, each with its usual size, where the FMU is told to begin settled at
+    `start_voltage` [V]; None if they are not known. `compared` names what the runs compare, `scale`
+    (ny,) its size, `by` who computed it.
     """
 
     state_names: tuple[str, ...]
@@ -52,4 +53,4 @@ class Truth:
     runs: tuple[Run, ...]
     problem: str = ""
     start_voltage: float = 0.0
-    settled_starts: dict[str, float] | None = None
+    settled_starts: dict[str, tuple[float, float]] | None = None
