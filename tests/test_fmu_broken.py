@@ -113,6 +113,12 @@ CORE = {
         "state->input.rate[index] = 0.0 * rate[i];",
         {"co-simulation, step 0.001 s"},
     ),
+    "a start without the rise": (
+        "start.c",
+        "input.rate[PSA_VOLTAGE] = state->start_voltage / RISE;",
+        "input.rate[PSA_VOLTAGE] = 0.0;",
+        {"settled start"},
+    ),
     "no line of the input": (
         "instance.c",
         "if (state->stride > 0.0)",

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE, Instance
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.instance3 import Instance3
@@ -159,7 +160,9 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
 
     That is at the start values of its states and inputs, with the outputs that follow from them.
     """
-    for interface, kind in ((CO_SIMULATION, "co-simulation"), (MODEL_EXCHANGE, "model exchange")):
+    kinds = {CO_SIMULATION: "co-simulation", MODEL_EXCHANGE: "model exchange"}
+    for interface in fmu.interfaces():
+        kind = kinds[interface]
         with fmu.start(interface) as instance:
             found = instance.get(list(truth.starts))
         others = [
@@ -174,6 +177,22 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
                 f" {len(others) - 1} more values differ; compare with the model that was exported,"
                 " with its --start-voltage and --history"
             )
+
+
+def settled_start_error(fmu: Fmu, truth: Truth) -> float:
+    """Return how far states and voltage are from those of a start at another `start_voltage`.
+
+    In usual sizes; they are those of the model settled there after a rise from 0 V.
+    """
+    names = list(truth.settled_starts or {})
+    expected, size = np.array(list((truth.settled_starts or {}).values())).T
+    worst = 0.0
+    for interface in fmu.interfaces():
+        values = {START_VOLTAGE: truth.start_voltage}
+        with fmu.start(interface, values=values) as instance:
+            error = np.abs(instance.get(names) - expected) / size
+        worst = max(worst, float(np.max(error)))
+    return worst
 
 
 def equation_error(fmu: Fmu, truth: Truth) -> float:
