@@ -99,7 +99,7 @@ def test_harmonics_of_a_periodic_drive_are_known_and_those_of_noise_are_not() ->
 
 
 def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> None:
-    time: FloatArray = np.arange(5000) * 1e-3
+    time = np.linspace(0.0, 4.999, 5000)
     triangle = Record(
         name="triangle", time=time, voltage=np.arcsin(np.sin(2.0 * np.pi * 4.0 * time))
     )
@@ -114,7 +114,7 @@ def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> No
 @pytest.mark.parametrize("hum", [49.97, 47.0])
 def test_a_hum_between_the_harmonics_of_a_periodic_drive_is_named(hum: float) -> None:
     """47 Hz is nobody's mains, and may be distortion of the drive."""
-    time: FloatArray = np.arange(2500) * 2e-3
+    time = np.linspace(0.0, 4.998, 2500)
     voltage = 50.0 + 50.0 * np.interp(time, [0, 5], [0.4, 1.0]) * np.sin(2 * np.pi * 4.0 * time)
     stack = psa.stack_model("P-885.51")
     still = psa.simulate(stack, time, voltage).outputs["displacement"]
