@@ -8,6 +8,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 
 from build_scripts.measured_data import measured_data_directory, must_be_present
+from tests.check_here import started_here
 
 #: Groups of tests that share something long, the longest first.
 LONG_GROUPS = ("platforms", "identification", "demo", "search", "verification", "browser")
@@ -38,6 +39,12 @@ def _turn(item: pytest.Item) -> int:
 
 def _place(names: Sequence[str], name: str) -> int:
     return names.index(name) if name in names else len(names)
+
+
+@pytest.fixture
+def code_runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`check_fmu` runs the code of FMUs, which must do no harm, in this process."""
+    monkeypatch.setattr("psa_casadi.export.check.check.started", started_here)
 
 
 @pytest.fixture(scope="session")

@@ -95,5 +95,5 @@ def test_an_identified_model_has_the_measured_capacitance(fast: Record) -> None:
     rows = {row[0]: row for row in parameter_table(found.model, found).rows}
     assert [rows[n][4] for n in ("C_p", "k_L")] == ["current", "fit"]
     given = replace(found.model, values={**found.model.values, "C_p": 3e-6})
-    noted = psa.identify([fast], model=given).model.provenance.notes
+    noted = psa.identify([fast.slice(0, 200)], model=given).model.provenance.notes
     assert any("keeps the 3 uF given" in n for n in noted)

@@ -180,7 +180,10 @@ def test_a_tone_whose_period_divides_a_sample_is_seen(period: float) -> None:
     [n if n == "P-885.51" else pytest.param(n, marks=slow) for n in sorted(STACKS)],
 )
 def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Mechanics) -> None:
-    """Corners at samples, given to the reference as breakpoints."""
+    """Corners at samples, given to the reference as breakpoints; by exact steps and the stepper.
+
+    The stepper is given the corners and every tenth sample only.
+    """
     p = stack_values(stack_name, mechanics)
     corners = np.array([0.0, 0.05, 0.1, 0.101, 0.15, 0.35, 0.4])
     levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
@@ -195,6 +198,12 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
         p, path, t[every], mechanics=mechanics, breakpoints=list(corners), rtol=1e-9
     )
     assert error(found.outputs["displacement"][every], true.displacement) <= RTOL
+    few = np.union1d(t[every], corners)
+    path_at_corners = np.interp(few, corners, levels)
+    own = simulate(model, few, path_at_corners, from_rest_at_zero=True, rtol=1e-10)
+    assert own.way == STEPPER
+    shown = own.outputs["displacement"][np.isin(few, t[every])]
+    assert error(shown, true.displacement) <= RTOL
 
 
 @pytest.mark.parametrize("hold", ["linear", "zero"])

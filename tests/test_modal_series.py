@@ -155,6 +155,7 @@ def test_a_fast_record_without_modes_has_none() -> None:
 
 
 @slow
+@pytest.mark.usefixtures("code_runs_here")
 def test_a_model_with_modes_becomes_an_fmu(tmp_path: Path) -> None:
     path = tmp_path / "modes.fmu"
     psa.export_fmu(with_two_modes(), path)
