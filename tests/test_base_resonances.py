@@ -55,6 +55,7 @@ def _quietly(_: str) -> None:
     pass
 
 
+@slow
 def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) -> None:
     """From the linear part's starts alone this fit ended at 1.16 times the noise."""
     truth, experiments, base = _fitted(tmp_path / "a.csv", "fast", 1)

@@ -209,7 +209,7 @@ def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
     assert "stays negative after an event" in found["event indicators"]
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
+@pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_binaries_that_cannot_be_used(fmi: int, tmp_path: Path) -> None:
     """Missing, cut off, of something else, or of a new library: found, and nothing is loaded."""
     name, content = _binary(fmi), entries(STACK, fmi)[_binary(fmi)]
