@@ -6,7 +6,7 @@
 typedef struct {
     double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1];
     double x[PSA_NX + 1]; /* states at the end of the last step */
-    int through_step;     /* one of them is asked for */
+    int through_step;     /* 1: one of them is asked for, 2: they are known, too */
 } psa_unknowns;
 
 /* Where a variable stands among the knowns, or NULL and a report. */
@@ -40,7 +40,7 @@ static double *unknown_place(psa_instance *instance, unsigned vr, psa_unknowns *
     case PSA_INDICATOR: return out->z + v->index;
     case PSA_STATE:
         if (instance->state.interface == PSA_CO_SIMULATION) {
-            out->through_step = 1;
+            if (!out->through_step) out->through_step = 1;
             return out->x + v->index;
         }
         break;

@@ -84,6 +84,7 @@ def test_measured_dependencies_are_listed() -> None:
         assert moving == {d.name for d in entry.dependencies} == listed
 
 
+@pytest.mark.usefixtures("code_runs_here")
 @VERSIONS
 @pytest.mark.parametrize("name", ["loop", "controller"])
 def test_check_passes(name: str, fmi: int) -> None:
