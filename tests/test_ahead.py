@@ -1,6 +1,5 @@
 """Models are compiled on free cores before they are asked for."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier, Event
 
@@ -14,8 +13,12 @@ from psa_casadi.simulation import ahead
 from psa_casadi.simulation.ahead import compiled, compiled_ahead
 from tests.stack_models import stack
 
-pytestmark = pytest.mark.skipif(os.cpu_count() == 1, reason="no core is free")
 PATIENCE = 10.0
+
+
+@pytest.fixture(autouse=True)
+def _two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PSA_CASADI_THREADS", "2")
 
 
 @pytest.fixture
@@ -42,7 +45,6 @@ def test_models_are_compiled_while_the_block_runs(
             all_done.set()
 
     monkeypatch.setattr(ahead, "why_not", why_not)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
     models = _with_effects(base, "slow_creep", "sensor_lag")
     with compiled_ahead(models, first=[lambda: done.append(("first",))]):
         assert all_done.wait(PATIENCE)
@@ -60,7 +62,6 @@ def test_what_has_not_begun_at_the_end_is_left_out(
         assert over.wait(PATIENCE)
 
     monkeypatch.setattr(ahead, "why_not", lambda *given: compiled_models.append(given))
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
     shutdown = ThreadPoolExecutor.shutdown
 
     def ended(pool: ThreadPoolExecutor, **how: bool) -> None:

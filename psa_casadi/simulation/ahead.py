@@ -4,7 +4,6 @@ A search simulates the base with every effect of the table, and each of these mo
 once on a machine. The fit before the search works on one core and leaves the others idle.
 """
 
-import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -14,7 +13,7 @@ from functools import partial
 from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.run import why_not
-from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.side_by_side import side_by_side, threads
 from psa_casadi.simulation.ways import output_of
 
 
@@ -27,12 +26,12 @@ def compiled_ahead(
     At the end, what has begun is finished and the rest is left out. What fails is tried again by
     whoever needs it, and fails there.
     """
-    cores = os.cpu_count() or 1
-    if cores == 1:
+    count = threads()
+    if count == 1:
         yield
         return
     works: list[Callable[[], object]] = [*first, *(partial(_compile, m) for m in models)]
-    with ThreadPoolExecutor(cores - 1) as pool:
+    with ThreadPoolExecutor(count - 1) as pool:
         for work in works:
             pool.submit(_in_context(copy_context(), work))
         try:
