@@ -69,6 +69,11 @@ BENCHES: dict[str, Bench] = {
             "hidden causes on independent plants: what is named, how surely, and how often rightly",
         ),
         _later(
+            "exam",
+            "exam",
+            "plants of another author: six kinds of hysteresis, causes in other forms, with marks",
+        ),
+        _later(
             "ablation",
             "ablation",
             "the diagnosis without each of its steps, and with each deciding constant moved",
