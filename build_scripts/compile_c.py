@@ -21,7 +21,8 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
-from psa_casadi.export.fmu.sources import write_sources
+from psa_casadi.export.fmu.texts import write_sources
+from psa_casadi.export.web.module import WEB_FLAGS, module_texts
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.codegen import generate_c
 from psa_casadi.simulation.exact.generate import generate
@@ -73,6 +74,18 @@ def write_exact(model: Model, directory: Path) -> Path:
     return directory / "exact.c"
 
 
+def page_work(
+    model: Model, directory: Path
+) -> list[tuple[Path, tuple[Path, ...], tuple[str, ...]]]:
+    """Write what is generated of a model in a page; return its files with folders and flags."""
+    directory.mkdir(parents=True)
+    for name, text in module_texts(model.structure).items():
+        (directory / name).write_text(text, encoding="utf-8")
+    here = ROOT / "fmu_src"
+    flags = (*WEB_FLAGS, "-Wall", "-Wextra", "-Werror")
+    return [(f, (directory, here / "page", here), flags) for f in sorted(here.glob("page/*.c"))]
+
+
 def main() -> int:
     """Compile all sources of a model; return 1 if the compiler complained or missed a file.
 
@@ -99,10 +112,11 @@ def main() -> int:
         work: list[tuple[Path, tuple[Path, ...], tuple[str, ...]]]
         work = [(f, (f.parent, headers), FLAGS) for f in files]
         work += [(f, (f.parent,), flags) for f in exact for flags in exactly]
+        work += page_work(compose((*BASE, *EFFECTS.values())), sources / "web")
 
         def compiled(item: tuple[Path, tuple[Path, ...], tuple[str, ...]]) -> list[str]:
             source, include, flags = item
-            print(f"{source.relative_to(sources)} {flags[-1]}\n", end="", flush=True)
+            print(f"{'/'.join(source.parts[-2:])} {flags[-1]}\n", end="", flush=True)
             return compile_strictly(source, include, objects, flags)
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -9,7 +9,7 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.examples.index import examples
 
 #: The how-to pages are recipes of `psa examples`, whose tests run what can be run.
-RECIPES = ("simulink", "dymola", "openmodelica", "omsimulator", "fmpy")
+RECIPES = ("simulink", "dymola", "openmodelica", "omsimulator", "fmpy", "own_effect")
 CHECKOUT = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
 
 _NAMED_BLOCK = re.compile(r"^```(\w+) +(\S+)$", re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Hook of mkdocs: the gallery of effects is made from the table of effects."""
+"""Hook of mkdocs: the gallery of effects is made from the table of effects, and the playground."""
 
 import tempfile
 from functools import cache
@@ -11,14 +11,18 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.residual.signature import signature
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES
+from psa_casadi.report.page.playground_page import playground
 from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
 from psa_casadi.report.words.tables import Table, effect_parameter_table
 
 PAGE, PICTURES = "effects.md", "pictures/effects"
+#: The page that runs every effect; its name with a sharp and an effect's begins with that one.
+PLAYGROUND = "playground.html"
 
 
 def on_files(files: Files, *, config: Any, **_: Any) -> Files:
-    """Add the picture of every effect's signature to the files of the site."""
+    """Add the picture of every effect's signature, and the playground, to the files of the site."""
+    files.append(File.generated(config, PLAYGROUND, content=playground()))
     for name in EFFECTS:
         content, _caption = picture(name)
         files.append(File.generated(config, f"{PICTURES}/{name}.png", content=content))
@@ -39,6 +43,8 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     return "\n\n".join(
         [
             markdown,
+            f"In the [playground]({PLAYGROUND}) each effect has a switch and sliders, under any"
+            " voltage ([how](web.md)).",
             markdown_table(overview()),
             *sections,
             "## Several modes",
@@ -61,7 +67,7 @@ def picture(name: str) -> tuple[bytes, str]:
 def overview() -> Table:
     """Return what every effect looks like, in a line each."""
     rows = tuple(
-        (f"[`{e.name}`](#{e.name})", e.belongs_to, _sentence(e.looks_like))
+        (f"[<code>{_breaking(e.name)}</code>](#{e.name})", e.belongs_to, _sentence(e.looks_like))
         for e in EFFECTS.values()
     )
     return Table(("effect", "in the", "what it looks like"), rows)
@@ -81,6 +87,7 @@ def section(effect: Component) -> str:
         path, words = f"{PICTURES}/{effect.name}.png", picture(effect.name)[1]
         shown = f"![Signature of {effect.name}. {words}]({path}){{ loading=lazy }}"
         parts.insert(4, f"[{shown}]({path})")
+        parts.insert(5, f"[Switch it on and change it]({PLAYGROUND}#{effect.name})")
     return "\n\n".join(parts)
 
 
@@ -89,6 +96,11 @@ def markdown_table(table: Table) -> str:
     rows = [table.head, ["---"] * len(table.head), *table.rows]
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in cells)
+
+
+def _breaking(name: str) -> str:
+    """Return a name that a narrow column may break behind an underscore."""
+    return name.replace("_", "_<wbr>")
 
 
 def _sentence(text: str) -> str:

@@ -6,7 +6,7 @@
 typedef struct {
     double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1];
     double x[PSA_NX + 1]; /* states at the end of the last step */
-    int through_step;     /* one of them is asked for */
+    int through_step;     /* 1: one of them is asked for, 2: they are known, too */
 } psa_unknowns;
 
 /* Where a variable stands among the knowns, or NULL and a report. */
@@ -19,7 +19,11 @@ static double *known_place(psa_instance *instance, unsigned vr, psa_knowns *in) 
     case PSA_INPUT: return in->u + v->index;
     case PSA_PARAMETER: return in->p + v->index;
     case PSA_SAMPLED: return in->p + PSA_NP + v->index;
-    case PSA_OPTION: return &in->option;
+    case PSA_OPTION:
+        if (v->index != PSA_START_VOLTAGE || instance->state.phase != PSA_INITIALIZATION)
+            return &in->option;
+        psa_say(instance, PSA_ERROR, "The derivative of a settled start by '%s' is not known.", v->name);
+        return NULL;
     default:
         psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be varied.", v->name);
         return NULL;
@@ -36,7 +40,7 @@ static double *unknown_place(psa_instance *instance, unsigned vr, psa_unknowns *
     case PSA_INDICATOR: return out->z + v->index;
     case PSA_STATE:
         if (instance->state.interface == PSA_CO_SIMULATION) {
-            out->through_step = 1;
+            if (!out->through_step) out->through_step = 1;
             return out->x + v->index;
         }
         break;
@@ -62,8 +66,9 @@ psa_result psa_directional_derivative(psa_instance *instance, const unsigned *un
         if (!place) return PSA_ERROR;
         *place += seed[i];
     }
-    const psa_result sampled = psa_sample_now(instance);
-    if (sampled != PSA_FINE) return sampled;
+    psa_result ready = psa_begin(instance);
+    if (ready == PSA_FINE) ready = psa_sample_now(instance);
+    if (ready != PSA_FINE) return ready;
     psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, in.t, in.x, in.u, in.p,
                               out.xdot, out.y, out.z))
@@ -117,8 +122,9 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
         *place += seed[i];
     }
     for (int i = 0; i < PSA_NZ; ++i) out.z[i] *= state->facing[i];
-    const psa_result sampled = psa_sample_now(instance);
-    if (sampled != PSA_FINE) return sampled;
+    psa_result ready = psa_begin(instance);
+    if (ready == PSA_FINE) ready = psa_sample_now(instance);
+    if (ready != PSA_FINE) return ready;
     psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_adjoint(state->solver.t, state->solver.x, u, state->p, out.xdot, out.y, out.z, &in.t,
                           in.x, in.u, in.p))

@@ -8,18 +8,17 @@ typedef struct {
     psa_instance core; /* first, so that a component is a core too */
     fmi2CallbackLogger logger;
     fmi2ComponentEnvironment environment;
-    int debug;
     char name[]; /* copy of the instance name */
 } component;
 
 /* A message of FMI 2.0 is a format of printf, in which #r1# stands for the name of a variable: the signs
    that begin such things are doubled. Importers that print the message as it is can read it too, which
    they could not if it came as an argument of "%s". */
-static void report(void *owner, psa_result severity, int detail, const char *sentence) {
+static void report(void *owner, psa_result severity, const char *sentence) {
     const component *const self = owner;
     char message[2 * PSA_SENTENCE];
     size_t length = 0;
-    if (!self->logger || (detail && !self->debug)) return;
+    if (!self->logger) return;
     for (; *sentence && length + 2 < sizeof message; ++sentence) {
         if (*sentence == '%' || *sentence == '#') message[length++] = *sentence;
         message[length++] = *sentence;
@@ -35,7 +34,7 @@ const char *fmi2GetVersion(void) { return fmi2Version; }
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t count,
                                const fmi2String categories[]) {
     ENTER(PSA_CALL_LOG);
-    return psa_fmi2_status(psa_choose_log(core, on != fmi2False, count, categories, &((component *)c)->debug));
+    return psa_fmi2_status(psa_choose_log(core, on != fmi2False, count, categories));
 }
 
 /* Why an instance cannot be made, or NULL. */
@@ -66,7 +65,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     memcpy(self->name, name, length);
     self->logger = given->logger;
     self->environment = given->componentEnvironment;
-    self->debug = logging != fmi2False;
+    self->core.debug = logging != fmi2False;
     self->core.report = report;
     self->core.owner = self;
     self->core.allocate = allocate;
@@ -93,6 +92,8 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
     ENTER(PSA_CALL_INITIALIZED);
+    const psa_result result = psa_begin(core);
+    if (result != PSA_FINE) return psa_fmi2_status(result);
     MOVE_TO(core->state.interface == PSA_CO_SIMULATION ? PSA_STEP_COMPLETE : PSA_EVENT);
 }
 

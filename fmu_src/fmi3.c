@@ -4,9 +4,9 @@
 
 #include "fmi3_face.h"
 
-static void report(void *owner, psa_result severity, int detail, const char *sentence) {
+static void report(void *owner, psa_result severity, const char *sentence) {
     const psa_component3 *const self = owner;
-    if (self->logger && (self->debug || !detail))
+    if (self->logger)
         self->logger(self->environment, psa_fmi3_status(severity), psa_log_category(severity), sentence);
 }
 
@@ -15,7 +15,7 @@ const char *fmi3GetVersion(void) { return "3.0"; }
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t count,
                                const fmi3String categories[]) {
     ENTER(PSA_CALL_LOG);
-    return psa_fmi3_status(psa_choose_log(core, on, count, categories, &((psa_component3 *)instance)->debug));
+    return psa_fmi3_status(psa_choose_log(core, on, count, categories));
 }
 
 /* Refuse an instance: say why and return NULL. */
@@ -36,7 +36,7 @@ static psa_component3 *instantiate(fmi3String name, fmi3String token, psa_interf
     memcpy(self->name, name, length);
     self->logger = logger;
     self->environment = environment;
-    self->debug = logging;
+    self->core.debug = logging;
     self->core.report = report;
     self->core.owner = self;
     self->core.allocate = calloc;
@@ -103,6 +103,8 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
 
 fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
     ENTER(PSA_CALL_INITIALIZED);
+    const psa_result result = psa_begin(core);
+    if (result != PSA_FINE) return psa_fmi3_status(result);
     const int events = core->state.interface == PSA_MODEL_EXCHANGE ||
                        ((psa_component3 *)instance)->event_mode_used;
     MOVE_TO(events ? PSA_EVENT : PSA_STEP_COMPLETE);

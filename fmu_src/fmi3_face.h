@@ -19,7 +19,6 @@ typedef struct {
     fmi3IntermediateUpdateCallback update;
     fmi3InstanceEnvironment environment;
     int event_mode_used, early_return_allowed;
-    int debug;
     char name[]; /* copy of the instance name */
 } psa_component3;
 

@@ -7,10 +7,13 @@
 #include "model.h"
 
 /* Value references count through the variables: time, then states, their derivatives, inputs, outputs,
-   parameters, event indicators, sampled states, each in the order of the model's vectors, and last, if
-   there are inputs, the option input_line. */
+   parameters, event indicators, sampled states, each in the order of the model's vectors, and last the
+   options: input_line if there are inputs, start_voltage if PSA_VOLTAGE is the place of the voltage among
+   them, not -1. */
 #define PSA_FIRST_STATE 1
-#define PSA_VARIABLES (1 + 2 * PSA_STATES + PSA_NU + PSA_NY + PSA_NP + PSA_NZ + PSA_NS + (PSA_NU > 0))
+#define PSA_VARIABLES \
+    (1 + 2 * PSA_STATES + PSA_NU + PSA_NY + PSA_NP + PSA_NZ + PSA_NS + (PSA_NU > 0) + (PSA_VOLTAGE >= 0))
+#define PSA_START_VOLTAGE 1 /* index of this option; that of input_line is 0 */
 
 typedef enum {
     PSA_TIME,
@@ -38,6 +41,11 @@ extern const double psa_start_states[PSA_NX + 1];
 extern const double psa_start_inputs[PSA_NU + 1];
 extern const double psa_start_parameters[PSA_HELD + 1]; /* behind them the sampled states */
 extern const double psa_state_nominals[PSA_NX + 1];
+/* What a settled start needs: whether a state remembers what came before, and with what rest; whether a
+   parameter is the gain of an effect. */
+enum { PSA_MEMORY_NONE, PSA_MEMORY_SETTLES, PSA_MEMORY_STAYS };
+extern const int psa_memory[PSA_NX + 1];
+extern const int psa_gains[PSA_NP + 1];
 /* What the states' nominal values move each switch by: the size of its noise at a tolerance of 1. */
 extern const double psa_switch_scales[PSA_NZ + 1];
 

@@ -100,6 +100,9 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     memcpy(state->given, psa_start_inputs, sizeof state->given);
     memcpy(state->earlier, psa_start_inputs, sizeof state->earlier);
     memcpy(state->p, psa_start_parameters, sizeof state->p);
+#if PSA_VOLTAGE >= 0
+    state->start_voltage = psa_start_inputs[PSA_VOLTAGE];
+#endif
     for (int i = 0; i < PSA_NZ; ++i) state->facing[i] = 1.0;
     state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
     state->phase = PSA_INSTANTIATED;
@@ -303,12 +306,8 @@ static psa_result advance(psa_instance *instance, psa_end end) {
     const psa_status status = run_solver(instance);
     remember_inputs(state, begin);
     psa_arrive(instance);
-#ifdef PSA_FIXED_STEP
-    (void)steps, (void)rejected; /* the sentence would take as long as the step */
-#else
     psa_whisper(instance, "Step from %.9g s to %.9g s: %ld solver steps, %ld rejected.", begin, solver->t,
             (long)(solver->steps - steps), (long)(solver->rejected - rejected));
-#endif
     if (status == PSA_OK) return PSA_FINE;
     state->phase = PSA_STEP_FAILED;
     state->last.kind = PSA_STEP_BROKEN;

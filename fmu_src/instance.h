@@ -86,6 +86,10 @@ typedef struct {
     double given[PSA_NU + 1];   /* last */
     double earlier[PSA_NU + 1]; /* that the last step started with */
     double stride;              /* length of that step; 0: there is none, or an event came after it */
+    /* The parameter start_voltage; what was set by itself before the first step, and so does not follow
+       it; whether the states of now are older than what they follow from. */
+    double start_voltage;
+    int64_t own_start[PSA_NX + 1], voltage_given, start_due;
     /* An event indicator is facing * switch + margin. Facing changes its sign at an event, so that the
        noise of an importer's solver about a held input makes no further ones. */
     double facing[PSA_NZ + 1];
@@ -103,8 +107,8 @@ typedef struct {
 
 #define PSA_SENTENCE 512 /* bytes of the longest one that an instance says, with its end */
 
-/* Receives a sentence; `detail` is 1 for what only debug logging shows. */
-typedef void psa_reporter(void *owner, psa_result severity, int detail, const char *sentence);
+/* Receives a sentence. */
+typedef void psa_reporter(void *owner, psa_result severity, const char *sentence);
 
 /* Called between two solver steps of a communication step. `more` is 0 at its end. Returns 1 to end the
    communication step earlier, at the time written to `end`. */
@@ -119,6 +123,7 @@ typedef struct {
     psa_end goal;       /* end of that step */
     double start_time;
     int outside_told;     /* that the instance has left what the records have shown */
+    int debug;            /* what only debug logging shows is reported too */
     psa_reporter *report; /* may be NULL */
     void *owner;
     void *(*allocate)(size_t count, size_t size);
@@ -132,10 +137,9 @@ psa_result psa_say(psa_instance *instance, psa_result result, const char *format
 void psa_whisper(psa_instance *instance, const char *format, ...);
 /* Report a missing array: 1 if count > 0 and a pointer is NULL. */
 int psa_lacks(psa_instance *instance, size_t count, const void *first, const void *second);
-/* Log category of a severity, and the choice of categories: `debug` follows that of the solver. */
+/* Log category of a severity, and the choice of categories: debug logging is that of the solver. */
 const char *psa_log_category(psa_result severity);
-psa_result psa_choose_log(psa_instance *instance, int on, size_t count,
-                          const char *const *categories, int *debug);
+psa_result psa_choose_log(psa_instance *instance, int on, size_t count, const char *const *categories);
 
 /* instance.c: life cycle and steps */
 void psa_instance_start(psa_instance *instance, psa_interface interface);
@@ -150,6 +154,14 @@ psa_result psa_do_step(psa_instance *instance, double point, double size, psa_up
                        int *early);
 /* Why an instance of this name and token cannot be made, or NULL. */
 const char *psa_objection(const char *name, const char *token);
+
+/* start.c: the parameter start_voltage, until the initialization ends */
+/* Bring the states to what it makes them, where they are older. */
+psa_result psa_begin(psa_instance *instance);
+/* Set it; the voltage follows it unless that was set by itself. */
+void psa_start_at(psa_instance *instance, double voltage);
+/* Another variable was set. */
+void psa_start_changed(psa_instance *instance, const psa_variable *v);
 
 /* sampling.c: sampled states between their instants. In co-simulation the instant at a communication
    point belongs to the step that starts there, and outputs are read as if it had happened. */

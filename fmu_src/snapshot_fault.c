@@ -87,6 +87,14 @@ static const char *sampling_fault(const psa_state *state) {
     return fabs(state->next_instant - state->solver.t) <= 4.0 * period ? NULL : "the next sample instant";
 }
 
+static const char *start_fault(const psa_state *state) {
+    for (int i = 0; i < PSA_NX; ++i)
+        if (!is_flag(state->own_start[i])) return "a flag";
+    if (!is_flag(state->voltage_given) || !is_flag(state->start_due)) return "a flag";
+    if (state->start_due && !(state->phase & (PSA_INSTANTIATED | PSA_INITIALIZATION))) return "a flag";
+    return isfinite(state->start_voltage) ? NULL : "the voltage of the start";
+}
+
 const char *psa_state_fault(const psa_state *state) {
     const char *const fault = fault_at(&state->solver, &state->input, state->p);
     const char *const in_phase = phase_fault(state), *const in_last = last_fault(&state->last);
@@ -101,5 +109,6 @@ const char *psa_state_fault(const psa_state *state) {
         if (fabs(state->facing[i]) != 1.0) return "an event indicator";
     if (!(state->event_margin > 0.0 && state->event_margin <= 1.0)) return "the margin of events";
     if (isnan(state->stop_time) || !is_flag(state->stop_defined)) return "the stop time";
-    return sampling_fault(state);
+    const char *const in_start = start_fault(state);
+    return in_start ? in_start : sampling_fault(state);
 }

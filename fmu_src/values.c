@@ -7,7 +7,8 @@ psa_result psa_refresh(psa_instance *instance) {
     const psa_state *const state = &instance->state;
     double u[PSA_NU + 1];
     if (instance->fresh) return PSA_FINE;
-    const psa_result result = psa_sample_now(instance);
+    psa_result result = psa_begin(instance);
+    if (result == PSA_FINE) result = psa_sample_now(instance);
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.since, u);
     psa_watch_range(instance, u, NULL);
@@ -45,28 +46,37 @@ static double value_of(const psa_instance *instance, const psa_variable *v) {
     case PSA_OUTPUT: return instance->y[v->index];
     case PSA_INDICATOR: return instance->z[v->index];
     case PSA_SAMPLED: return sampled_value(&instance->state, v->index);
-    case PSA_OPTION: return instance->state.line;
+    case PSA_OPTION: return v->index == PSA_START_VOLTAGE ? instance->state.start_voltage : instance->state.line;
     default: return instance->state.p[v->index];
     }
 }
 
+/* Bring what a kind of variables follows from up to date. */
+static psa_result up_to_date(psa_instance *instance, psa_kind kind) {
+    switch (kind) {
+    case PSA_STATE: return psa_begin(instance);
+    case PSA_DERIVATIVE:
+    case PSA_OUTPUT:
+    case PSA_INDICATOR:
+    case PSA_SAMPLED: return psa_refresh(instance);
+    default: return PSA_FINE;
+    }
+}
+
 psa_result psa_get(psa_instance *instance, const unsigned *vr, size_t count, double *value) {
-    psa_result result = PSA_FINE;
+    psa_result worst = PSA_FINE;
     if (psa_lacks(instance, count, vr, value)) return PSA_ERROR;
     for (size_t i = 0; i < count; ++i) {
         const psa_variable *const v = psa_variable_of(instance, vr[i]);
         if (!v) return PSA_ERROR;
-        if (v->kind == PSA_DERIVATIVE || v->kind == PSA_OUTPUT || v->kind == PSA_INDICATOR ||
-            v->kind == PSA_SAMPLED) {
-            result = psa_refresh(instance);
-            if (result != PSA_FINE) return result;
-        }
+        const psa_result result = up_to_date(instance, v->kind);
+        if (result != PSA_FINE) return result;
         value[i] = value_of(instance, v);
         if (!isfinite(value[i]))
-            result = psa_say(instance, PSA_DISCARD, "'%s' is not finite at t = %.9g s.", v->name,
-                             instance->state.solver.t);
+            worst = psa_say(instance, PSA_DISCARD, "'%s' is not finite at t = %.9g s.", v->name,
+                            instance->state.solver.t);
     }
-    return result;
+    return worst;
 }
 
 /* A variable may be set if it is an input, a parameter, or a state that no solver in here is using: in
@@ -110,6 +120,10 @@ static void set_one(psa_instance *instance, const psa_variable *v, double value)
         if (!state->rate_given[v->index]) state->input.rate[v->index] = 0.0;
         return;
     }
+    if (v->kind == PSA_OPTION && v->index == PSA_START_VOLTAGE) {
+        psa_start_at(instance, value);
+        return;
+    }
     if (v->kind == PSA_OPTION) {
         state->line = value;
         return;
@@ -130,7 +144,10 @@ psa_result psa_set(psa_instance *instance, const unsigned *vr, size_t count, con
         if (result > worst) worst = result;
     }
     if (worst != PSA_FINE) return worst;
-    for (size_t i = 0; i < count; ++i) set_one(instance, &psa_variables[vr[i]], value[i]);
+    for (size_t i = 0; i < count; ++i) {
+        set_one(instance, &psa_variables[vr[i]], value[i]);
+        psa_start_changed(instance, &psa_variables[vr[i]]);
+    }
     instance->fresh = 0;
     return PSA_FINE;
 }

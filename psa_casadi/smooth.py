@@ -4,6 +4,9 @@ import casadi as ca
 
 from psa_casadi.component import Expression, Symbols
 
+#: Exponent of the smooth stop; 2 bends gently, infinity is the ideal stop operator.
+_SHARPNESS = 4.0
+
 
 def direction(s: Symbols) -> Expression:
     """Return the sign of the voltage rate, `s(u') = u' / sqrt(u'^2 + hold_rate^2)` [1].
@@ -40,3 +43,12 @@ def magnitude_power(value: Expression, exponent: Expression) -> Expression:
 def signed_power(value: Expression, exponent: Expression) -> Expression:
     """Return `sign(value) |value|^exponent`, smooth at 0 like `magnitude_power`."""
     return value * (value**2 + 1e-24) ** ((exponent - 1) / 2)
+
+
+def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
+    """Rate of a smooth stop element: z' = u' - (|u'| sgn(z) + u') / 2 * |z / threshold|^m."""
+    ratio = z / threshold
+    return s.voltage_rate - 0.5 * (
+        rate_magnitude(s) * signed_power(ratio, _SHARPNESS)
+        + s.voltage_rate * magnitude_power(ratio, _SHARPNESS)
+    )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from html import unescape
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -94,6 +95,7 @@ class Browser:
         axe = files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
         text = page.read_text(encoding="utf-8")
         copy = page.with_name(f"{page.stem}-axe.html")  # beside it: its links are relative
+        text = without_policy(text)
         looked = f"<script>{axe}</script>{_AXE}</body>".join(text.rsplit("</body>", 1))
         copy.write_text(looked, encoding="utf-8")
         try:
@@ -119,6 +121,37 @@ class Browser:
         )
 
 
+def without_policy(text: str) -> str:
+    """Return a page that lets scripts in which are not its own: those of a test."""
+    return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text, count=1)
+
+
+def driven(
+    browser: Browser, page: Path, script: str, *flags: str, silent: bool = True, timed: bool = False
+) -> Any:
+    """Run a script in a copy of a page when all is drawn, and return what it passes to `tell`.
+
+    Where it is to be `silent`, a word on the console fails the test. A `timed` script runs before
+    the page is loaded: afterwards the clock of this browser stands still while a script runs.
+    """
+    copy = page.with_name(f"{page.stem}-driven.html")
+    tell = "document.getElementById('driven').textContent = JSON.stringify(found);"
+    wait = "window.addEventListener('load', () => setTimeout(() => {", "}, 500));"
+    begin, last = ("", "") if timed else wait
+    call = (
+        f"<pre id='driven'></pre><script>function tell(found) {{ {tell} }}"
+        f"{begin}{script}{last}</script></body>"
+    )
+    text = call.join(without_policy(page.read_text(encoding="utf-8")).rsplit("</body>", 1))
+    copy.write_text(text, encoding="utf-8")
+    document, console = browser.document(copy, *flags)
+    copy.unlink()
+    found = re.search(r"<pre id=.driven.>(.*?)</pre>", document, re.DOTALL)
+    if found is None or not found[1] or (silent and console):
+        pytest.fail(f"the script in {page} did not come to its end: {console}")
+    return json.loads(unescape(found[1]))
+
+
 def find_browser(folder: Path) -> Browser:
     """Return a browser; without one the test is skipped, or fails where one is required."""
     path = next((p for p in map(shutil.which, NAMES) if p), None)
@@ -134,6 +167,7 @@ def on_a_phone(page: Path, height: int = 844) -> Path:
     """Return a page that shows `page` in a frame as wide as a phone, and how it came out."""
     inner, outer = (page.with_name(f"{page.stem}-{part}.html") for part in ("inner", "phone"))
     text = page.read_text(encoding="utf-8")
+    text = without_policy(text)
     inner.write_text(text.replace("</body>", f"{_REPORTER}</body>"), encoding="utf-8")
     outer.write_text(
         "<!DOCTYPE html><html><body style='margin:0'><script>addEventListener('message',"

@@ -1,13 +1,19 @@
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 # before NumPy is loaded: several threads in each of the test processes get in each other's way
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
+    os.environ.setdefault("PSA_CASADI_THREADS", "1")
+# hundreds of Python processes are started, and each would compile the package again
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
 
 from build_scripts.measured_data import measured_data_directory, must_be_present
+from tests.check_here import started_here
 
 #: Groups of tests that share something long, the longest first.
 LONG_GROUPS = ("platforms", "identification", "demo", "search", "verification", "browser")
@@ -15,6 +21,7 @@ LONG_GROUPS = ("platforms", "identification", "demo", "search", "verification", 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let a test file that is named run whole: the quick tier is of all files together."""
+    sys.dont_write_bytecode = False
     if hasattr(config, "workerinput"):  # a process of pytest-xdist does what the first one says
         return
     chosen = any(str(word).startswith("-m") for word in config.invocation_params.args)
@@ -38,6 +45,12 @@ def _turn(item: pytest.Item) -> int:
 
 def _place(names: Sequence[str], name: str) -> int:
     return names.index(name) if name in names else len(names)
+
+
+@pytest.fixture
+def code_runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`check_fmu` runs the code of FMUs, which must do no harm, in this process."""
+    monkeypatch.setattr("psa_casadi.export.check.check.started", started_here)
 
 
 @pytest.fixture(scope="session")

@@ -95,12 +95,11 @@ def with_periodic(d: Diagnosis, *, counts: bool = False) -> Diagnosis:
                    base=(base,), extended=(y,))  # fmt: skip
 
 
-def _fit(model: Model) -> Fit:
-    free = ("k_L", "tau")
-    empty = np.zeros((0, 2))
-    return Fit(model, unknowns_of(model, free, [{}], [0.0], 1e-6), np.zeros(3), np.zeros(0), empty,
-               (NOISE,), 0.0, True, False, 1, Way(1e-6, 1e-6),
-               (Simulated(EXACT, 0.0),))  # fmt: skip
+def _fit(model: Model, records: int) -> Fit:
+    unknowns = unknowns_of(model, ("k_L", "tau"), [{}] * records, [0.0] * records, 1e-6)
+    empty, levels = np.zeros((0, unknowns.size)), (NOISE,) * records
+    return Fit(model, unknowns, np.zeros(unknowns.size), np.zeros(0), empty, levels, 0.0, True,
+               False, 1, Way(1e-6, 1e-6), (Simulated(EXACT, 0.0),))  # fmt: skip
 
 
 def diagnosis(
@@ -139,8 +138,8 @@ def diagnosis(
         next_experiment=NextExperiment(None, (), "Hold the voltage for a minute."),
         notes=("Forces are assumed.",),
         experiments=tuple(p[0] for p in parts),
-        base_fit=_fit(compose(BASE)),
-        extended_fit=_fit(model),
+        base_fit=_fit(compose(BASE), len(names)),
+        extended_fit=_fit(model, len(names)),
         base=base,
         extended=tuple(p[2] for p in parts) if added else base,
         model=model,

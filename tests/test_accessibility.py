@@ -27,6 +27,7 @@ SITE = (
     "tutorials/laboratory_to_fmu/index.html",
     "commands/index.html",
     "python/index.html",
+    "json/index.html",
 )
 
 

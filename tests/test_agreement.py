@@ -123,18 +123,3 @@ def test_displacement_agrees_with_the_reference(
     ):
         difference = np.abs(found.outputs[name][every] - wanted).max()
         assert difference < 1e-5 * np.ptp(wanted), name
-
-
-@pytest.mark.parametrize("stack", slow_but(["P-885.51", "PTBS200"], sorted(STACKS)))
-def test_a_slow_path_with_holds_agrees(stack: str) -> None:
-    """A path of ramps and holds from 1 ms to 0.2 s; only its corners and 40 instants are given."""
-    p = stack_values(stack, "cascade")
-    corners = np.array([0.0, 0.05, 0.1, 0.101, 0.15, 0.35, 0.4])
-    levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
-    t = np.union1d(np.linspace(0.0, 0.4, 41), corners)
-    path = reference.from_samples(corners, levels)
-    true = reference.simulate(p, path, t, breakpoints=list(corners), rtol=1e-9)
-    model = compose(BASE, p)
-    found = simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True, rtol=1e-10)
-    error = np.abs(found.outputs["displacement"] - true.displacement).max()
-    assert error < 1e-6 * np.ptp(true.displacement)

@@ -206,6 +206,8 @@ def _model_with(component: Component) -> Model:
             return part_model(part.name)
     if component in SIMPLIFIED and component not in BASE:
         return compose(SIMPLIFIED)
+    if component.name == "memory_spectrum":
+        return compose([component if c.name == "bouc_wen" else c for c in BASE])
     added = [component] if component not in (*BASE, *ALL) else []
     model = compose([*BASE, *ALL, *added])
     assert component in model.components

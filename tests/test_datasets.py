@@ -3,7 +3,7 @@
 import hashlib
 import http.server
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,12 +15,13 @@ from typer.testing import CliRunner
 from psa_casadi import datasets
 from psa_casadi.cli.datasets import datasets as command
 from psa_casadi.cli.failures import guarded
-from psa_casadi.datasets.fetching import DATA_VARIABLE, convert
-from psa_casadi.datasets.published import DATASETS, Dataset, Extract
+from psa_casadi.datasets import DATASETS, Dataset
+from psa_casadi.datasets.conversions.columns import Columns
+from psa_casadi.datasets.fetching import DATA_VARIABLE
 from psa_casadi.errors import InputError, PsaError
 
 TABLE = "".join(f"{k:.6f}\t9.000000\t{k * 1.8:.6f}\t{-0.5 * k:.6f}\r\n" for k in range(40)).encode()
-PART = Extract(first_row=3, rows=20, voltage=2, displacement=3, sample_rate=200.0)
+PART = Columns(first_row=3, rows=20, voltage=2, displacement=3, sample_rate=200.0)
 
 
 def psa(*arguments: str | Path) -> tuple[int, str, str]:
@@ -63,9 +64,9 @@ def publish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, b
 
     def make(url: str, table: bytes) -> Dataset:
         first = DATASETS["micromanipulator"].files[0]
-        original = replace(first.original, name="table.dat", url=url, sha256=sha(table))
-        csv = sha(convert(TABLE, PART))
-        file = replace(first, name="part.csv", sha256=csv, original=original, extract=PART)
+        original = replace(first.originals[0], name="table.dat", url=url, sha256=sha(table))
+        csv = sha(PART.csv([TABLE]))
+        file = replace(first, name="part.csv", sha256=csv, originals=(original,), conversion=PART)
         small = replace(DATASETS["micromanipulator"], name="small", files=(file,))
         monkeypatch.setitem(DATASETS, "small", small)
         return small
@@ -88,7 +89,36 @@ def test_a_table_becomes_a_record(
     np.testing.assert_allclose(record.voltage, k * 1.8, rtol=1e-12)
     np.testing.assert_allclose(record.displacement, -0.5e-6 * k, rtol=1e-12)
     assert record.sha256 == DATASETS["small"].files[0].sha256
+    assert datasets.originals("small")["table.dat"].read_bytes() == TABLE
     assert Path(record.source).is_relative_to(tmp_path / "cache")
+
+
+class Halves:
+    """Makes the record of a table that is published in two files."""
+
+    words = "both halves of the table"
+
+    def csv(self, originals: Sequence[bytes]) -> bytes:
+        first, second = originals
+        return PART.csv([first + second])
+
+
+def test_a_record_may_be_made_of_several_originals(
+    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    dataset = publish(served, TABLE)
+    (file,) = dataset.files
+    halves = []
+    for name, part in (("first.dat", TABLE[:700]), ("second.dat", TABLE[700:])):
+        (tmp_path / "published" / name).write_bytes(part)
+        url = served.replace("table.dat", name)
+        halves.append(replace(file.originals[0], name=name, url=url, sha256=sha(part)))
+    split = replace(file, originals=tuple(halves), conversion=Halves())
+    monkeypatch.setitem(DATASETS, "small", replace(dataset, files=(split,)))
+    assert datasets.paths("small")[0].read_bytes() == PART.csv([TABLE])
+    text = datasets.origin_text(DATASETS["small"])
+    assert "From first.dat, second.dat: both halves of the table." in text
 
 
 def test_what_was_downloaded_is_kept_and_what_was_spoilt_is_made_again(
@@ -134,11 +164,15 @@ def test_a_folder_is_taken_as_it_is_or_refused(
         datasets.load("small")
     path = tmp_path / "small" / "part.csv"
     path.parent.mkdir()
-    path.write_bytes(convert(TABLE, PART).replace(b"0.005,", b"0.006,"))
+    path.write_bytes(PART.csv([TABLE]).replace(b"0.005,", b"0.006,"))
     with pytest.raises(InputError, match="is not the published record, its SHA-256 differs"):
         datasets.load("small")
-    path.write_bytes(convert(TABLE, PART))
+    path.write_bytes(PART.csv([TABLE]))
     assert datasets.load("small")[0].source == str(path)
+    with pytest.raises(InputError, match=r"table\.dat: there is no such file"):
+        datasets.originals("small")
+    (path.parent / "table.dat").write_bytes(TABLE)
+    assert list(datasets.originals("small")) == ["table.dat"]
 
 
 def test_the_measured_records_are_the_published_ones(
@@ -157,11 +191,13 @@ def test_every_dataset_says_what_it_is(dataset: Dataset) -> None:
         assert part in text
     assert dataset.licence.split(",")[0] in dataset.licence_text
     for file in dataset.files:
-        assert file.original.url.startswith("https://")
-        assert file.original.url.endswith(f"/{file.original.name}")
-        for digest in (file.sha256, file.original.sha256):
-            assert len(bytes.fromhex(digest)) == 32
-        assert file.extract.rows >= 16
+        assert file.conversion.words in text
+        assert len(bytes.fromhex(file.sha256)) == 32
+        for original in file.originals:
+            assert original.url.startswith("https://")
+            assert original.url.endswith(f"/{original.name}")
+            assert len(bytes.fromhex(original.sha256)) == 32
+            assert original.url in text
 
 
 def test_the_command_lists_shows_and_writes(
@@ -176,7 +212,7 @@ def test_the_command_lists_shows_and_writes(
     assert "part.csv" in out
     kept = sorted((tmp_path / "new" / "place").iterdir())
     assert [p.name for p in kept] == ["part.csv", "small_licence.txt"]
-    assert kept[0].read_bytes() == convert(TABLE, PART)
+    assert kept[0].read_bytes() == PART.csv([TABLE])
     assert kept[1].read_text() == datasets.origin_text(dataset)
 
 

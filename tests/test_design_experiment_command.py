@@ -25,6 +25,7 @@ def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None
         "design", "experiment", "--stack", STACK, "--duration", "0.5", "--samples", "60",
         "--high", "60", "--current", "0.01", "--family", "triangles", "--starts", "1",
         "--separate", "sensor_nonlinearity", "slow_creep", "-o", str(output), "--report", str(page),
+        "--still",
     ]  # fmt: skip
     found = CliRunner().invoke(app, arguments)
     assert found.exit_code == 0, found.output

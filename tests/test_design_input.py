@@ -154,7 +154,7 @@ def test_the_command_writes_voltage_and_page(tmp_path: Path) -> None:
         {"time [s]": path.time, "displacement [um]": 1e6 * path.displacement},
     )
     arguments = ["design", "input", "--model", str(tmp_path / "m.json"), "-o", str(out)]
-    more = ["--target", str(tmp_path / "p.csv"), "--report", str(tmp_path / "r.html")]
+    more = ["--target", str(tmp_path / "p.csv"), "--report", str(tmp_path / "r.html"), "--still"]
     found = CliRunner().invoke(app, [*arguments, *more])
     assert found.exit_code == 0, found.output
     rows = [line for line in found.output.splitlines() if line.startswith("designed")]
@@ -217,7 +217,7 @@ def test_a_measured_trial_corrects_the_voltage(tmp_path: Path) -> None:
     psa.write_record(folder / "t.csv", {"time [s]": path.time, **measured})
     words = ["design", "input", "--model", str(folder / "m.json"), "-o", str(folder / "c.csv")]
     words += ["--target", str(folder / "p.csv"), "--measured", str(folder / "t.csv")]
-    found = CliRunner().invoke(app, [*words, "--report", str(folder / "c.html")])
+    found = CliRunner().invoke(app, [*words, "--report", str(folder / "c.html"), "--still"])
     assert found.exit_code == 0, found.output
     again = creeping_displacement(values, path.time, psa.read_record(folder / "c.csv").voltage)
     assert error_of(path, again).rms < 0.5 * error_of(path, shown).rms

@@ -1,10 +1,12 @@
 """What records know of parameters that they leave open, in words."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from psa_casadi.identification.certainty.combinations import Combination, free_combinations
-from psa_casadi.identification.certainty.determinacy import Determinacy
+from psa_casadi.identification.certainty.determinacy import Determinacy, covariance_of
 from psa_casadi.identification.certainty.formulas import physical_formulas
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import simulate
@@ -126,3 +128,15 @@ def test_what_is_determined_or_free_by_itself_has_no_formula() -> None:
     assert first.known is None
     assert first.parameters == ("delta", "c_P")
     assert first.sentence == "delta and c_P are free: these records hardly depend on any of them."
+
+
+@pytest.mark.parametrize("samples", [20, 90, 400])
+def test_slow_residuals_leave_no_negative_variance(samples: int) -> None:
+    """Of residuals that swing slowly the correlation, cut off at its last lag, is none."""
+    found, experiments, _ = loops("P-885.51")
+    count = len(found.residuals)
+    slow = found.sigma[0] * np.sin(2.0 * np.pi * np.arange(count) / samples)
+    covariance = covariance_of(replace(found, residuals=slow), experiments)
+    sizes = np.linalg.eigvalsh(covariance)
+    assert sizes[0] >= -1e-9 * sizes[-1]
+    assert np.all(np.diag(covariance) > 0.0)

@@ -11,7 +11,7 @@ import psa_casadi as psa
 from psa_casadi.diagnosis.held_out.errors import gain_of
 from psa_casadi.diagnosis.noise.colour import colour_of
 from psa_casadi.diagnosis.noise.residual_tests import omnibus
-from psa_casadi.records.drive import among_harmonics, drive_frequency
+from psa_casadi.records.drive import among_harmonics, drive_frequency, mains_line
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -96,6 +96,35 @@ def test_harmonics_of_a_periodic_drive_are_known_and_those_of_noise_are_not() ->
     noise = Record(name="noise", time=time, voltage=np.random.default_rng(0).standard_normal(N))
     assert drive_frequency(noise) is None
     assert not among_harmonics(2.0, noise)
+
+
+def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> None:
+    time = np.linspace(0.0, 4.999, 5000)
+    triangle = Record(
+        name="triangle", time=time, voltage=np.arcsin(np.sin(2.0 * np.pi * 4.0 * time))
+    )
+    assert among_harmonics(49.97, triangle)
+    assert mains_line(49.97, triangle)
+    assert mains_line(60.02, triangle) is False  # the drive's fifteenth harmonic
+    assert not mains_line(47.0, triangle)
+    noise = Record(name="noise", time=time, voltage=np.random.default_rng(0).standard_normal(5000))
+    assert mains_line(60.02, noise)
+
+
+@pytest.mark.parametrize("hum", [49.97, 47.0])
+def test_a_hum_between_the_harmonics_of_a_periodic_drive_is_named(hum: float) -> None:
+    """47 Hz is nobody's mains, and may be distortion of the drive."""
+    time = np.linspace(0.0, 4.998, 2500)
+    voltage = 50.0 + 50.0 * np.interp(time, [0, 5], [0.4, 1.0]) * np.sin(2 * np.pi * 4.0 * time)
+    stack = psa.stack_model("P-885.51")
+    still = psa.simulate(stack, time, voltage).outputs["displacement"]
+    rng = np.random.default_rng(3)
+    noise = 2e-3 * np.ptp(still) * rng.standard_normal(time.size)
+    line = 3e-3 * np.ptp(still) * np.sin(2.0 * np.pi * hum * time + 0.7)
+    record = Record(name="hum", time=time, voltage=voltage, displacement=still + noise + line)
+    effects = [psa.EFFECTS["mains_hum"], psa.EFFECTS["slow_creep"], psa.EFFECTS["structural_mode"]]
+    found = psa.diagnose([record], effects=effects)
+    assert [c.effect for c in found.causes] == (["mains_hum"] if hum > 48.0 else [])
 
 
 def test_gain_is_the_reduction_of_the_held_out_rms() -> None:

@@ -137,7 +137,7 @@ def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) 
     paths = {n: tmp_path / n for n in ("ext.json", "patched.json", "d.json", "r.html")}
     said = done(
         "diagnose", tmp_path / "r.csv", "-o", paths["ext.json"], "--patch", paths["patched.json"],
-        "--json", paths["d.json"], "--report", paths["r.html"],
+        "--json", paths["d.json"], "--report", paths["r.html"], "--still",
     ).stdout  # fmt: skip
     told = json.loads(paths["d.json"].read_text(encoding="utf-8"))
     assert told["verdict"] == "unexplained"

@@ -33,7 +33,7 @@ def text(tmp_path_factory: pytest.TempPathFactory) -> str:
         combinations=(Combination(("k_L", "A"), "k_L + A", 1e-3, "k_L and A only as their sum"),),
         advice=(Advice("Hold 60 V.", ("tau",), None),),
     )
-    write_fit_report(found, path, origin="synthetic")
+    write_fit_report(found, path, origin="synthetic", still=True)
     assert [p.name for p in path.parent.iterdir()] == ["fit.html"]
     return path.read_text(encoding="utf-8")
 
@@ -80,7 +80,7 @@ def test_a_model_without_fitted_parameters_has_its_page() -> None:
 
 
 def test_every_colour_of_a_plot_has_a_counterpart_at_night(text: str, tmp_path: Path) -> None:
-    write_report(diagnosis("cause_named"), tmp_path / "d.html")
+    write_report(diagnosis("cause_named"), tmp_path / "d.html", still=True)
     other = (tmp_path / "d.html").read_text(encoding="utf-8")
     for page in (text, other):
         used = set(re.findall(r'"(#[0-9a-fA-F]{3,8})"', str(figures(page)).replace("'", '"')))
@@ -90,7 +90,7 @@ def test_every_colour_of_a_plot_has_a_counterpart_at_night(text: str, tmp_path: 
 
 def test_a_fit_report_that_cannot_be_written_is_the_users_problem(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        write_fit_report(identification(), tmp_path / "absent" / "x.html")
+        write_fit_report(identification(), tmp_path / "absent" / "x.html", still=True)
 
 
 def test_parameters_are_graded_as_the_determinacy_says() -> None:

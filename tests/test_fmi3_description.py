@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.common.variable_table import OPTIONS, variable_table
 from psa_casadi.export.fmu.dependencies import dependencies
 from psa_casadi.export.fmu.model_description import model_description
 from psa_casadi.export.fmu.model_description3 import model_description3
@@ -38,7 +38,7 @@ def test_variables(name: str) -> None:
     for v in variables:
         if v.attrib["name"].startswith("der("):
             assert v.attrib["name"] == f"der({by_reference[int(v.attrib['derivative'])]})"
-        between = v.attrib["name"] in (*model_named(name).parameter_names, "input_line")
+        between = v.attrib["name"] in (*model_named(name).parameter_names, *OPTIONS)
         between = between or v.attrib["name"].startswith("switch.")
         assert ("intermediateUpdate" in v.attrib) == (not between and v is not variables[0])
         assert ("initial" in v.attrib) == (v.attrib["causality"] not in ("input", "independent"))

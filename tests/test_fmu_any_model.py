@@ -61,6 +61,7 @@ MODELS: dict[str, Callable[[], Model]] = {
 }
 
 
+@pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 @pytest.mark.parametrize("name", slow_but(["switch by a state", "no output"], MODELS))
 def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) -> None:
@@ -69,6 +70,7 @@ def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) 
 
 
 @slow
+@pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_a_wired_system_passes_the_check(fmi: int, tmp_path: Path) -> None:
     """Its switches follow states and held commands, not the inputs."""
@@ -77,6 +79,7 @@ def test_a_wired_system_passes_the_check(fmi: int, tmp_path: Path) -> None:
     assert report.passed, report.failures
 
 
+@pytest.mark.usefixtures("code_runs_here")
 def test_without_outputs_the_states_are_compared(tmp_path: Path) -> None:
     report = check_fmu(export_fmu(_without_outputs(), tmp_path / "m.fmu"), _without_outputs())
     assert report.compared

@@ -5,10 +5,12 @@ import re
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from psa_casadi.export.fmu.platforms import compile_library, host_platform
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
@@ -19,7 +21,8 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
-from tests.fmu_models import exported
+from tests.fmu_models import entries, exported, rewritten
+from tests.tiers import slow_but
 
 STACK = "P-885.51"
 
@@ -102,6 +105,37 @@ def test_debug_logging_shows_the_solver(slave: Instance) -> None:
     assert "solver steps" in slave.messages[-1]
     names = (ctypes.c_char_p * 1)(b"noise")
     assert slave.call("SetDebugLogging", 1, ctypes.c_size_t(1), names) == ERROR
+
+
+_COUNTING = """
+#include <stdarg.h>
+#include <stdio.h>
+__attribute__((visibility("default"))) int psa_sentences = 0;
+static int counted(char *text, size_t size, const char *format, va_list arguments) {
+    ++psa_sentences;
+    return vsnprintf(text, size, format, arguments);
+}
+"""
+
+
+@pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
+def test_a_step_writes_no_sentence_that_nobody_reads(fmi: int, tmp_path: Path) -> None:
+    """To write one takes a good part of a microsecond, more than a short step's share."""
+    inside = {n.removeprefix("sources/"): c for n, c in entries(STACK, fmi).items()}
+    texts = {n: c.decode() for n, c in inside.items() if n.endswith((".c", ".h"))}
+    texts["log.c"] = _COUNTING + texts["log.c"].replace(" vsnprintf(", " counted(")
+    library = compile_library(texts, "psa", host_platform())
+    binary = next(n for n in inside if n.startswith("binaries/"))
+    changed = rewritten(exported(STACK, fmi), tmp_path / "c.fmu", {binary: lambda _: library})
+    with Fmu(changed) as fmu, fmu.start(CO_SIMULATION) as slave:
+        count = ctypes.c_int.in_dll(fmu.library, "psa_sentences")
+        slave.step(0.0, 1e-3)
+        assert count.value == 0
+        flag = ctypes.c_int(1) if fmi == 2 else ctypes.c_bool(True)
+        assert slave.call("SetDebugLogging", flag, ctypes.c_size_t(0), None) == OK
+        slave.step(1e-3, 1e-3)
+        assert count.value == 1
+        assert "solver steps" in slave.messages[-1]
 
 
 def test_output_derivatives_are_those_of_the_trajectory(slave: Instance) -> None:

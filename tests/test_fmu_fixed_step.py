@@ -15,7 +15,8 @@ import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
-from psa_casadi.export.fixed_step.probe import VOLTAGES
+from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, played_inputs
+from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.fixed import FIXED_ENTRY
 from psa_casadi.export.fmu.sources import STRICT
@@ -23,10 +24,12 @@ from psa_casadi.export.importer.calls import CO_SIMULATION
 from psa_casadi.export.importer.fmu import Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.model.compose import compose
+from psa_casadi.report.words.text import check_sentence
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.c_host.build import HEADERS
 from tests.exact_cases import JUMP, FloatArray, error
+from tests.fmu_models import rewritten
 from tests.stack_models import stack
 from tests.tiers import slow
 
@@ -146,8 +149,8 @@ def test_the_description_says_what_it_is(fmi: int, tmp_path: Path) -> None:
     options = ["-std=c99", *STRICT, f"-I{HEADERS}", f"-I{sources[0].parent}", "-c"]
     for source in (s for s in sources if s.name in ("instance.c", "fmi_data.c", "values.c")):
         run_compiler([*compiler_command(), *options, str(source), "-o", "object.o"], tmp_path)
-    with pytest.raises(psa.InputError, match="takes fixed steps of 1e-05 s"):
-        psa.check_fmu(path)
+    with pytest.raises(psa.InputError, match="takes fixed steps of 1e-05 s and carries no evid"):
+        psa.check_fmu(path, evidence=True)
 
 
 @pytest.mark.parametrize(
@@ -179,3 +182,85 @@ def test_the_command_wants_both_options_or_neither(tmp_path: Path) -> None:
         told = json.loads(archive.read(FIXED_ENTRY))
     assert set(told["errors"]) == set(VOLTAGES)
     assert all(f"{error:.1e}" in done.output for error in told["errors"].values())
+
+
+@cache
+def archived(fmi: int) -> bytes:
+    """Return the file of an FMU of a stack with a fixed step."""
+    with temporary_folder() as folder:
+        path = psa.export_fmu(stack("P-885.51"), folder / "fixed.fmu", fmi=fmi, step=STEP)
+        return path.read_bytes()
+
+
+def written(fmi: int, folder: Path) -> Path:
+    """Return the path of a copy of `archived`."""
+    (folder / "fixed.fmu").write_bytes(archived(fmi))
+    return folder / "fixed.fmu"
+
+
+def told(path: Path) -> dict[str, float]:
+    """Return the errors that an FMU states, by voltage."""
+    with zipfile.ZipFile(path) as archive:
+        errors: dict[str, float] = json.loads(archive.read(FIXED_ENTRY))["errors"]
+    return errors
+
+
+@slow
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_the_check_finds_the_errors_that_it_states(fmi: int, tmp_path: Path) -> None:
+    """On the voltages behind them; what means nothing there is left out, and said."""
+    path = written(fmi, tmp_path)
+    report = psa.check_fmu(path)
+    assert report.passed, report.failures
+    assert report.compared
+    figures = {row.name: row.figure for row in report.rows}
+    for voltage, stated in told(path).items():
+        assert figures[f"fixed step, {voltage}"] == pytest.approx(stated, rel=0.06, abs=1e-8)
+    names = {"life cycle", "snapshots", "line of the input", "start of a run", "settled start"}
+    assert names < figures.keys()
+    assert {"equations", "model exchange", "parameter changes"} < set(report.left_out)
+    assert ("intermediate update" in report.left_out) == (fmi == 3)
+    assert figures.keys().isdisjoint(report.left_out)
+    assert "Left out, as its step is fixed: model exchange inst" in check_sentence(report)
+
+
+@slow
+def test_the_check_notices_smaller_errors_than_there_are(tmp_path: Path) -> None:
+    def boast(content: bytes) -> bytes:
+        stated = json.loads(content)
+        stated["errors"] = {name: 0.8 * error for name, error in stated["errors"].items()}
+        return json.dumps(stated).encode()
+
+    changed = rewritten(written(2, tmp_path), tmp_path / "b.fmu", {FIXED_ENTRY: boast})
+    failed = {row.name for row in psa.check_fmu(changed).failures}
+    assert {"reproducible", "fixed step, tones", "fixed step, jumps"} <= failed
+    assert "fixed step, ramps and holds, 10 at once" not in failed
+    for nothing in (b"{}", b'{"errors": {"sine": "x"}}', b"no JSON"):
+        with zipfile.ZipFile(changed) as archive:
+            entries = {n: archive.read(n) for n in archive.namelist()}
+        write_archive(tmp_path / "c.fmu", {**entries, FIXED_ENTRY: nothing})
+        with pytest.raises(psa.InputError, match=r"fixed_step\.json.*xport the FMU again"):
+            psa.check_fmu(tmp_path / "c.fmu")
+
+
+@slow
+def test_the_check_of_another_part_with_a_fixed_step(tmp_path: Path) -> None:
+    path = psa.export_fmu(psa.part_model("flexure_stage"), tmp_path / "flexure.fmu", step=STEP)
+    report = psa.check_fmu(path)
+    assert report.passed, report.failures
+
+
+def test_an_importer_that_holds_inputs_is_told_its_own_errors(tmp_path: Path) -> None:
+    """FMI 3.0 has no way to move them: what a jump within a step leaves is twice as much there."""
+    moved, held = (told(written(fmi, tmp_path)) for fmi in (2, 3))
+    assert held["jumps"] > 1.5 * moved["jumps"]
+    assert held["sine"] > 5.0 * moved["sine"]
+    u = played_inputs(stack("P-885.51").plant(), VOLTAGES["jumps"][1](np.linspace(0, 1, STEPS + 1)))
+    times = STEP * np.arange(STEPS + 1, dtype=np.float64)
+    signals = Signals(("voltage",), times, u[:, :1], held=True)
+    found = co_simulate(exported(3), times, signals, ("displacement",))[:, 0]
+    model = stack("P-885.51").plant()
+    true = psa.simulate(model, times, u[:, 0], as_exported=True, rtol=1e-9, hold="zero")
+    assert error(found, np.asarray(true.outputs["displacement"])) == pytest.approx(
+        held["jumps"], rel=0.06
+    )

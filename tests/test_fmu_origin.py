@@ -43,6 +43,7 @@ def _reproducible(path: Path) -> CheckRow:
     return next(row for row in check_fmu(path).rows if row.name == "reproducible")
 
 
+@pytest.mark.usefixtures("code_runs_here")
 def test_an_export_of_another_casadi_is_reproducible(older: Path) -> None:
     row = _reproducible(older)
     assert row.passed, row.remark
@@ -60,6 +61,7 @@ CHANGES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
 }
 
 
+@pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize("change", slow_but(["equation", "start value"], CHANGES))
 def test_a_change_of_it_is_found(change: str, older: Path, tmp_path: Path) -> None:
     place, edit, said = CHANGES[change]

@@ -83,8 +83,9 @@ FAULTS = {
     ),
     "an allocation in a step": (
         "counted", "allocations == made",
-        "values.c", "    psa_result result = PSA_FINE;\n",
-        "    psa_result result = instance->allocate(1, 1) ? PSA_FINE : PSA_ERROR;\n",
+        "values.c", "    psa_input_at(&state->input, state->solver.since, u);\n",
+        "    if (!instance->allocate(1, 1)) return PSA_ERROR;\n"
+        "    psa_input_at(&state->input, state->solver.since, u);\n",
     ),
 }  # fmt: skip
 

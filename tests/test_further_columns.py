@@ -236,7 +236,7 @@ def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(
         "\n           ", " "
     )
     assert json.loads(found.to_json())["columns"][0]["named"] == {right: pytest.approx(1.0)}
-    write_report(found, tmp_path / "page.html")
+    write_report(found, tmp_path / "page.html", still=True)
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "What the further columns decided" in page
     assert "With displacement_2" in page

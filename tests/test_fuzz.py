@@ -36,11 +36,11 @@ from tests.fuzz.target import CRASH, FALSE_PASS, FOREIGN, HANG, LEFT_OVER, Found
 #: Inputs of each target in the quick tier, and in the full one.
 QUICK = {"records-csv": 500, "column-maps": 500, "paths": 200, "models": 200}
 FULL = {
-    "records-csv": 6000, "records-mat": 1500, "records-hdf5": 10, "records-parquet": 700,
-    "records-xlsx": 150, "records-tdms": 600, "records-h5": 10, "records-npz": 600,
-    "records-npy": 600, "records-lvm": 600, "records-dat": 600,
-    "column-maps": 6000, "mapped-records": 1000, "units": 4000, "models": 1500, "paths": 2000,
-    "binaries": 6000, "zips": 150, "descriptions": 500, "states": 1000,
+    "records-csv": 3000, "records-mat": 750, "records-hdf5": 10, "records-parquet": 350,
+    "records-xlsx": 150, "records-tdms": 300, "records-h5": 10, "records-npz": 300,
+    "records-npy": 300, "records-lvm": 300, "records-dat": 300,
+    "column-maps": 3000, "mapped-records": 500, "units": 2000, "models": 750, "paths": 1000,
+    "binaries": 3000, "zips": 150, "descriptions": 500, "states": 500,
 }  # fmt: skip
 #: Commands, which take seconds each.
 COMMANDS = {

@@ -15,28 +15,30 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.task import Method
-from tests.benchmarks.hidden_cases import Case, records_of, run_case
+from psa_casadi.units import FloatArray
+from tests.benchmarks.hidden_cases import Case, Found, records_of, run_case
 from tests.plants.make import Truth, make_record
 from tests.plants.table import FOREIGN, KNOWN, called
 from tests.tiers import slow, slow_but
 
 NAMING = ("cause_named", "partly_explained", "ambiguous")
-#: The seed of every effect's record.
-SEED = 1
+#: The seed of every effect's record, and its samples: half of the whole one, which names the effect
+#: as well (tried with two seeds each) in half the time.
+SEED, SAMPLES = 1, 3000
 #: Lags that a slow record hardly tells apart.
 LAGS = {"drive_lag", "sensor_lag", "sensor_delay"}
 #: Share of the noise below which nothing of an effect is left beside the base.
 HARDLY = 0.1
 #: Foreign causes that take most of a minute each: the benchmark `diagnose` has them.
 LONG = {"guide_stiffness", "range_switch", "source_power"}
-#: Fresh records in every run.
-FRESH = 4
+#: Fresh records in every run: so many, and twice as many where one of them misleads.
+FRESH = 2
 
 
 def diagnose(effect: str | None, seed: int, folder: Path) -> tuple[psa.Diagnosis, Truth]:
     path = folder / "record.csv"
     truth = make_record(effect, seed, path)
-    return psa.diagnose([psa.read_record(path)]), truth
+    return psa.diagnose([psa.read_record(path).slice(0, SAMPLES)]), truth
 
 
 def within(found: psa.Diagnosis) -> set[str]:
@@ -53,9 +55,13 @@ def test_the_hidden_effect_is_named_and_the_gain_is_real(effect: str, tmp_path: 
     assert found.extended_errors.holdout_rms_m < found.base_errors.holdout_rms_m
     assert found.noise_floor_rms_m == pytest.approx(truth.sigma, rel=0.2)
     # the clean displacement is known here: the extended model must be nearer to it than the base
-    held = found.experiments[0].held_out
-    errors = [np.std((y - truth.displacement)[held]) for y in (found.base[0], found.extended[0])]
+    errors = [_missed(found, truth, y) for y in (found.base[0], found.extended[0])]
     assert errors[1] < 0.8 * errors[0]
+
+
+def _missed(found: psa.Diagnosis, truth: Truth, y: FloatArray) -> float:
+    """Return the rms by which a prediction misses the clean displacement, held out [m]."""
+    return float(np.std((y - truth.displacement[:SAMPLES])[found.experiments[0].held_out]))
 
 
 @slow
@@ -63,9 +69,7 @@ def test_the_hidden_effect_is_named_and_the_gain_is_real(effect: str, tmp_path: 
 def test_a_lag_is_named_as_a_lag(effect: str, tmp_path: Path) -> None:
     found, truth = diagnose(effect, SEED, tmp_path)
     if found.verdict == "adequate":  # the base's own lags and masses have taken it over
-        held = found.experiments[0].held_out
-        missed = float(np.std((found.base[0] - truth.displacement)[held]))
-        assert missed < HARDLY * truth.sigma
+        assert _missed(found, truth, found.base[0]) < HARDLY * truth.sigma
         return
     assert found.causes
     assert found.causes[0].effect in LAGS
@@ -108,12 +112,22 @@ def test_a_cause_that_is_not_in_the_table_is_not_named_alone(effect: str, tmp_pa
 
 @slow
 def test_fresh_records_every_time() -> None:
-    """Seeds are drawn anew and printed: at most one of them may mislead."""
-    seeds = [secrets.randbelow(10**6) for _ in range(FRESH)]
+    """Seeds are drawn anew and printed: none of two may mislead, or at most one of four."""
+    seeds = [secrets.randbelow(10**6) for _ in range(2 * FRESH)]
     draw = np.random.default_rng(seeds[0])
     cases = [Case("known", str(draw.choice(KNOWN)), s, (1.0, 3.0)) for s in seeds]
-    found = [run_case(case) for case in cases]
-    for f in found:
-        print(f.case, f.rho, f.verdict, f.within)
-    assert sum(f.alone is not None and f.alone != f.case.right for f in found) <= 1
-    assert sum(f.case.right in f.within or f.rho < 0.9 for f in found) >= FRESH - 1
+    found = [_told(case) for case in cases[:FRESH]]
+    if not all(map(_right, found)):
+        found += [_told(case) for case in cases[FRESH:]]
+    assert sum(not _right(f) for f in found) <= 1
+
+
+def _told(case: Case) -> Found:
+    found = run_case(case)
+    print(found.case, found.rho, found.verdict, found.within)
+    return found
+
+
+def _right(f: Found) -> bool:
+    """Whether no other cause is named alone, and the hidden one is named if it shows."""
+    return f.alone in (None, f.case.right) and (f.case.right in f.within or f.rho < 0.9)

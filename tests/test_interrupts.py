@@ -30,7 +30,7 @@ from psa_casadi.model.model_file import dumps, load_model, loads
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, write_record
 from psa_casadi.simulation.exact.run import run_exact
-from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import input_samples, simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
@@ -41,6 +41,12 @@ from tests.tiers import slow
 TIME: FloatArray = np.arange(600, dtype=float) * 5e-3
 VOLTAGE = 50.0 - 50.0 * np.cos(4 * np.pi * TIME)
 TABLE = [EFFECTS["slow_creep"], EFFECTS["offset_drift"]]
+
+
+@pytest.fixture(autouse=True)
+def _threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work is done side by side, as it is for users, where the other tests have one thread."""
+    monkeypatch.setenv(VARIABLE, "2")
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +193,7 @@ def test_a_command_says_what_it_kept(
         monkeypatch.setattr(module, "diagnose", lambda *given, **options: finished)
     write_record(tmp_path / "r.csv", columns(record))
     m, j, r = (tmp_path / n for n in ("m.json", "d.json", "r.html"))
-    given = [command, str(tmp_path / "r.csv"), "-o", str(m), "--report", str(r)]
+    given = [command, str(tmp_path / "r.csv"), "-o", str(m), "--report", str(r), "--still"]
     if command == "diagnose":
         given += ["--json", str(j)]
     ended = CliRunner().invoke(app, given)
@@ -246,7 +252,15 @@ def interrupted(
     word: str, record: Path, folder: Path, command: str, times: int = 1
 ) -> tuple[subprocess.Popen[str], float, str]:
     """Run a command, interrupt it so many times after a step began; return how long that took."""
-    given = [command, str(record), "-o", str(folder / "m.json"), "--report", str(folder / "r.html")]
+    given = [
+        command,
+        str(record),
+        "-o",
+        str(folder / "m.json"),
+        "--report",
+        str(folder / "r.html"),
+        "--still",
+    ]
     process = subprocess.Popen(
         [sys.executable, "-m", "psa_casadi.cli", *given],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,

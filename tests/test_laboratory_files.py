@@ -2,6 +2,7 @@
 
 import gzip
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record, record_from
+from psa_casadi.records.read.column_map import parse_columns
 from tests.laboratory_bytes import gcs, hdf5, lvm, named, npy, npz, tdms, xlsx
 
 N = 20
@@ -73,6 +75,7 @@ READ: dict[str, bytes] = {
     "UTF-16 without a mark": text("Time (s),Voltage (V),Position (um)")
     .decode()
     .encode("utf-16-le"),
+    "quoted, units behind a comma": text('"Time, s","Voltage, V","Displacement, um"'),
     "LabVIEW, one time.lvm": lvm(["Voltage", "Position"], ROWS, units=["Volts", "um"]),
     "LabVIEW, no time.lvm": lvm(
         ["Voltage", "Position"], [r[1:] for r in ROWS], columns="No", units=["V", "um"], comma=True
@@ -137,6 +140,16 @@ OPEN: dict[str, bytes] = {
         "Record Length,20,Points", "Sample Interval,0.001,s", "TIME,CH1,CH2"
     ),
     "an oscilloscope, names below settings": text("Model,X,1", "x-axis,1,2"),
+    "an oscilloscope, volts": text("x-axis,1,2", "second,Volt,Volt"),
+    "an oscilloscope, steps counted": "\n".join(
+        [
+            "X,CH1,CH2,Start,Increment,",
+            "Sequence,Volt,Volt,0.000000e+00,1.000000e-03,",
+            *(f"{k},{v:.6g},{x:.6g},,," for k, (v, x) in enumerate(zip(V, X, strict=True))),
+            "",
+        ]
+    ).encode(),
+    "channels with spaces": text("Zeit;Kanal A;Kanal B", "(s);(V);(mV)", delimiter=";", point=","),
     "LabVIEW, untitled.lvm": lvm(["Untitled", "Untitled 1"], ROWS),
     "data recorder.dat": gcs(
         ["Voltage of output channel 1", "Current Position of axis 1"], VX_ROWS
@@ -158,9 +171,9 @@ def test_what_cannot_be_decided_ends_with_the_line_to_type(form: str, tmp_path: 
     path = kept(tmp_path, form, OPEN[form])
     with pytest.raises(InputError) as caught:
         read_record(path)
-    typed = re.search(r"--columns (\S.*?) \(with your units\)", str(caught.value))
-    assert typed is not None, caught.value
-    assert_read(path, columns=typed[1])
+    typed = re.findall(r"--columns (\S.*?) \(with your units", str(caught.value))
+    assert len(set(typed)) == 1, caught.value  # one line for all that is open
+    assert_read(path, columns=shlex.split(typed[0])[0])
 
 
 @pytest.mark.parametrize(
@@ -250,7 +263,39 @@ def test_a_mistake_in_a_workbook_is_told_with_its_row(tmp_path: Path) -> None:
 
 def test_units_below_names_that_are_none_are_kept(tmp_path: Path) -> None:
     path = kept(tmp_path, "a", text("x-axis,1,2", "second,Volt,Volt"))
-    with pytest.raises(InputError, match="gives the unit 'V', --columns gives 'um'"):
+    with pytest.raises(InputError, match=r"gives the unit 'V', --columns gives 'um'.*such as 10um"):
         read_record(path, columns="time=x-axis,voltage=1,displacement=2:um")
     path.write_bytes(text("x-axis,1,2", "second,Volt,um"))
     assert_read(path, "time=x-axis,voltage=1,displacement=2")
+
+
+def test_a_scale_says_what_one_in_the_file_is(tmp_path: Path) -> None:
+    path = kept(tmp_path, "a", text("x-axis,1,2", "second,Volt,Volt"))
+    record = read_record(path, columns="time=x-axis,voltage=1:15V,displacement=2:-2.5e0 um")
+    assert record.displacement is not None
+    np.testing.assert_allclose(record.voltage, 15.0 * V, rtol=1e-12)
+    np.testing.assert_allclose(record.displacement, -2.5e-6 * X, rtol=1e-12)
+    archive = kept(tmp_path, "a.npz", npz({"time": T, "u": V, "x": X}))
+    record = read_record(archive, columns="voltage=u:1e1V,displacement=x:.5nm")
+    assert record.displacement is not None
+    np.testing.assert_allclose(record.voltage, 10.0 * V, rtol=1e-12)
+    np.testing.assert_allclose(record.displacement, 0.5e-9 * X, rtol=1e-12)
+
+
+@pytest.mark.parametrize("scale", ["0", "-0.0", "1e999"])
+def test_a_scale_that_leaves_nothing_is_refused(scale: str) -> None:
+    with pytest.raises(InputError, match="leaves nothing of the numbers"):
+        parse_columns(f"displacement=x:{scale}um")
+
+
+def test_a_sensors_volts_are_told_to_need_a_scale(tmp_path: Path) -> None:
+    path = kept(tmp_path, "a", text("time [s],voltage [V],displacement [V]"))
+    with pytest.raises(InputError, match=r"does not measure length.*displacement=NAME:10um"):
+        read_record(path)
+    assert_read(path, "displacement=displacement:1um")
+
+
+def test_an_oscilloscope_without_an_increment_is_told(tmp_path: Path) -> None:
+    path = kept(tmp_path, "a", b"X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,0,,\n0,1,2,\n")
+    with pytest.raises(InputError, match=r"line 2: the head gives no sample time \(Increment"):
+        read_record(path)

@@ -1,5 +1,8 @@
 """Pages that are made when the site is built: commands, effects, recipes."""
 
+import json
+import re
+
 import pytest
 import yaml  # type: ignore[import-untyped]
 from typer.core import TyperGroup
@@ -9,9 +12,12 @@ from build_scripts import copied_pages
 from build_scripts.commands_page import commands
 from build_scripts.effects_page import PICTURES, overview, section
 from build_scripts.measured_data import ROOT
+from build_scripts.schemas_page import WRITTEN_BY, kind
+from build_scripts.schemas_page import section as schema_section
 from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
+from psa_casadi.report.documents.schemas import FILES, schema_texts
 
 
 def _options(group: TyperGroup, name: str) -> dict[str, list[str]]:
@@ -38,7 +44,8 @@ def test_the_page_of_commands_holds_every_command_and_option() -> None:
 
 
 def test_the_gallery_lists_every_effect() -> None:
-    assert [row[0] for row in overview().rows] == [f"[`{name}`](#{name})" for name in EFFECTS]
+    shown = [row[0].replace("<wbr>", "") for row in overview().rows]
+    assert shown == [f"[<code>{name}</code>](#{name})" for name in EFFECTS]
 
 
 def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> None:
@@ -46,6 +53,7 @@ def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> Non
     text = section(effect)
     assert effect.equation_text.split(",  ", maxsplit=1)[0] in text
     assert f"]({PICTURES}/backlash.png)" in text
+    assert "](playground.html#backlash)" in text
     assert effect.source[1:] in text
     assert all(f"| {p.name} | {p.unit} |" in text for p in effect.parameters)
 
@@ -72,3 +80,35 @@ def _pages(entry: object) -> list[str]:
     entries = entry.values() if isinstance(entry, dict) else entry
     assert not isinstance(entries, str)
     return [page for e in entries for page in _pages(e)]  # type: ignore[attr-defined]
+
+
+def test_the_page_of_json_files_holds_every_member_of_every_schema() -> None:
+    assert set(WRITTEN_BY) == set(FILES)
+    for name in FILES:
+        schema = json.loads(schema_texts()[f"{name}.schema.json"])
+        text = schema_section(name, schema)
+        records = [schema, *schema.get("$defs", {}).values()]
+        members = [member for record in records for member in record["properties"]]
+        assert [m for m in members if f"| `{m}` |" not in text] == []
+        linked = set(re.findall(r"\]\(#([\w-]+)\)", text))
+        assert linked == set(re.findall(r"\{ #([\w-]+) \}", text))
+
+
+@pytest.mark.parametrize(
+    ("schema", "words"),
+    [
+        ({"const": "x/1"}, '`"x/1"`'),
+        ({"enum": ["a", "b"]}, '`"a"`, `"b"`'),
+        ({"anyOf": [{"type": "number"}, {"type": "null"}]}, "number or null"),
+        ({"type": "array", "items": {"type": "string"}}, "list of strings"),
+        (
+            {"type": "array", "items": {"anyOf": [{"type": "string"}, {"$ref": "#/$defs/Own"}]}},
+            "list of strings or [Own](#f-own)",
+        ),
+        ({"type": "array", "items": {"$ref": "#/$defs/Cause"}}, "list of [Cause](#f-cause)"),
+        ({"type": "array", "prefixItems": [{"type": "number"}] * 2}, "[number, number]"),
+        ({"type": "object", "additionalProperties": {"type": "number"}}, "by name: number"),
+    ],
+)
+def test_what_a_value_may_be_is_told_in_words(schema: dict[str, object], words: str) -> None:
+    assert kind("f", schema) == words

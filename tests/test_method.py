@@ -18,7 +18,7 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
 from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, split
-from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import simulate
 from tests.benchmarks.ablation import (
     ablation_table,
@@ -196,12 +196,16 @@ def test_what_sets_of_causes_are_good_for_shows_in_the_ablation() -> None:
     assert rows == [every, ("50 % (1 of 2)", "50 % (1 of 2)", "1.500, 2.00", "1")]
 
 
-def test_every_constant_is_moved_and_a_diagnosis_uses_them() -> None:
+def test_every_constant_is_moved_and_a_diagnosis_uses_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     moved = moved_constants()
     assert {name.split(" = ")[0] for name in moved} == {f.name for f in fields(Thresholds)}
     assert len(fields(Thresholds)) <= 25
     assert moved["price = 16"].thresholds.price == 16.0
     assert thresholds() == Thresholds()
-    with using(Thresholds(price=3.0)):
-        assert side_by_side(lambda _: thresholds().price, range(4)) == [3.0] * 4
+    for threads in ("1", "2"):
+        monkeypatch.setenv(VARIABLE, threads)
+        with using(Thresholds(price=3.0)):
+            assert side_by_side(lambda _: thresholds().price, range(4)) == [3.0] * 4
     assert thresholds().price == 8.0

@@ -134,7 +134,7 @@ def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN
 
 
 @slow
-def test_several_modes_are_found_together() -> None:
+def test_several_modes_are_found_together_and_again_from_what_was_found() -> None:
     found = psa.diagnose([shaken_stack(11)])
     (cause,) = found.causes
     assert cause.effect.startswith("modal_series")
@@ -144,6 +144,9 @@ def test_several_modes_are_found_together() -> None:
     tones = np.array([v for n, v in values.items() if n.startswith("series_frequency")])
     for frequency, _, _ in HIDDEN:
         assert np.min(np.abs(tones / frequency - 1.0)) < 2e-3
+    again = psa.diagnose([shaken_stack(11)], model=found.model)
+    assert again.base_errors.holdout_nrmse_percent > 1.0
+    assert [c.effect.startswith("modal_series") for c in again.causes] == [True]
 
 
 @slow
@@ -152,13 +155,7 @@ def test_a_fast_record_without_modes_has_none() -> None:
 
 
 @slow
-def test_a_diagnosis_from_a_model_with_modes_finds_them_again() -> None:
-    found = psa.diagnose([shaken_stack(11)], model=psa.diagnose([shaken_stack(11)]).model)
-    assert found.base_errors.holdout_nrmse_percent > 1.0
-    assert [c.effect.startswith("modal_series") for c in found.causes] == [True]
-
-
-@slow
+@pytest.mark.usefixtures("code_runs_here")
 def test_a_model_with_modes_becomes_an_fmu(tmp_path: Path) -> None:
     path = tmp_path / "modes.fmu"
     psa.export_fmu(with_two_modes(), path)

@@ -60,6 +60,7 @@ def test_the_oscillator_runs_in_a_modelica_compiler() -> None:
     assert load(text, "VanDerPol.Examples.Free") is not None
 
 
+@pytest.mark.usefixtures("code_runs_here")
 def test_the_oscillators_fmu_passes_the_check() -> None:
     failed = [row for row in psa.check_fmu(_oscillator(2), van_der_pol()).rows if not row.passed]
     assert not failed

@@ -1,9 +1,13 @@
-"""Linear algebra runs on one thread within a fit, and as before after it."""
+"""Linear algebra runs on one thread within a fit; work beside it on as many as are wanted."""
+
+import threading
 
 import numpy as np
+import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
+from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 
 
 def _threads() -> set[int]:
@@ -24,3 +28,14 @@ def test_the_number_of_threads_is_restored() -> None:
             assert _within() == {1}
             assert _threads() == {1}
         assert _threads() == before
+
+
+@pytest.mark.parametrize(("wanted", "own"), [("1", True), ("2", False), ("many", False)])
+def test_work_has_the_threads_that_are_wanted(
+    wanted: str, own: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is no number counts as nothing said: a thread for each core."""
+    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    monkeypatch.setenv(VARIABLE, wanted)
+    found = side_by_side(lambda _: threading.get_ident(), range(3))
+    assert (set(found) == {threading.get_ident()}) == own

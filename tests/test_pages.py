@@ -11,7 +11,7 @@ from psa_casadi.command_line import typed
 from psa_casadi.diagnosis.held_out.errors import Errors
 from psa_casadi.report.page.design_page import write_design_page
 from psa_casadi.report.page.fit_page import write_fit_report
-from psa_casadi.report.words.phrases import handy_scale, length_scale, one_unit
+from psa_casadi.report.words.phrases import handy_scale, in_page_unit, length_scale, one_unit
 from tests.html_page import Page, figures
 from tests.report_cases import diagnosis, identification
 
@@ -24,8 +24,8 @@ def test_every_page_tells_date_version_command_and_the_records_hashes(
     try:
         d, found = diagnosis("cause_named"), identification()
         paths = [tmp_path / f"{k}.html" for k in range(3)]
-        psa.write_report(d, paths[0])
-        write_fit_report(found, paths[1])
+        psa.write_report(d, paths[0], still=True)
+        write_fit_report(found, paths[1], still=True)
         write_design_page(paths[2], title="A design", summary=["It moves."])
     finally:
         typed.reset(token)
@@ -46,8 +46,8 @@ def test_a_page_without_a_command_tells_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["diagnosis", "fit"])
 def test_a_small_page_is_below_a_megabyte_and_says_the_same(kind: str, tmp_path: Path) -> None:
     result = diagnosis("cause_named") if kind == "diagnosis" else identification()
-    result.report(tmp_path / "large.html")
-    result.report(tmp_path / "small.html", small=True)
+    result.report(tmp_path / "large.html", still=True)
+    result.report(tmp_path / "small.html", small=True, still=True)
     large, small = ((tmp_path / f"{n}.html").read_text("utf-8") for n in ("large", "small"))
     assert len(small) < 1e6 < len(large)
     assert "data:image/png;base64," in small
@@ -58,7 +58,7 @@ def test_a_small_page_is_below_a_megabyte_and_says_the_same(kind: str, tmp_path:
 
 
 def test_the_library_and_each_record_are_there_once(tmp_path: Path) -> None:
-    diagnosis("cause_named").report(tmp_path / "a.html")
+    diagnosis("cause_named").report(tmp_path / "a.html", still=True)
     text = (tmp_path / "a.html").read_text("utf-8")
     assert text.count("plotly.js v") == 1
     drawn = re.findall(r'<script type="application/json">(.*?)</script>', text, re.DOTALL)
@@ -74,7 +74,7 @@ def test_the_errors_of_a_page_have_one_unit(tmp_path: Path) -> None:
         base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
         extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
     )
-    d.report(tmp_path / "a.html", small=True)
+    d.report(tmp_path / "a.html", small=True, still=True)
     text = Page((tmp_path / "a.html").read_text("utf-8")).text.replace("\u00a0", " ")
     start = text.index("base model, held-out rms")
     tiles = text[start : start + 400]
@@ -88,3 +88,14 @@ def test_a_unit_of_a_page_ends_with_it() -> None:
         assert length_scale(3e-9).unit == "µm"
         assert length_scale(3e-9, counts=True).unit == "counts"
     assert length_scale(3e-9).unit == "nm"
+
+
+def test_a_sentence_has_the_unit_of_its_page() -> None:
+    sentence = "-0.29 um at 0.17 s, +60 nm at 12 um; 3 mm, 5 umbrellas."
+    assert in_page_unit(sentence) == "-0.29 µm at 0.17 s, +60 nm at 12 µm; 3 mm, 5 umbrellas."
+    with one_unit(handy_scale(2e-9)):
+        assert in_page_unit(sentence).startswith("-290 nm at 0.17 s, +60 nm at 12 µm; 3 mm")
+    with one_unit(handy_scale(2e-6)):
+        assert in_page_unit(sentence).startswith("-0.29 µm at 0.17 s, +0.06 µm at 12 µm; 3 mm")
+    with one_unit(length_scale(1.0, counts=True)):
+        assert in_page_unit(sentence).startswith("-0.29 µm at 0.17 s, +60 nm at 12 µm")

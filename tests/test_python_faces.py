@@ -108,7 +108,7 @@ def test_results_draw_and_report_themselves(tmp_path: Path) -> None:
         assert cell.startswith("<pre")
         assert "data:image/png;base64," in cell
     for k, reported in enumerate((d, found)):
-        reported.report(tmp_path / f"{k}.html")
+        reported.report(tmp_path / f"{k}.html", still=True)
         assert (tmp_path / f"{k}.html").stat().st_size > 10_000
 
 

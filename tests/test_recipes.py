@@ -20,6 +20,7 @@ from fmpy import read_model_description
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
+from psa_casadi.component import BALANCES
 from psa_casadi.examples.index import Example, Script, examples
 from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.simulation.history import settled_at
@@ -261,3 +262,29 @@ def test_the_workflow_is_yaml_and_its_commands_run(
 def test_scripts_are_found_on_a_page() -> None:
     page = replace(examples()["fmpy"], text="# T\n```sh run.sh\na\nb\n```\n```console\n$ c\n```\n")
     assert page.scripts == (Script("sh", "run.sh", "a\nb\n"),)
+
+
+def test_the_page_on_own_effects_has_every_balance() -> None:
+    text = examples()["own_effect"].text
+    rows = [f"| `{b.name}` | {b.unit} | {b.description} |" for b in BALANCES.values()]
+    assert [row for row in rows if row not in text] == []
+
+
+@slow
+def test_an_own_effect_is_found_with_the_size_that_was_put_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for command in _shell(examples()["own_effect"]):
+        if command.startswith("python "):
+            subprocess.run([sys.executable, *shlex.split(command)[1:]], check=True)
+        else:
+            run_command(command)
+    own = psa.own_effects("pickup")
+    monkeypatch.delitem(sys.modules, "pickup")
+    values = psa.load_model("extended.json", own.values()).values
+    assert values["pickup_gain"] == pytest.approx(4e-9, rel=0.02)
+    assert values["pickup_time"] == pytest.approx(0.05, rel=0.02)
+    names = [v.name for v in read_model_description("stack.fmu").modelVariables]
+    assert "pickup_gain" in names
+    assert (tmp_path / "pickup.png").stat().st_size > 0

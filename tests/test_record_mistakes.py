@@ -30,7 +30,10 @@ def with_row(row: int, text: str) -> list[str]:
         ("time [s],voltage,displacement [um]", r"'voltage' has no unit .*'voltage \[V\]'"),
         ("time [s],voltage [],displacement [um]", r"column 'voltage': has no unit"),
         ("time [V],voltage [V],displacement [um]", r"'time': the unit 'V' does not measure time"),
-        ("time [s],voltage [V],displacement [V]", r"not measure length; .* um, nm, pm, counts\."),
+        (
+            "time [s],voltage [V],displacement [V]",
+            r"not measure length; .* um, nm, pm, counts, or say what 1 in",
+        ),
         (f"{HEADER},Voltage [mV]", r"column 4: 'voltage' stands twice .*\(first as column 2\)"),
         (
             f"time [s],voltage [V],displacement [um{'9' * 500}]",

@@ -227,3 +227,16 @@ def test_arrays_are_checked_as_files_are(column: str, values: FloatArray, senten
 def test_a_record_is_made_by_keywords() -> None:
     with pytest.raises(TypeError, match="positional"):
         Record("r", T, T)  # type: ignore[call-arg]
+
+
+def test_a_record_is_written_as_it_is(tmp_path: Path) -> None:
+    t = np.arange(20.0)
+    x = np.where(t == 3.0, np.nan, 1e-7 * t)
+    record = Record(
+        name="a", time=t, voltage=2.0 * t + 1.0, displacement=x, current=1e-3 * t,
+        temperature=300.0 + t, displacement_2=0.5e-7 * t,
+    )  # fmt: skip
+    write_record(tmp_path / "a.csv", record)
+    again = read_record(tmp_path / "a.csv")
+    for name in ("time", "voltage", "displacement", "current", "temperature", "displacement_2"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(record, name))

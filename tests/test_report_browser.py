@@ -16,6 +16,7 @@ from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone
 from tests.report_cases import diagnosis, identification
+from tests.tiers import slow_but
 
 pytestmark = pytest.mark.xdist_group("browser")
 
@@ -28,7 +29,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
     return find_browser(tmp_path_factory.mktemp("browser"))
 
 
-@pytest.fixture(scope="module", params=PAGES)
+@pytest.fixture(scope="module", params=slow_but(["diagnosis"], PAGES))
 def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pages") / f"{request.param}.html"
     if request.param == "fit":

@@ -21,7 +21,7 @@ WRONG, WHY = "What the base model gets wrong", "Why this cause"
 
 
 def page_of(d: Diagnosis, path: Path) -> tuple[str, Page]:
-    write_report(d, path / "r.html", origin="synthetic")
+    write_report(d, path / "r.html", origin="synthetic", still=True)
     text = (path / "r.html").read_text(encoding="utf-8")
     return text, Page(text)
 

@@ -10,6 +10,7 @@ from fmpy.ssp.ssd import read_ssd
 from lxml import etree  # type: ignore[import-untyped]
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
 from psa_casadi.export.ssp.layout import OUTSIDE, Port
 from psa_casadi.export.ssp.parameters import shared_parameters
@@ -48,7 +49,7 @@ def test_every_file_follows_its_schema_and_names_what_the_fmus_have(name: str) -
                 assert known[connector.name].causality == connector.kind
         for part, values in archive.parameters.items():
             assert {n: known_start(archive, part, n) for n in values} == values
-            assert {*values, "input_line"} == {*archive.fmus[part].names("parameter"), "input_line"}
+            assert {*values} == {*archive.fmus[part].names("parameter")} - {*OPTIONS}
 
 
 def known_start(archive: SspArchive, part: str, name: str) -> float:

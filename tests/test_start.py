@@ -35,6 +35,21 @@ def test_rest_is_rest(name: str, effects: tuple[str, ...]) -> None:
     assert np.ptp(held.displacement) < 1e-9 * held.displacement[0]
 
 
+def test_a_memory_that_relaxes_in_a_bent_model_leaves_the_others_at_rest() -> None:
+    """They only follow it."""
+    gains = {"saturation_gain": 0.1, "leak_gain": 0.1}
+    model = stack("P-885.51")
+    for effect in ("saturation_of_strain", "charge_leakage"):
+        model = model.with_effect(EFFECTS[effect])
+    model = model.with_values(gains)
+    start = start_state(model, [60.0, 0.0], memory={"leak_voltage": 9.0})
+    rate = np.array(model.structure.f(0.0, start.x, [60.0, 0.0], model.parameter_vector())[0])
+    shares = np.abs(rate.ravel()) / model.state_nominals()
+    fast = np.array([not s.memory for s in model.structure.states])
+    assert shares[model.state_names.index("leak_voltage")] > 1e-2
+    assert np.max(shares[fast]) < 1e-2
+
+
 @pytest.mark.parametrize("name", sorted(STACKS))
 def test_a_record_that_starts_in_motion_starts_without_a_transient(name: str) -> None:
     """The start on a ramp is the state that a long ramp has led to."""

@@ -13,7 +13,7 @@ from psa_casadi.model.compose import compose
 from psa_casadi.records import write_record
 from psa_casadi.records.excitation import time_grid, triangle
 from psa_casadi.report.words.timings import timings_table
-from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.simulation.timings import REST, Stage, stage, timed
@@ -36,7 +36,10 @@ def _work() -> None:
         _simulate([])
 
 
-def test_stages_count_for_themselves_and_simulations_of_all_threads() -> None:
+def test_stages_count_for_themselves_and_simulations_of_all_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(VARIABLE, "2")
     _work()  # compiled before
     with timed() as spent:
         _simulate([])

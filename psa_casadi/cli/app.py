@@ -24,6 +24,7 @@ from psa_casadi.cli.identify import identify
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
 from psa_casadi.cli.surroundings import prepare
+from psa_casadi.cli.web import web
 from psa_casadi.command_line import typed
 from psa_casadi.version import __version__
 
@@ -93,6 +94,7 @@ design.command(
     " --max-voltage 120 -o move.csv",
 )(guarded(input_))
 app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))
+app.command(epilog="Example: psa web extended.json -o page.html")(guarded(web))
 app.command(epilog="Example: psa examples van_der_pol -o van_der_pol")(guarded(examples))
 app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(datasets))
 

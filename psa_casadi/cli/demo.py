@@ -1,13 +1,19 @@
 """`psa demo`: the whole story on a synthetic record that ships with the package."""
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from psa_casadi.cli.screen import Quiet, show, show_table, width, working
 from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY
+
+if TYPE_CHECKING:
+    from psa_casadi.model.compose import Model
+    from psa_casadi.records.record import Record
 
 RECORD = "synthetic_record.csv"
 FILES = {
@@ -43,6 +49,7 @@ def demo(
     from psa_casadi.diagnosis.diagnose import diagnose
     from psa_casadi.export.check.check import check_fmu
     from psa_casadi.export.fmu.archive import export_fmu
+    from psa_casadi.export.fmu.platforms import make_compiler_ready
     from psa_casadi.files import atomic_write
     from psa_casadi.identification.identify import identify
     from psa_casadi.model.model_file import save_model
@@ -51,21 +58,28 @@ def demo(
     from psa_casadi.report.plots.figure import save_figure
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence, story
+    from psa_casadi.simulation.ahead import compiled_ahead
+    from psa_casadi.simulation.stepper import make_ready
 
     paths = _prepared(directory)
     record = read_record(paths[RECORD], need_excitation=True)
     show("A synthetic record, made by a simulated stack with one effect hidden in it.", quiet)
-    with working("identifying", quiet, IDENTIFY) as progress:
+    with (
+        working("identifying", quiet, IDENTIFY) as progress,
+        compiled_ahead(_searched(record), first=[make_compiler_ready]),
+    ):
         save_model(identify([record], progress=progress).model, paths["model.json"])
-    with working("diagnosing", quiet, DIAGNOSE) as progress:
+    with ThreadPoolExecutor(1) as beside, working("diagnosing", quiet, DIAGNOSE) as progress:
         d = diagnose([record], progress=progress)
+        exported = beside.submit(export_fmu, d.model, paths["extended.fmu"])
+        beside.submit(make_ready, d.model.plant())  # the check simulates with it
         save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
         write_report(d, paths["report.html"], origin=_ORIGIN)
         save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
     show(f"\n{story(d, origin=_ORIGIN, width=width())}\n", quiet)
     with working("exporting and checking the FMU", quiet):
-        export_fmu(d.model, paths["extended.fmu"])
+        exported.result()
         checked = check_fmu(paths["extended.fmu"], d.model)
     show_table(check_table(checked), quiet)
     files = "\n".join(f"  {name:<20}  {meaning}" for name, meaning in FILES.items())
@@ -73,6 +87,15 @@ def demo(
     if not checked.passed:
         raise typer.Exit(1)
     show(NEXT.format(report=paths["report.html"]), quiet)
+
+
+def _searched(record: "Record") -> "Iterator[Model]":
+    """Yield the models that the diagnosis will try, the last ones first (see `diagnose`)."""
+    from psa_casadi.effects import EFFECTS
+    from psa_casadi.identification.start.ordinary import starting_model
+
+    start = starting_model([record])
+    return (start.with_effect(e) for e in reversed(EFFECTS.values()) if not e.needs_column)
 
 
 def _prepared(directory: Path) -> dict[str, Path]:

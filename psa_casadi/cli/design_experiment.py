@@ -12,6 +12,7 @@ from psa_casadi.cli.screen import (
     Quiet,
     SampleTimeOption,
     StackOption,
+    StillOption,
     show,
     show_table,
     tell_written,
@@ -96,6 +97,7 @@ def experiment(
         Path | None, typer.Option("-o", "--output", help="CSV with the voltage to apply.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+    still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     own: EffectsOption = None,
@@ -133,7 +135,7 @@ def experiment(
             design, rivals = design_given.informative(
                 chosen, parameter or [], optimality.value, plan, progress
             )
-        _write(design, chosen, rivals, output, report)
+        _write(design, chosen, rivals, output, (report, still))
     _tell(design, chosen, quiet)
     tell_written(output, report, quiet=quiet)
 
@@ -143,14 +145,15 @@ def _write(
     model: "Model",
     rivals: "Sequence[Rival]",
     output: Path | None,
-    report: Path | None,
+    page: tuple[Path | None, bool],
 ) -> None:
     from psa_casadi.report.page.experiment_part import write_experiment_page, write_voltage
 
     if output is not None:
         write_voltage(output, design.record)
+    report, still = page
     if report is not None:
-        write_experiment_page(report, design, model, {r.name: r for r in rivals})
+        write_experiment_page(report, design, model, {r.name: r for r in rivals}, still=still)
 
 
 def _tell(design: "Informative | Separated", model: "Model", quiet: bool) -> None:

@@ -9,6 +9,7 @@ from psa_casadi.cli.screen import (
     EffectsOption,
     Quiet,
     StackOption,
+    StillOption,
 )
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def input_(
     check_fmu: Annotated[
         bool, typer.Option("--check-fmu/--no-check-fmu", help="Simulate the exported FMU too.")
     ] = True,
+    still: StillOption = False,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -68,7 +70,7 @@ def input_(
     given.check()
     if chosen is None or limits is None:
         return
-    task = runs.Task(chosen.plant(), limits, output, report, check_fmu, quiet)
+    task = runs.Task(chosen.plant(), limits, output, report, still, check_fmu, quiet)
     if move is not None:
         runs.move(task, move)
     elif path is not None and trial:

@@ -31,6 +31,7 @@ from psa_casadi.report.page.design_input_part import (
     trial_pictures,
 )
 from psa_casadi.report.page.design_page import write_design_page
+from psa_casadi.report.page.live_part import LiveModel, live_design
 from psa_casadi.report.words.phrases import number
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class Task:
     limits: AmplifierLimits
     output: Path
     report: Path | None
+    still: bool
     check_fmu: bool
     quiet: bool
 
@@ -71,7 +73,7 @@ def track(task: Task, path: Target, minimax: bool) -> None:
     tables = (error_table(rows), limits_table(found.response, task.limits))
     badge = "least largest error" if minimax else "least squares"
     _finish(task, "Designed input", summary, tables, tracking_pictures(found, plain),
-            found.response, badge)  # fmt: skip
+            found.response, badge, path=path)  # fmt: skip
 
 
 def _how(found: TrackedInput) -> list[str]:
@@ -107,7 +109,9 @@ def invert(task: Task, path: Target) -> None:
     summary.append(f"{len(found.trials)} trials on the simulator.")
     tables = (error_table(rows), limits_table(found.response, task.limits))
     pictures = inversion_pictures(found, task.limits)
-    _finish(task, "Inverted input", summary, tables, pictures, found.response, "inversion")
+    _finish(
+        task, "Inverted input", summary, tables, pictures, found.response, "inversion", path=path
+    )
 
 
 def correct(task: Task, path: Target, trial: Record) -> None:
@@ -127,7 +131,7 @@ def correct(task: Task, path: Target, trial: Record) -> None:
         limits_table(found.response, task.limits),
     )
     _finish(task, "Corrected input", summary, tables, trial_pictures(found), found.response,
-            "one trial")  # fmt: skip
+            "one trial", path=path)  # fmt: skip
 
 
 def move(task: Task, ends: tuple[float, float]) -> None:
@@ -196,9 +200,18 @@ def _played(task: Task, time: np.ndarray, voltage: np.ndarray) -> np.ndarray:
     return played_on_fmu(task.plant, time, voltage)
 
 
+def _live(task: Task, response: Response, path: Target | None) -> LiveModel | None:
+    """Begin what lets the stack run in the page, unless that is to be still."""
+    if task.still:
+        return None
+    played = (response.time, response.voltage, response.displacement)
+    wanted = None if path is None else path.displacement
+    return live_design(task.plant, played, wanted, rest=True)
+
+
 def _finish(
     task: Task, title: str, summary: Sequence[str], tables: Sequence[Titled],
-    pictures: "Sequence[Picture]", response: Response, *badges: str,
+    pictures: "Sequence[Picture]", response: Response, *badges: str, path: Target | None = None,
 ) -> None:  # fmt: skip
     """Write CSV and page, show sentences and tables."""
     with _keeping(task, response):
@@ -206,7 +219,7 @@ def _finish(
         if task.report is not None:
             write_design_page(
                 task.report, title=title, summary=summary, tables=tables, figures=pictures,
-                badges=badges,
+                badges=badges, live=_live(task, response, path),
             )  # fmt: skip
     for sentence in summary:
         show(sentence, task.quiet)

@@ -11,11 +11,13 @@ import typer
 from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
+    HysteresisOption,
     Origin,
     OriginOption,
     Quiet,
     SampleTimeOption,
     SmallOption,
+    StillOption,
     show,
     show_table,
     tell_written,
@@ -49,6 +51,7 @@ def diagnose(
     stiffness: Annotated[
         float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
     ] = None,
+    hysteresis: HysteresisOption = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="MODEL.json of the extended model.")
     ] = None,
@@ -76,6 +79,7 @@ def diagnose(
         ),
     ] = False,
     small: SmallOption = False,
+    still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -120,13 +124,14 @@ def diagnose(
                     holdout=found[count:],
                     model=start,
                     stiffness=stiffness,
+                    hysteresis=hysteresis.value if hysteresis else None,
                     effects=tuple(known_effects(given.effects).values()),
                     progress=progress,
                 )
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = following or _beside(json or report)
-            d, unpatched = _finish(d, place, outputs, (origin.value, small), progress)
+            d, unpatched = _finish(d, place, outputs, (origin.value, small, still), progress)
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
@@ -146,24 +151,24 @@ def _finish(
     d: "Diagnosis",
     following: Path | None,
     outputs: Mapping[str, Path | None],
-    page: tuple[str, bool],
+    page: tuple[str, bool, bool],
     progress: Callable[[str], None],
 ) -> "tuple[Diagnosis, str]":
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
-    `page` says what the page calls the records, and whether it is small.
+    `page` says what the page calls the records, and whether it is small, and still.
     """
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
 
     written: list[Path] = []
-    origin, small = page
+    origin, small, still = page
     try:
         with stage("next experiment"):
             d = _with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
-            files.write(d, {**outputs, "--patch": None}, origin, written, small=small)
+            files.write(d, {**outputs, "--patch": None}, origin, written, small=small, still=still)
         with stage("unnamed correction"):
             return d, _write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:

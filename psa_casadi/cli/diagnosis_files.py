@@ -59,6 +59,7 @@ def write(
     written: list[Path],
     *,
     small: bool = False,
+    still: bool = False,
 ) -> None:
     """Write what was asked for, each file whole or not at all, and add it to what is `written`."""
     import psa_casadi as psa
@@ -67,7 +68,7 @@ def write(
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
         "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: psa.write_report(d, path, origin=origin, small=small),
+        "--report": lambda path: psa.write_report(d, path, origin=origin, small=small, still=still),
         "--figure": lambda path: psa.save_figure(d, path, origin=origin),
     }
     for option, path in outputs.items():

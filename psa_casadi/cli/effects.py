@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.screen import show, show_table, tell_written, width
+from psa_casadi.cli.screen import EffectsOption, show, show_table, tell_written, width
 
 if TYPE_CHECKING:
+    from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
 
 
@@ -18,24 +19,28 @@ def effects(
         Path | None,
         typer.Option(help="PNG picture of the effect's signature to write; needs NAME."),
     ] = None,
+    modules: EffectsOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print names only.")] = False,
 ) -> None:
     """List the effects that a diagnosis looks for; show one with equation, signature and source.
 
     Example: psa effects slow_creep --figure creep.png
     """
-    from psa_casadi.effects import EFFECTS
+    from psa_casadi.cli.inputs import Given
     from psa_casadi.effects.modal_series import MODAL_SERIES
+    from psa_casadi.model.own_effects import known_effects
     from psa_casadi.report.words.tables import effects_table
     from psa_casadi.report.words.text import effect_page
 
-    known = {**EFFECTS, **{e.name: e for e in MODAL_SERIES.values()}}
-    wanted = _known(name, list(known), figure)
+    given = Given(modules)
+    listed = known_effects(given.effects)
+    known = {**listed, **{e.name: e for e in MODAL_SERIES.values()}}
+    wanted = _known(given, name, list(known), figure)
     if wanted is None:
         if quiet:
-            show("\n".join(EFFECTS))
+            show("\n".join(listed))
         else:
-            show_table(effects_table(EFFECTS.values()))
+            show_table(effects_table(listed.values()))
         return
     if figure is not None:
         _draw(known[wanted], figure)
@@ -43,11 +48,9 @@ def effects(
     tell_written(figure, quiet=quiet)
 
 
-def _known(name: str | None, names: list[str], figure: Path | None) -> str | None:
+def _known(given: "Given", name: str | None, names: list[str], figure: Path | None) -> str | None:
     """Return the effect that is meant; InputError with every mistake if it or the path is bad."""
-    from psa_casadi.cli.inputs import Given
-
-    given, wanted = Given(), None
+    wanted = None
     given.outputs({"--figure": figure}, [])
     if name is None and figure is not None:
         given.add(

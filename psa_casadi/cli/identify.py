@@ -10,11 +10,14 @@ import typer
 from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
+    Form,
+    HysteresisOption,
     Origin,
     OriginOption,
     Quiet,
     SampleTimeOption,
     SmallOption,
+    StillOption,
     show,
     tell_written,
     width,
@@ -48,6 +51,7 @@ def identify(
     stiffness: Annotated[
         float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
     ] = None,
+    hysteresis: HysteresisOption = None,
     method: Annotated[
         Method, typer.Option(help="How the parameters are found.")
     ] = Method.PREDICTION_ERROR,
@@ -60,6 +64,7 @@ def identify(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
     small: SmallOption = False,
+    still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
     origin: OriginOption = Origin.MEASURED,
@@ -78,6 +83,8 @@ def identify(
         given.add("--method paper has no likelihood; leave --profile or --method out.")
     if method is Method.PAPER and model is not None:
         given.add("--method paper starts from no model; leave --model or --method out.")
+    if method is Method.PAPER and hysteresis not in (None, Form.BOUC_WEN):
+        given.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
     given.stiffness(stiffness)
     given.outputs({"--output": output, "--json": json, "--report": report}, [*records, model])
     measured = given.records(records, columns=columns, sample_time=sample_time)
@@ -87,9 +94,15 @@ def identify(
         if method is Method.PAPER:
             found = by_paper(measured, stiffness=stiffness, progress=progress)
         else:
-            found = run(measured, model=start, stiffness=stiffness, progress=progress)
+            found = run(
+                measured,
+                model=start,
+                stiffness=stiffness,
+                hysteresis=hysteresis.value if hysteresis else None,
+                progress=progress,
+            )
         profiles = _finish(
-            found, output, (json, report, small), profile or (), origin.value, progress
+            found, output, (json, report, small, still), profile or (), origin.value, progress
         )
     show(identification_text(found, origin=origin.value, width=width()), quiet)
     for found_profile in profiles:
@@ -107,14 +120,14 @@ def identify(
 def _finish(
     found: "Identification",
     output: Path,
-    more: tuple[Path | None, Path | None, bool],
+    more: tuple[Path | None, Path | None, bool, bool],
     wanted: Sequence[str],
     origin: str,
     progress: Callable[[str], None],
 ) -> "list[Profile]":
     """Write the files and return the profiles; at an interrupt the model is kept, which it says.
 
-    `more` are the JSON file, the page, and whether that is small.
+    `more` are the JSON file, the page, and whether that is small, and still.
     """
     from psa_casadi.cli.interrupts import kept
     from psa_casadi.files import atomic_write
@@ -124,7 +137,7 @@ def _finish(
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.strict_json import json_text
 
-    json, report, small = more
+    json, report, small, still = more
     done = [output]
     try:
         save_model(found.model, output)
@@ -135,7 +148,9 @@ def _finish(
             done.append(json)
         if report is not None and not found.interrupted:
             progress("writing the report")
-            write_fit_report(found, report, origin=origin, profiles=profiles, small=small)
+            write_fit_report(
+                found, report, origin=origin, profiles=profiles, small=small, still=still
+            )
         ended = found.interrupted
     except KeyboardInterrupt:
         save_model(found.model, output)

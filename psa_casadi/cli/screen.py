@@ -50,13 +50,21 @@ ColumnsOption = Annotated[
     typer.Option(
         "--columns",
         help="Which array of the file is which column, if the names differ:"
-        " time=t:ms,voltage=log.u,displacement=m.2:um",
+        " time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:"
+        " displacement=CH2:10um",
     ),
 ]
 
 SmallOption = Annotated[
     bool,
-    typer.Option("--small", help="Page below 1 MB, for mail: one picture in place of the plots."),
+    typer.Option("--small", help="Page below 1.5 MB, for mail: one picture in place of the plots."),
+]
+
+StillOption = Annotated[
+    bool,
+    typer.Option(
+        "--still", help="Page without the model that runs in it: nothing is compiled for it."
+    ),
 ]
 
 SampleTimeOption = Annotated[
@@ -66,6 +74,24 @@ SampleTimeOption = Annotated[
     ),
 ]
 
+
+class Form(StrEnum):
+    """Forms of the base's hysteresis."""
+
+    BOUC_WEN = "bouc-wen"
+    SPECTRUM = "spectrum"
+    BEST = "best"
+
+
+HysteresisOption = Annotated[
+    Form | None,
+    typer.Option(
+        "--hysteresis",
+        help="Form of the base's hysteresis; best is the one that the records prefer. By default"
+        " Bouc-Wen, or as the model has it.",
+        show_default=False,
+    ),
+]
 
 HistoryOption = Annotated[
     str | None,

@@ -7,6 +7,7 @@ from psa_casadi.components.flexure import FLEXURE
 from psa_casadi.components.further_sensors import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.components.hysteresis_compensator import HYSTERESIS_COMPENSATOR
 from psa_casadi.components.mechanics import CASCADE_MECHANICS, SINGLE_MASS
+from psa_casadi.components.memory_spectrum import MEMORY_SPECTRUM
 from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
 from psa_casadi.components.position_controller import POSITION_CONTROLLER
 from psa_casadi.components.prestress import PRESTRESS_MECHANISM, PRESTRESS_PORT
@@ -20,6 +21,7 @@ COMPONENTS: dict[str, Component] = {
         DRIVE,
         LINEAR_FORCE,
         BOUC_WEN,
+        MEMORY_SPECTRUM,
         CREEP_LAG,
         CASCADE_MECHANICS,
         SINGLE_MASS,
@@ -53,4 +55,13 @@ BASE: tuple[Component, ...] = (
 #: The simplified model with one mass (paper eq. 6).
 SIMPLIFIED: tuple[Component, ...] = (DRIVE, LINEAR_FORCE, BOUC_WEN, CREEP_LAG, SINGLE_MASS, SENSOR)
 
-__all__ = ["BASE", "COMPONENTS", "MONITOR", "SECOND_SENSOR", "SIMPLIFIED", "STRAIN_GAUGE"]
+__all__ = [
+    "BASE",
+    "BOUC_WEN",
+    "COMPONENTS",
+    "MEMORY_SPECTRUM",
+    "MONITOR",
+    "SECOND_SENSOR",
+    "SIMPLIFIED",
+    "STRAIN_GAUGE",
+]

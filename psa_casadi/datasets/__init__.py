@@ -10,8 +10,9 @@ that `DATASETS` gives. Where the authors publish another format, what is kept is
 the conversion stated with the record makes of it, byte for byte.
 """
 
-from psa_casadi.datasets.fetching import copy, find, origin_text, paths
-from psa_casadi.datasets.published import DATASETS, Dataset, DatasetFile
+from psa_casadi.datasets.devices import DATASETS
+from psa_casadi.datasets.fetching import copy, find, origin_text, originals, paths
+from psa_casadi.datasets.published import Dataset, DatasetFile
 from psa_casadi.records import Record, read_records
 
 __all__ = [
@@ -23,7 +24,9 @@ __all__ = [
     "load",
     "micromanipulator",
     "origin_text",
+    "originals",
     "paths",
+    "steering_mirror",
 ]
 
 
@@ -35,6 +38,14 @@ def micromanipulator() -> list[Record]:
         PsaError: a file cannot be downloaded, or what came is not the published one.
     """
     return load("micromanipulator")
+
+
+def steering_mirror() -> list[Record]:
+    """Return one record of each axis and level of a steering mirror (Floren et al. 2024).
+
+    Raises: as `micromanipulator`.
+    """
+    return load("steering_mirror")
 
 
 def load(name: str) -> list[Record]:

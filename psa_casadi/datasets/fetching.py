@@ -6,7 +6,8 @@ import os
 from pathlib import Path
 
 from psa_casadi.cache import writable_room
-from psa_casadi.datasets.published import DATASETS, Dataset, DatasetFile, Extract, Original
+from psa_casadi.datasets.devices import DATASETS
+from psa_casadi.datasets.published import Dataset, DatasetFile, Original
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.files import atomic_write
 
@@ -58,61 +59,69 @@ def copy(name: str, folder: str | os.PathLike[str]) -> list[Path]:
     return written
 
 
+def originals(name: str) -> dict[str, Path]:
+    """Return the verified originals of a dataset by name, downloaded where that is needed.
+
+    Raises:
+        InputError: no such dataset, or a file in `$PSA_CASADI_DATA` is missing or differs.
+        PsaError: a file cannot be downloaded, or what came differs from what was published.
+    """
+    dataset = find(name)
+    every = {o.name: o for file in dataset.files for o in file.originals}
+    data = os.environ.get(DATA_VARIABLE)
+    if data:
+        folder = Path(data) / name
+        return {k: _from_folder(folder, dataset, k, o.sha256) for k, o in every.items()}
+    return {k: _download(o, _room(dataset)) for k, o in every.items()}
+
+
 def origin_text(dataset: Dataset) -> str:
     """Return source, citation, what was taken, and licence, as they go with every copy."""
+    every = {o.name: o for file in dataset.files for o in file.originals}
+    files = "\n".join(f"{o.url} (SHA-256 {o.sha256})" for o in every.values())
     taken = "\n".join(
-        f"{f.name}: {f.description}. From {f.original.url} (SHA-256 {f.original.sha256}),"
-        f" {f.extract.rows} rows from row {f.extract.first_row} on, columns {f.extract.voltage} and"
-        f" {f.extract.displacement}, all counted from 0."
+        f"{f.name}: {f.description}. From {', '.join(o.name for o in f.originals)}:"
+        f" {f.conversion.words}."
         for f in dataset.files
     )
     return (
         f"{dataset.name}: {dataset.description}.\nSource: {dataset.source}\n"
-        f"Citation: {dataset.citation}\n\n{taken}\n\n{dataset.licence_text}"
+        f"Citation: {dataset.citation}\n\n{taken}\n\n{files}\n\n{dataset.licence_text}"
     )
-
-
-def convert(table: bytes, extract: Extract) -> bytes:
-    """Return the CSV file of a record, taken from a table of numbers in text.
-
-    Time in s with three decimals, voltage in V with six, displacement in um with four.
-    """
-    lines = table.decode("ascii").splitlines()[extract.first_row :][: extract.rows]
-    rows = ["time [s],voltage [V],displacement [um]"]
-    for k, line in enumerate(lines):
-        cells = line.split()
-        voltage, displacement = float(cells[extract.voltage]), float(cells[extract.displacement])
-        rows.append(f"{k / extract.sample_rate:.3f},{voltage:.6f},{displacement:.4f}")
-    return ("\n".join(rows) + "\n").encode("ascii")
 
 
 def _path(dataset: Dataset, file: DatasetFile) -> Path:
     data = os.environ.get(DATA_VARIABLE)
     if data:
-        return _from_folder(Path(data) / dataset.name, dataset, file)
-    kept = writable_room("datasets") / dataset.name / file.name
+        return _from_folder(Path(data) / dataset.name, dataset, file.name, file.sha256)
+    room = _room(dataset)
+    kept = room / file.name
     if kept.is_file() and _sha256(kept.read_bytes()) == file.sha256:
         return kept
-    content = convert(_download(file.original, kept.parent).read_bytes(), file.extract)
+    content = file.conversion.csv([_download(o, room).read_bytes() for o in file.originals])
     if _sha256(content) != file.sha256:
         raise PsaError(
-            f"{file.name}: the conversion of {file.original.url} has changed; report it."
+            f"{file.name}: the conversion of {file.originals[-1].url} has changed; report it."
         )
     atomic_write(kept, content)
     return kept
 
 
-def _from_folder(folder: Path, dataset: Dataset, file: DatasetFile) -> Path:
-    path = folder / file.name
+def _room(dataset: Dataset) -> Path:
+    return writable_room("datasets") / dataset.name
+
+
+def _from_folder(folder: Path, dataset: Dataset, name: str, sha256: str) -> Path:
+    path = folder / name
     if not path.is_file():
         raise InputError(
             f"{path}: there is no such file, and {DATA_VARIABLE} says that records lie there; run"
             f" `psa datasets {dataset.name} -o {folder}` without {DATA_VARIABLE} on a machine with"
             f" a network, or unset {DATA_VARIABLE}."
         )
-    if _sha256(path.read_bytes()) != file.sha256:
+    if _sha256(path.read_bytes()) != sha256:
         raise InputError(
-            f"{path}: is not the published record, its SHA-256 differs from {file.sha256}; it was"
+            f"{path}: is not the published record, its SHA-256 differs from {sha256}; it was"
             f" changed or damaged: fetch it again from {dataset.source}."
         )
     return path

@@ -15,10 +15,12 @@ from psa_casadi.diagnosis.thresholds import using
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished
+from psa_casadi.identification.search.forms import search_forms
 from psa_casadi.identification.search.measured_load import LOAD, is_measured, loads_as_curves
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress, relevelled
 from psa_casadi.identification.start.columns import columns_of, with_levels
+from psa_casadi.identification.start.form import Hysteresis, forms_of
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.identification.start.other_quantities import refuse_wrapped
 from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
@@ -30,6 +32,7 @@ from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, in_one_order
+from psa_casadi.simulation.ahead import compiled_ahead
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
 
@@ -53,6 +56,7 @@ def diagnose(
     holdout: Records = (),
     model: Model | None = None,
     stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
     effects: Sequence[Component] | None = None,
     method: Method | None = None,
     progress: Progress = lambda _: None,
@@ -63,9 +67,10 @@ def diagnose(
     arrays (see `record_from`), or several of these.
     Held-out data are the records `holdout`, else a quarter of every record in blocks (see
     `divided`); they choose nothing but whether an extension may stay. `model` is where the base fit
-    starts; `stiffness` [N/m] fixes the force scale; `effects` is the table to search; `method` can
-    leave parts of the method out (for its ablation). Raises InputError, and DiagnosisInterrupted
-    with the best model so far at a keyboard interrupt once there is one.
+    starts; `stiffness` [N/m] fixes the force scale; `hysteresis` is the form of the base's (see
+    `identify`); `effects` is the table to search; `method` can leave parts of the method out (for
+    its ablation). Raises InputError, and DiagnosisInterrupted with the best model so far at a
+    keyboard interrupt once there is one.
     """
     method = method or Method()
     given, kept = records_given(records), records_given(holdout)
@@ -79,23 +84,40 @@ def diagnose(
             experiments = divided(clean, [cleaned(r) for r in apart])
             start, scale_given = chosen_start(clean, model, stiffness)
             columns = columns_of(start, [e.record for e in experiments])
-            start, experiments = columns.model, with_levels(experiments, columns.fitted)
+            experiments = with_levels(experiments, columns.fitted)
+            start, preferred = _in_form(columns.model, hysteresis, experiments, progress)
             refuse_stuck([e.record for e in experiments])
             known = {e.name for e in table}
             searched = (*table, *(c for c in start.effects if c.more_of in known))
             start = start.without(c.name for c in searched if c.gain is not None)
             there = {c.name for c in start.components}
             table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-            said += columns.left_out
+            said += [*columns.left_out, *preferred]
         so_far: list[Fit] = []
         task = Task(experiments, tuple(table), method, progress, so_far.append, hidden)
         try:
-            found = _diagnose(start, task, scale_given)
+            # from the end: the screening begins at the front
+            with compiled_ahead(start.with_effect(e) for e in reversed(table)):
+                found = _diagnose(start, task, scale_given)
             return replace(found, notes=(*found.notes, *said))
         except KeyboardInterrupt:
             if not so_far:
                 raise
             raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
+
+
+def _in_form(
+    start: Model,
+    hysteresis: Hysteresis | None,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+) -> tuple[Model, tuple[str, ...]]:
+    """Return where the base fit starts, in the form that is asked for; and why it is the best."""
+    forms = forms_of(start, hysteresis)
+    if len(forms) == 1:
+        return forms[0], ()
+    found, why = search_forms(forms, experiments, progress=progress)
+    return next(m for m in forms if m.components == found.best.model.components), (why,)
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]:

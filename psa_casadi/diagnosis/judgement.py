@@ -3,11 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from psa_casadi.diagnosis.budget import Share
 from psa_casadi.diagnosis.corrections.correct import Correction
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.screening.evidence import credible_set, temperature
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.thresholds import thresholds
+
+#: What is said of a cause that is part of the extended model and not named.
+SMALL_NOTE = (
+    "{} is in the extended model and removes {:.0f} % of the held-out error above the noise. It is"
+    " not named: structure remains, and so little may only correct the form of what is named."
+)
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,15 @@ def told_from(step: Step) -> tuple[str, ...]:
         return ()
     within = credible_set(step.probability, thresholds().credible)
     return tuple(name for name in within if name != step.cause.name)
+
+
+def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
+    """Return causes that are not named where structure remains: the form of the others is wrong.
+
+    Each removes less of the base's excess than a form may miss. The largest is always named.
+    """
+    largest = max((c.share for c in causes), default=0.0)
+    return tuple(c for c in causes if c.share < min(thresholds().form, largest))
 
 
 def withdrawn_names(

@@ -38,7 +38,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Cause:
-    """A named cause: where it sits, how sure, how large, and what it cannot be told from."""
+    """A named cause: where it sits, how sure, how large, and what else it may be."""
 
     effect: str
     belongs_to: str
@@ -85,7 +85,7 @@ class Remaining:
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """The experiment that would tell the rivals apart.
+    """The experiment that would distinguish the rivals.
 
     `voltage_csv` is the file with the voltage to play, where one was written; `chance` is for each
     rival the probability that it is then named if it is the cause.

@@ -37,7 +37,8 @@ class Thresholds:
       Memories of plants and of measured stacks: 5 to 86 %; gains and loads that a memory imitates:
       91 to 94 %.
     * `form`: share by which a form may miss a contribution: a correction that imitates all but so
-      much of the causes is the same explanation.
+      much of the causes is the same explanation; and where structure remains, a further cause that
+      removes less is in the model and not named.
     * `held_out`: gain in log-likelihood that held-out samples must show.
     * `most_causes`: of one hypothesis.
     * `ringing`: a resonance near the band is tried where its ringing explains this share of what

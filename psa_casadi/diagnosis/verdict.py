@@ -21,7 +21,14 @@ from psa_casadi.diagnosis.held_out.errors import (
     whole_residuals,
 )
 from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
-from psa_casadi.diagnosis.judgement import Weighed, told_from, verdict_of, withdrawn_names
+from psa_casadi.diagnosis.judgement import (
+    SMALL_NOTE,
+    Weighed,
+    told_from,
+    too_small,
+    verdict_of,
+    withdrawn_names,
+)
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
@@ -126,7 +133,12 @@ def conclude(
         stiffness_given,
         evidence=diagnosis_evidence(final.fit, found, experiments, final.predicted, spent),
     )
-    causes = tuple(_cause(s, last.fit, found, spent) for s in named)
+    small = too_small(spent.causes) if partly else ()
+    causes = tuple(
+        _cause(s, last.fit, found, spent)
+        for s in named
+        if s.cause.name not in [c.what for c in small]
+    )
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -147,6 +159,7 @@ def conclude(
         notes=(
             *model.provenance.notes,
             *(withdrawn_names(steps, weighed, beaten, doubt) if verdict == "unexplained" else ()),
+            *(SMALL_NOTE.format(c.what, 100 * max(c.share, 0.0)) for c in small),
             *coverage_notes(experiments),
         ),
         experiments=tuple(experiments),

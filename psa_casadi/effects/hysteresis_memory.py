@@ -6,25 +6,14 @@ import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.scales import voltage_scale
-from psa_casadi.smooth import magnitude_power, rate_magnitude, signed_power
+from psa_casadi.smooth import stop_rate
 from psa_casadi.variables import Parameter, State, Values
 
-#: Exponent of the smooth stop; 2 bends gently, infinity is the ideal stop operator.
-_SHARPNESS = 4.0
 #: Narrowest first threshold, over rated voltage. The memory of a ferroelectric is spread over the
 #: loop; a dwell much narrower than the loop is friction or backlash and not this effect.
 _NARROWEST = 0.0125
 #: Thresholds of the elements over the first one: more than a decade.
 _RATIOS = (1.0, 2.5, 6.0, 15.0)
-
-
-def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
-    """Rate of a smooth stop element: z' = u' - (|u'| sgn(z) + u') / 2 * |z / threshold|^m."""
-    ratio = z / threshold
-    return s.voltage_rate - 0.5 * (
-        rate_magnitude(s) * signed_power(ratio, _SHARPNESS)
-        + s.voltage_rate * magnitude_power(ratio, _SHARPNESS)
-    )
 
 
 def _weights(s: Symbols) -> list[Expression]:

@@ -14,9 +14,8 @@ leaves the memory as it is.
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.effects.hysteresis_memory import stop_rate
 from psa_casadi.scales import voltage_scale
-from psa_casadi.smooth import direction, magnitude_power, signed_power
+from psa_casadi.smooth import direction, magnitude_power, signed_power, stop_rate
 from psa_casadi.variables import Parameter, State, Values
 
 #: Force over voltage of the play elements, over k_L: loops of some 10 % of the stroke.
@@ -52,6 +51,7 @@ RATE_DEPENDENT_HYSTERESIS = Component(
         " thresholds that do: Al Janaideh, Su and Rakheja, Smart Mater. Struct. 17 (2008) 035026"
     ),
     gain="rate_gain",
+    needs=("bouc_wen",),
     equation_text=(
         "force gains (c - 1) f_H,  c = (1 + (u'/(rate_onset u_rated))^2)^(rate_gain/(2 ln 10)),  or"
         " where rate_by_threshold = 1  -(c - 1) 0.3 k_L w |z/w|^6 (sgn(u') + z/w)/2,"

@@ -22,6 +22,7 @@ RATE_INDEPENDENT_ASYMMETRY = Component(
         " even term of generalised Bouc-Wen models (Song and Der Kiureghian, J. Eng. Mech. 2006)"
     ),
     gain="delta_r",
+    needs=("bouc_wen",),
     equation_text="f_H' gains delta_r |u'| (u + asymmetry_bend u_rated (|f_H|/h_ref)^n)",
     parameters=(
         Parameter("delta_r", 0.0, "N/V2", (-1e5, 1e5), "rate-independent asymmetry", scale=_scale),

@@ -40,6 +40,7 @@ SELF_HEATING = Component(
         " generation in multilayer actuators in proportion to the loss of the hysteresis"
     ),
     gain="heating_gain",
+    needs=("bouc_wen",),
     equation_text=(
         "force gains heating_gain q (f_L + f_H),"
         "  q' = |u'|/u_rated (|f_H|/h_ref)^(n+1) - q / heating_time"

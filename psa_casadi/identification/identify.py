@@ -12,8 +12,9 @@ from psa_casadi.identification.certainty.determinacy import Determinacy, assumed
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.search.forms import search_forms
 from psa_casadi.identification.search.measured_load import loads_as_curves
-from psa_casadi.identification.search.multistart import Search, StartOutcome, search
+from psa_casadi.identification.search.multistart import Search, StartOutcome
 from psa_casadi.identification.search.refitting import Progress, record_rms, refit, relevelled
 from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.doubts import (
@@ -23,6 +24,7 @@ from psa_casadi.identification.start.doubts import (
     doubtful_voltage,
 )
 from psa_casadi.identification.start.electrical import capacitance_of
+from psa_casadi.identification.start.form import Hysteresis, forms_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
@@ -99,6 +101,7 @@ def identify(
     *,
     model: Model | None = None,
     stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
     progress: Progress = lambda _: None,
 ) -> Identification:
     """Fit the base model, or `model`, to all samples of all records.
@@ -107,9 +110,10 @@ def identify(
     arrays (see `record_from`), or several of these.
     Maximum likelihood over all records together: every record has its own noise level (its
     residual's), initial state and offset. `stiffness` is the free stack's stiffness [N/m] from a
-    data sheet; without it forces keep the scale of an assumed stiffness, and the model says so. A
-    keyboard interrupt ends the search with the best fit so far, which `warnings` then says. Raises
-    InputError, SimulationError.
+    data sheet; without it forces keep the scale of an assumed stiffness, and the model says so.
+    `hysteresis` is its form: `bouc-wen` (as in the base model), a `spectrum` of elements (see
+    `memory_spectrum`), or the `best` of them by Schwarz's criterion. A keyboard interrupt ends the
+    search with the best fit so far, which `warnings` then says. Raises InputError, SimulationError.
     """
     given_records = records_given(records)
     refuse_still(given_records)
@@ -121,15 +125,16 @@ def identify(
     refuse_few(given_records, fitted, said)
     start, given = chosen_start(fitted, model, stiffness)
     columns = columns_of(start, fitted)
-    start = columns.model
+    forms = forms_of(columns.model, hysteresis)
+    start = forms[0]
     experiments = with_levels([whole(r) for r in fitted], columns.fitted)
     experiments = loads_as_curves(start, experiments, progress)
     linear = None
     if model is None:
         progress("starting values from the records")
         linear = linear_start(fitted, start.values)
-    found = search(
-        start,
+    found, preferred = search_forms(
+        forms,
         experiments,
         linear=linear.candidates if linear else (),
         thorough=True,
@@ -173,7 +178,12 @@ def identify(
         experiments=experiments,
         warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
         starts=found.starts,
-        sentences=(*said, *columns.left_out, *(f.sentence for f in best.further)),
+        sentences=(
+            *said,
+            *((preferred,) if preferred else ()),
+            *columns.left_out,
+            *(f.sentence for f in best.further),
+        ),
         combinations=open_ones,
         advice=advised or (),
         interrupted=advised is None,

@@ -10,6 +10,9 @@ FloatArray = npt.NDArray[np.float64]
 _DOMINANT = 0.5
 _SIDE_LINES = 5
 _ORDERS = 12
+#: Mains frequencies [Hz] and their harmonics; how far a grid is off them; and how many of a
+#: record's resolutions a line lies off the drive's harmonics to be told from them.
+_MAINS, _MULTIPLES, _OFF, _APART = (50.0, 60.0), 3, 0.004, 2.0
 
 
 def drive_frequency(record: Record) -> float | None:
@@ -38,6 +41,19 @@ def among_harmonics(frequency: float, record: Record) -> bool:
     """
     drive = drive_frequency(record)
     return drive is not None and frequency < (_ORDERS + 0.5) * drive
+
+
+def mains_line(frequency: float, record: Record) -> bool:
+    """Whether a frequency [Hz] is that of a mains, or a harmonic of it, and none of the drive's."""
+    near = any(
+        abs(frequency - m * mains) < _OFF * m * mains
+        for mains in _MAINS
+        for m in range(1, _MULTIPLES + 1)
+    )
+    drive = drive_frequency(record)
+    if drive is None or not near:
+        return near
+    return abs(frequency - round(frequency / drive) * drive) > _APART / record.duration
 
 
 def turns(voltage: FloatArray, share: float = 0.1) -> bool:

@@ -31,13 +31,16 @@ def plot(result: Diagnosis | Identification | Trajectory) -> Figure:
 
 
 def page(
-    result: Diagnosis | Identification, path: str | os.PathLike[str], small: bool = False
+    result: Diagnosis | Identification,
+    path: str | os.PathLike[str],
+    small: bool = False,
+    still: bool = False,
 ) -> None:
     """Write the page of a result, one HTML file. Raises InputError when that cannot be."""
     if isinstance(result, Diagnosis):
-        write_report(result, path, small=small)
+        write_report(result, path, small=small, still=still)
     else:
-        write_fit_report(result, path, small=small)
+        write_fit_report(result, path, small=small, still=still)
 
 
 def line(result: Diagnosis | Identification | Trajectory) -> str:
@@ -78,7 +81,7 @@ def cell(result: Diagnosis | Identification | Trajectory) -> str:
     plot(result).savefig(buffer, format="png", dpi=60)
     picture = base64.b64encode(buffer.getvalue()).decode("ascii")
     return (
-        f'<pre style="white-space: pre-wrap">{escape(words)}</pre>'
+        f'<pre style="white-space: pre; overflow-x: auto">{escape(words)}</pre>'
         f'<img style="max-width: 100%" alt="{escape(line(result))}"'
         f' src="data:image/png;base64,{picture}">'
     )

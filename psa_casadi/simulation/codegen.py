@@ -10,7 +10,8 @@ from psa_casadi.component import Expression
 from psa_casadi.model.compose import Structure
 from psa_casadi.scratch import temporary_folder
 
-_PRAGMAS = """\
+#: What stands before generated C.
+PRAGMAS = """\
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #pragma GCC diagnostic ignored "-Wunused-function"
@@ -80,7 +81,7 @@ def generate_c(structure: Structure, *, sensitivities: bool) -> dict[str, str]:
     if not body.endswith("#endif\n"):  # CasADi does not look whether its writing succeeded
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     return {
-        "model.c": _PRAGMAS + body,
+        "model.c": PRAGMAS + body,
         "model_config.h": _config(structure, list(functions.values()), sensitivities),
     }
 

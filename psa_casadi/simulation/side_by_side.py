@@ -12,6 +12,8 @@ from typing import TypeVar
 
 from psa_casadi.interruption import interruptible_work
 
+#: Environment variable with the number of threads; without it there is one for each core.
+VARIABLE = "PSA_CASADI_THREADS"
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -22,13 +24,19 @@ def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[
     What has begun is finished first, what has not is left out. Context variables are the caller's.
     A keyboard interrupt ends the simulations of what has begun, too.
     """
-    given = list(items)
-    if len(given) < 2:
+    given, count = list(items), threads()
+    if len(given) < 2 or count == 1:
         return [work(item) for item in given]
-    with interruptible_work() as own, ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+    with interruptible_work() as own, ThreadPoolExecutor(max_workers=count) as pool:
         contexts = [copy_context() for _ in given]
         try:
             return list(pool.map(lambda context, item: context.run(work, item), contexts, given))
         except KeyboardInterrupt:
             own.stop()
             raise
+
+
+def threads() -> int:
+    """Return how many threads work may have: `PSA_CASADI_THREADS`, else one for each core."""
+    wanted = os.environ.get(VARIABLE, "")
+    return int(wanted) if wanted.isdecimal() and int(wanted) > 0 else os.cpu_count() or 1

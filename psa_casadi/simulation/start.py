@@ -69,9 +69,10 @@ def start_state(
 
     Solves f_s(x_s, m) = w_s for the states without memory, where w_s is the steady rate that the
     inputs' rates cause, by Newton's method; the derivatives follow from the same linear systems.
+    The memories that settle are solved for first: their deviations count from where they would be.
     """
     structure = model.structure
-    rest, moving = _functions(structure)
+    settle, rest, moving = _functions(structure)
     names = memory_names(structure)
     deviation = np.array([(memory or {}).get(n, 0.0) for n in names])
     u, w = np.array(inputs, dtype=float), np.array(rates or [0.0] * len(inputs), dtype=float)
@@ -81,10 +82,13 @@ def start_state(
     without[gains] = 0.0  # a saturating effect would lead Newton's method astray from far away
     nominal = model.state_nominals()
     now = np.array([time])
-    x = np.zeros(len(structure.states))
+    settled = np.zeros(len(structure.states))
     for values in (without, p) if np.any(p[gains]) else (p,):
-        x = _settle(rest, x, (now, u, values, deviation), nominal)
-    final, by_p, by_memory = _Call(moving, (now, x, u, w, p, deviation))()
+        settled = _at_rest(settle, settled, (now, u, values, deviation), nominal)
+    x = settled
+    if any(s.memory and s.settles for s in structure.states):
+        x = _at_rest(rest, settled, (now, u, p, deviation, settled), nominal)
+    final, by_p, by_memory = _Call(moving, (now, x, u, p, deviation, settled, w))()
     return Start(final[:, 0], by_p, by_memory)
 
 
@@ -110,15 +114,12 @@ def _fast_jacobian(structure: Structure) -> ca.Function:
     return ca.Function("fast", [s.time, s.x, s.u, s.p, deviation], [jacobian])
 
 
-def _settle(
-    rest: ca.Function,
-    x: FloatArray,
-    where: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    nominal: FloatArray,
+def _at_rest(
+    newton: ca.Function, x: FloatArray, where: tuple[FloatArray, ...], nominal: FloatArray
 ) -> FloatArray:
-    time, u, p, deviation = where
+    """Return where Newton's method leads from x; `where` is time and what comes behind x."""
     x = x.copy()
-    step = _Call(rest, (time, x, u, p, deviation))
+    step = _Call(newton, (where[0], x, *where[1:]))
     for _ in range(_NEWTON_STEPS):
         new = step()[0][:, 0]
         with np.errstate(invalid="ignore"):  # overflow ends in nan, which is no equilibrium
@@ -163,24 +164,33 @@ def _memory(array: FloatArray) -> Any:
 
 
 @cache
-def _functions(structure: Structure) -> tuple[ca.Function, ca.Function]:
+def _functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return a Newton step for all that settles, one for the states without memory, the motion."""
     s = structure
     memory = [i for i, state in enumerate(s.states) if state.memory]
     settling = [i for i, state in enumerate(s.states) if not state.memory or state.settles]
     fast = [i for i, state in enumerate(s.states) if not state.memory]
     deviation = ca.SX.sym("deviation", len(memory))
-    settled = _newton(s, settling, _placed(s, s.x, memory, deviation, settled=False))
-    start = _newton(s, fast, _placed(s, settled, memory, deviation, settled=True))
-    rest = ca.Function("rest", [s.time, s.x, s.u, s.p, deviation], [ca.densify(start)])
+    known = ca.SX.sym("settled", len(s.states))
+    where = [s.time, s.x, s.u, s.p, deviation]
+    newton = _newton(s, settling, _placed(s, s.x, memory, deviation))
+    settle = ca.Function("settle", where, [ca.densify(newton)])
+    settled = ca.substitute([newton], [s.x], [known])[0]
+    start = _newton(s, fast, _placed(s, s.x, memory, deviation, settled))
+    rest = ca.Function("rest", [*where, known], [ca.densify(start)])
     rate = ca.SX.sym("rate", len(s.inputs))
     moving: Expression = start
     for _ in range(2):
         moving = _in_motion(s, start, moving, fast, memory, rate)
     derivatives: list[Expression] = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
-    return rest, ca.Function(
-        "moving",
-        [s.time, s.x, s.u, rate, s.p, deviation],
-        [ca.densify(e) for e in (moving, *derivatives)],
+    return (
+        settle,
+        rest,
+        ca.Function(
+            "moving",
+            [*where, known, rate],
+            [ca.densify(e) for e in (moving, *derivatives)],
+        ),
     )
 
 
@@ -196,15 +206,22 @@ def _at(s: Structure, expression: Expression, x: Expression) -> Expression:
 
 
 def _placed(
-    s: Structure, x: Expression, memory: list[int], deviation: Expression, *, settled: bool
+    s: Structure,
+    x: Expression,
+    memory: list[int],
+    deviation: Expression,
+    settled: Expression | None = None,
 ) -> Expression:
-    """Return x with the memories at their deviation from the settled value, if there is one."""
+    """Return x with the memories at their deviation from the settled value, if there is one.
+
+    Without `settled` those that have such a value stay as they are.
+    """
     parts = [x[i] for i in range(len(s.states))]
     for column, i in enumerate(memory):
         if not s.states[i].settles:
             parts[i] = deviation[column]
-        elif settled:
-            parts[i] = x[i] + deviation[column]
+        elif settled is not None:
+            parts[i] = settled[i] + deviation[column]
     return ca.vertcat(*parts)
 
 

@@ -86,6 +86,11 @@ def _library(structure: Structure) -> ctypes.CDLL:
     return library
 
 
+def make_ready(model: Model) -> None:
+    """Compile the stepper of a model; else its first `run` does."""
+    _library(model.structure)
+
+
 def run(
     model: Model,
     t: FloatArray,

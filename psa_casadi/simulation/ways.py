@@ -12,6 +12,8 @@ from psa_casadi.simulation.stepper import Steps, run
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Outputs that are the displacement a model shows, the first that it has.
+SHOWN = ("measured_displacement", "displacement")
 #: Names of the two ways in results.
 EXACT, STEPPER = "exact steps", "stepper"
 #: The stepper's tolerance of a step over the one asked of the whole run: with the 0.003 of the
@@ -19,16 +21,16 @@ EXACT, STEPPER = "exact steps", "stepper"
 STEP_SHARE, SMALLEST_STEP_RTOL = 0.0005, 1e-12
 #: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
 #: Each is judged by the one before; a turn that one halving misses as well is seen after two.
-_LADDER = ((0.03, 0), (0.01, 2), (3e-3, 4), (3e-3, 6))
+LADDER = ((0.03, 0), (0.01, 2), (3e-3, 4), (3e-3, 6))
 #: Share of the tolerance to which two runs agree: the finer one may err by a part of it that both
 #: have in common.
-_AGREE = 0.5
+AGREE = 0.5
 #: Below this tolerance two runs may share an error that is of its size: the stepper is taken.
-_TIGHTEST = 1e-6
+TIGHTEST = 1e-6
 #: Loosest tolerance of exact steps: beyond it nothing is won.
 LOOSEST = 1e-5
 #: Range below which a displacement counts as constant, over its nominal size.
-_STILL = 1e-3
+STILL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,7 @@ class Traced:
 
 def output_of(model: Model) -> str | None:
     """Return the name of the displacement that a model shows, None if it has none."""
-    names = ("measured_displacement", "displacement")
-    return next((n for n in names if n in model.output_names), None)
+    return next((n for n in SHOWN if n in model.output_names), None)
 
 
 def trace(
@@ -112,7 +113,7 @@ def accurate(
     output = output_of(model)
     before: FloatArray | None = None
     nominal = 0.0 if output is None else model.output_nominals()[model.output_names.index(output)]
-    for share, coarsest in _LADDER if output and rtol >= _TIGHTEST else ():
+    for share, coarsest in LADDER if output and rtol >= TIGHTEST else ():
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
@@ -120,12 +121,12 @@ def accurate(
             )  # fmt: skip
         except NotExact:
             break
-        size = max(float(np.ptp(found.shown)), _STILL * nominal)
+        size = max(float(np.ptp(found.shown)), STILL * nominal)
         fine = before is not None and not found.forced
         if (
             before is not None
             and fine
-            and np.max(np.abs(found.shown - before)) <= _AGREE * rtol * size
+            and np.max(np.abs(found.shown - before)) <= AGREE * rtol * size
         ):
             x, y = found.x, found.y
             if x is not None and y is not None:

@@ -24,6 +24,10 @@ def bench(
     json_file: Annotated[
         Path | None, typer.Option("--json", help="The tables as JSON, to write.")
     ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="Folder of records of your own, in place of the public ones."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """List the benchmarks, or run one and print its tables."""
@@ -34,10 +38,14 @@ def bench(
     given = Given()
     if name not in BENCHES:
         given.add(f"There is no benchmark '{name}'; there are {', '.join(BENCHES)}.")
+    elif folder is not None and BENCHES[name].run_on is None:
+        able = ", ".join(b.name for b in BENCHES.values() if b.run_on is not None)
+        given.add(f"--folder: the benchmark '{name}' takes no records of your own; {able} does.")
     given.outputs({"--figure": figure, "--json": json_file}, [])
     given.check()
     with working(f"benchmark {name}", quiet) as progress:
-        outcome = BENCHES[name].run(progress, quick)
+        own = BENCHES[name].run_on
+        outcome = own(progress, folder) if own and folder else BENCHES[name].run(progress, quick)
     for titled in outcome.tables:
         show(f"\n{titled.title}\n", quiet)
         show_table(titled.table, quiet)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from matplotlib.figure import Figure
 
@@ -38,12 +39,13 @@ class Bench:
     """A benchmark by name: what it shows, how long it takes, and the function that runs it.
 
     `run(progress, quick)` measures everything again; `quick` does the same on fewer or smaller
-    cases.
+    cases. `run_on(progress, folder)`, where there is one, measures the records of a folder instead.
     """
 
     name: str
     description: str
     run: Callable[[Progress, bool], Outcome]
+    run_on: Callable[[Progress, Path], Outcome] | None = None
 
 
 def share(count: int, of: int) -> str:

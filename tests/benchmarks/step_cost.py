@@ -16,8 +16,8 @@ from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fixed_step.export import export_c
 from psa_casadi.export.fixed_step.planning import fixed_step
 from psa_casadi.export.fixed_step.probe import VOLTAGES
-from psa_casadi.export.fmu.fixed import fixed_sources
-from psa_casadi.export.fmu.sources import compiled_files, export_token, source_files
+from psa_casadi.export.fmu.sources import compiled_files
+from psa_casadi.export.fmu.texts import exported_texts
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.words.tables import Table
@@ -49,11 +49,8 @@ def measured(model: Model, repetitions: int, *, fixed: bool) -> FloatArray:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         export_c(model, folder, step=STEP, name="stack", substeps=1)
-        token = export_token(model, model.name)
-        texts = source_files(model, model.name, token)
-        if fixed:
-            step = fixed_step(model, name="stack", step=STEP, substeps=1)
-            texts = fixed_sources(texts, step)
+        step = fixed_step(model, name="stack", step=STEP, substeps=1) if fixed else None
+        token, texts, _ = exported_texts(model, model.name, fixed=step)
         for file, text in texts.items():
             (folder / file).write_text(text, encoding="utf-8")
         sources = compiled_files(texts)

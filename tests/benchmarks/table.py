@@ -1,16 +1,21 @@
 """The table of benchmarks: each is loaded when it is run."""
 
 from importlib import import_module
+from pathlib import Path
 
 from tests.benchmarks.outcome import Bench, Outcome, Progress
 
 
-def _later(module: str, name: str, description: str) -> Bench:
+def _later(module: str, name: str, description: str, *, on_folder: bool = False) -> Bench:
     def run(progress: Progress, quick: bool) -> Outcome:
         found: Outcome = import_module(f"tests.benchmarks.{module}").run(progress, quick)
         return found
 
-    return Bench(name, description, run)
+    def run_on(progress: Progress, folder: Path) -> Outcome:
+        found: Outcome = import_module(f"tests.benchmarks.{module}").run_on(progress, folder)
+        return found
+
+    return Bench(name, description, run, run_on if on_folder else None)
 
 
 BENCHES: dict[str, Bench] = {
@@ -25,6 +30,11 @@ BENCHES: dict[str, Bench] = {
             "fits",
             "fits",
             "exact steps against the stepper: error against time, lanes, effects, whole diagnoses",
+        ),
+        _later(
+            "web",
+            "web",
+            "models in pages: sizes, redraw times in a headless browser, errors",
         ),
         _later(
             "coverage",
@@ -42,9 +52,26 @@ BENCHES: dict[str, Bench] = {
             "the measured micromanipulator: held-out error of the paper's model and of two effects",
         ),
         _later(
+            "floors",
+            "floors",
+            "measured records: held-out error of a diagnosis beside the floor of each (--folder)",
+            on_folder=True,
+        ),
+        _later(
+            "mirror",
+            "mirror",
+            "models of one axis of the steering mirror by its authors' score (--folder)",
+            on_folder=True,
+        ),
+        _later(
             "hidden",
             "diagnose",
             "hidden causes on independent plants: what is named, how surely, and how often rightly",
+        ),
+        _later(
+            "exam",
+            "exam",
+            "plants of another author: six kinds of hysteresis, causes in other forms, with marks",
         ),
         _later(
             "ablation",

@@ -141,7 +141,10 @@ def _cvode(case: Case, fmu: Fmu, tolerance: float) -> Solved:
             for k in range(begin, end):
                 now = float(t[k])
                 while now < t[k + 1]:
-                    event, _, now = solver.step(now, float(t[k + 1]))
+                    try:
+                        event, _, now = solver.step(now, float(t[k + 1]))
+                    except RuntimeError as error:
+                        raise FmuError(f"CVode stopped after {now:g} s: {error}") from error
                     if event:
                         solver.reset(now)
                 rows.append(instance.get([_OUTPUT]))

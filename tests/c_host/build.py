@@ -4,6 +4,7 @@ What a test needs from the system's packages may be missing: then the test is sk
 if the tool is one of those that PSA_CASADI_REQUIRE_TOOLS names.
 """
 
+import hashlib
 import os
 import shutil
 import subprocess
@@ -169,9 +170,21 @@ def linked(
     folder of other sources of the FMU than its own.
     """
     inside = inside or everywhere(fmi) / "sources"
-    sources = [*(str(HERE / n) for n in files), *(str(p) for p in sorted(inside.glob("*.c")))]
+    sources = [*(HERE / n for n in files), *sorted(inside.glob("*.c"))]
     program = Path(_FOLDER.name) / f"{name}-{fmi}"
-    places = [f"-DHOST_LINKED={fmi}", "-isystem", str(HEADERS), "-isystem", str(inside)]
-    options = ["-std=c99", *STRICT, *places, *sources, "-o", str(program), "-lm", "-pthread"]
-    run_compiler([*command, *options], Path(_FOLDER.name))
+    compiler = [*command, "-std=c99", *STRICT, f"-DHOST_LINKED={fmi}", "-isystem", str(HEADERS)]
+    objects = [_object(compiler, source, inside) for source in sources]
+    run_compiler([*command, *objects, "-o", str(program), "-lm", "-pthread"], Path(_FOLDER.name))
     return program
+
+
+def _object(compiler: Sequence[str], source: Path, inside: Path) -> str:
+    """Compile one file with the headers of a folder, unless the same was compiled before."""
+    digest = hashlib.sha256(repr(compiler).encode())
+    for path in (source, *sorted(inside.glob("*.h"))):
+        digest.update(path.read_bytes())
+    made = Path(_FOLDER.name) / f"{source.stem}-{digest.hexdigest()[:16]}.o"
+    if not made.exists():
+        line = [*compiler, "-isystem", str(inside), "-c", str(source), "-o", str(made)]
+        run_compiler(line, Path(_FOLDER.name))
+    return str(made)

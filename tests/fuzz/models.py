@@ -14,8 +14,8 @@ import numpy as np
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.design.tracking.targets import read_target
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.fmu.archive import DESCRIPTIONS
 from psa_casadi.export.fmu.evidence_files import evidence_texts
+from psa_casadi.export.fmu.texts import DESCRIPTIONS
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import (
     Covariance,

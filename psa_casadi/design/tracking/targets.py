@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import Problems
-from psa_casadi.records.read.columns import parse_header
 from psa_casadi.records.read.csv_table import load_text, parse_numbers
+from psa_casadi.records.read.header import parse_header
 from psa_casadi.units import parse_unit, to_si
 
 FloatArray = npt.NDArray[np.float64]

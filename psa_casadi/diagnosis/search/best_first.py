@@ -106,8 +106,15 @@ class _Search:
         return None
 
     def otherwise(self) -> bool:
-        """Try what is dear, where most is left: another base, all effects; whether that was new."""
+        """Try what is dear, where most is left; whether that was new.
+
+        Another base, all effects, and sets of them: where no cause alone may be the answer, two
+        may.
+        """
         if self.seen_in_records():
+            return True
+        if not self.known.best().causes and self.once("sets", NONE):
+            self.several_at_once()
             return True
         if "all afresh" in self.task.method.without or not self.once("all afresh", NONE):
             return False

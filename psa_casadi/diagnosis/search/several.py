@@ -21,6 +21,8 @@ def fit_sets(known: Known, task: Task) -> None:
     """
     root, price = known.root, known.scale.price
     view, alike = known.view(root), task.alike(root.fit)
+    if not view.trials:
+        return
     every = [
         found
         for size in range(2, thresholds().most_causes + 1)

@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.records.drive import among_harmonics
+from psa_casadi.records.drive import among_harmonics, mains_line
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -75,8 +75,9 @@ def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Exper
 def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
     """Whether the data ask for this effect and not for something else.
 
-    Not with a parameter pushed to the end of its range, a tone among the harmonics of a
-    periodic drive, or a period over the displacement that fits into it less than twice.
+    Not with a parameter pushed to the end of its range, a tone among the harmonics of a periodic
+    drive (a hum at the mains' frequency may lie between them), or a period over the displacement
+    that fits into it less than twice.
     """
     values = fit.model.values
     widest = max(e.record.range_m for e in experiments)
@@ -84,8 +85,10 @@ def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) 
     if any(period > 0.5 * widest for period in periods):
         return False
     tone = cause.tone
-    if tone is not None and any(among_harmonics(values[tone], e.record) for e in experiments):
-        return False
+    for record in (e.record for e in experiments if tone is not None):
+        hum = cause.belongs_to == "environment" and mains_line(values[tone or ""], record)
+        if among_harmonics(values[tone or ""], record) and not hum:
+            return False
     for p in cause.parameters:
         if not p.fitted or p.name == cause.gain:
             continue

@@ -11,10 +11,12 @@ import numpy.typing as npt
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.export.check.rows import BREAKDOWNS
 from psa_casadi.export.check.truth import Run, Truth
+from psa_casadi.export.common.variable_table import starts_at_voltage
 from psa_casadi.export.fmu.model_description import time_scale
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
+from psa_casadi.simulation.history import settled_at
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value
 
@@ -58,7 +60,7 @@ def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatA
     take their samples after it, those after it.
     """
     if not has_reference(model):
-        return _simulated(model, times, inputs)
+        return simulated(model, times, inputs)
     cascade = "k_B" in model.values
     signals = {name: _signal(inputs, i) for i, name in enumerate(inputs.names)}
     found = simulate(
@@ -86,7 +88,8 @@ def _signal(inputs: Signals, column: int) -> Signal:
     return lambda t: float(values[max(bisect_left(times, t) - 1, 0)])
 
 
-def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+def simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+    """Return the same by the simulator."""
     quiet = not model.output_names
     grid = np.union1d(times, inputs.times[inputs.times <= times[-1]])
     start = np.array([s.start for s in model.structure.states])
@@ -102,6 +105,15 @@ def _simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
 
 def truth_of(model: Model, version: int) -> Truth:
     """Return what an FMU of a version of FMI is compared with; runs that fail are a problem."""
+    truth = bare_truth(model)
+    try:
+        return _with_runs(truth, model, held=version == 3)
+    except BREAKDOWNS as error:
+        return replace(truth, problem=str(error))
+
+
+def bare_truth(model: Model) -> Truth:
+    """Return what an FMU is compared with, without runs."""
     s = model.structure
     switches = ca.Function("z", s.arguments, [ca.vertcat(*s.switches.values())])
     names = model.output_names or model.state_names
@@ -110,10 +122,7 @@ def truth_of(model: Model, version: int) -> Truth:
         tuple(s.switches), s.f, switches, _starts(model), bool(model.sampled_names), names,
         "reference" if has_reference(model) else "simulator", np.ones(len(names)), (),
     )  # fmt: skip
-    try:
-        return _with_runs(truth, model, held=version == 3)
-    except BREAKDOWNS as error:
-        return replace(truth, problem=str(error))
+    return _with_settled_start(truth, model)
 
 
 def _starts(model: Model) -> dict[str, float]:
@@ -125,6 +134,23 @@ def _starts(model: Model) -> dict[str, float]:
     names = (model.state_names, model.input_names, model.output_names)
     values = (*groups, y)
     return {n: float(v) for k, own in enumerate(names) for n, v in zip(own, values[k], strict=True)}
+
+
+def _with_settled_start(truth: Truth, model: Model) -> Truth:
+    """Add the start at another voltage than that of the export, where there is one."""
+    if not starts_at_voltage(model):
+        return truth
+    voltage = next(i for i in model.structure.inputs if i.name == "voltage")
+    usual = nominal_value(voltage.nominal, model.values)
+    chosen = max((0.4 * usual, 0.6 * usual), key=lambda v: abs(v - voltage.start))
+    try:
+        settled = settled_at(model, chosen).structure
+    except BREAKDOWNS:  # it does not rest there
+        return truth
+    sizes = model.state_nominals().tolist()
+    starts = {q.name: (q.start, v) for q, v in zip(settled.states, sizes, strict=True)}
+    starts["voltage"] = chosen, usual
+    return replace(truth, start_voltage=chosen, settled_starts=starts)
 
 
 def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:

@@ -51,7 +51,7 @@ def _differ(a: FloatArray, b: FloatArray) -> bool:
 
 
 def life_cycle(fmu: Fmu) -> Problems:
-    """Both interfaces: initialise, step or evaluate, terminate, reset, and the same again."""
+    """All interfaces: initialise, step or evaluate, terminate, reset, and the same again."""
     size = fmu.step_size
     results = []
     with fmu.start(CO_SIMULATION) as slave:
@@ -62,6 +62,11 @@ def life_cycle(fmu: Fmu) -> Problems:
             slave.setup()
     if _differ(*results):
         yield "after a reset a co-simulation instance gives other results"
+    if MODEL_EXCHANGE in fmu.interfaces():
+        yield from _exchanged(fmu)
+
+
+def _exchanged(fmu: Fmu) -> Problems:
     with fmu.start(MODEL_EXCHANGE) as model:
         names = fmu.states()
         x = np.array([0.1 * fmu.nominals[n] for n in names])
@@ -90,7 +95,7 @@ def needless_events(instance: Instance) -> Problems:
 def refused_instances(fmu: Fmu) -> Problems:
     """A wrong token and an empty name give no instance."""
     wrong = (({"token": "{no such token}"}, "a wrong token"), ({"name": ""}, "an empty name"))
-    for interface in (CO_SIMULATION, MODEL_EXCHANGE):
+    for interface in fmu.interfaces():
         for changes, what in wrong:
             instance = fmu.instantiate(interface, **changes)
             if instance is not None:

@@ -23,6 +23,7 @@ from psa_casadi.export.check.description import (
     undefined_units,
 )
 from psa_casadi.export.check.evidence import Repeated, repeated, wrong_evidence
+from psa_casadi.export.check.fixed_step import StatedStep, fixed_truth, stated_step
 from psa_casadi.export.check.origin import (
     not_compared,
     unreproducible_parts,
@@ -30,8 +31,9 @@ from psa_casadi.export.check.origin import (
     wrong_start_values,
 )
 from psa_casadi.export.check.process import started
-from psa_casadi.export.check.rows import CheckRow, count
+from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, CheckRow, count
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
+from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.fmu.validity import with_validity
@@ -48,11 +50,15 @@ __all__ = ["CheckReport", "CheckRow", "check_fmu"]
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All checks of one FMU; `compared` says whether there was a model to compare with."""
+    """All checks of one FMU; `compared` says whether there was a model to compare with.
+
+    `left_out` names the checks that this kind of FMU has nothing for.
+    """
 
     path: Path
     rows: tuple[CheckRow, ...]
     compared: bool
+    left_out: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -91,7 +97,10 @@ def check_fmu(
     open to the code. An archive that would leave its folder, has links, is damaged or a bomb is not
     unpacked, and nothing of it runs.
 
-    Raises InputError if the file is no FMU, or one with a fixed step.
+    Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
+    checks that mean nothing there.
+
+    Raises InputError if the file is no FMU, or if evidence is asked of one with a fixed step.
     """
     path = Path(path)
     rows = _archive_rows(path)
@@ -99,17 +108,16 @@ def check_fmu(
         return CheckReport(path, tuple(rows), compared=False)
     chosen: list[Model] = [model] if model else []
     with requests_to_end_answered(), Archive(path) as archive:
-        step = fixed_step_of(archive.directory)
-        if step is not None:
+        stated = stated_step(archive.directory)
+        if stated is not None and (evidence or records):
             raise InputError(
-                f"{path}: this FMU takes fixed steps of {step:g} s; `psa check` knows FMUs with the"
-                " adaptive solver only. Its error was measured at export, and its description tells"
-                " it."
+                f"{path}: this FMU takes fixed steps of {stated.step:g} s and carries no evidence;"
+                " leave --evidence and --record out, or check an FMU with the adaptive solver."
             )
         carried = (archive.directory / MODEL_ENTRY).is_file()
         with started(_INTEGRATOR if model or carried else ()) as process:
             rows += _described(archive, chosen, tuple(effects))
-            truth = truth_of(chosen[0], archive.version) if chosen else None
+            truth = _truth(chosen[0], archive.version, stated) if chosen else None
             again = Repeated((), ())
             if evidence or records:
                 again = repeated(archive, chosen[0] if chosen else None, records)
@@ -117,8 +125,14 @@ def check_fmu(
             key, limits = secrets.token_bytes(32), Limits(timeout, memory)
             task = Task(path, archive.directory, truth, key, limits, again.playbacks)
             rows += process.rows(task)
-    compared = any(row.name == "equations" for row in rows)
-    return CheckReport(path, tuple(rows), compared=compared)
+    last = "start of a run" if stated else "equations"
+    compared = any(row.name == last for row in rows)
+    left_out = LEFT_OUT + (LEFT_OUT3 if archive.version == 3 else ())
+    return CheckReport(path, tuple(rows), compared, left_out if stated else ())
+
+
+def _truth(model: Model, version: int, stated: StatedStep | None) -> Truth:
+    return fixed_truth(model, version, stated) if stated else truth_of(model, version)
 
 
 def _archive_rows(path: Path) -> list[CheckRow]:
@@ -154,7 +168,7 @@ def _described(
         chosen[:] = [_as_exported(archive, chosen[0])]
         for name, compared in _ORIGIN.items():
             yield count(name, compared, archive, chosen[0])
-        if chosen[0].evidence is not None:
+        if chosen[0].evidence is not None and fixed_step_of(archive.directory) is None:
             yield count("evidence inside", wrong_evidence, archive, chosen[0])
         yield _reproducible(archive, chosen[0])
 

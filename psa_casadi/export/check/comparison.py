@@ -17,8 +17,10 @@ def compare(fmu: Fmu, truth: Truth, run: Run) -> CheckRow:
         found = co_simulate(
             fmu, run.times, run.inputs, names, tolerance=run.tolerance, settled=truth.settled
         )
-    error = np.max(np.abs(found - run.expected), axis=0) / truth.scale
+    error = np.max(np.abs(found - run.expected), axis=0) / (
+        truth.scale if run.scale is None else run.scale
+    )
     worst = int(np.argmax(error))
     largest = float(error[worst])
-    remark = f"largest in {names[worst]}, against the {truth.by}"
+    remark = f"largest in {names[worst]}, against the {run.by or truth.by}"
     return CheckRow(run.name, largest, run.limit, largest <= run.limit, remark)

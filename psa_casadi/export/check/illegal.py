@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from ctypes import byref, c_double, c_int, c_size_t, c_uint
 
+from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.importer.calls import (
     CO_SIMULATION,
     ERROR,
@@ -125,6 +126,20 @@ def _of_version_3(fmu: Fmu) -> Calls:
     }  # fmt: skip
 
 
+def _of_fixed_step(fmu: Fmu) -> Calls:
+    """Return what is illegal where the step is fixed, and the parameters with it."""
+    step = fixed_step_of(fmu.directory)
+    if step is None:
+        return {}
+    co, constants = CO_SIMULATION, fmu.constants()
+    calls: dict[str, tuple[int, bool, Call]] = {
+        "a step that is no multiple of the fixed one": (co, True, lambda i: i.step(0.0, 1.5 * step))
+    }
+    if constants:
+        calls["setting a constant"] = (co, True, lambda i: i.set({constants[0]: 1.0}))
+    return calls
+
+
 def _status(call: Call, instance: Instance) -> int:
     """Return the status of a call."""
     try:
@@ -137,8 +152,10 @@ def _status(call: Call, instance: Instance) -> int:
 def illegal_calls(fmu: Fmu) -> Iterator[str]:
     """Illegal calls return an error with a message, and the instance can be used afterwards."""
     own = _of_version_2(fmu) if fmu.version == 2 else _of_version_3(fmu)
-    calls = {**_common(fmu), **_of_input(fmu), **_of_output(fmu), **own}
+    calls = {**_common(fmu), **_of_input(fmu), **_of_output(fmu), **_of_fixed_step(fmu), **own}
     for what, (interface, initialise, call) in calls.items():
+        if interface not in fmu.interfaces():
+            continue
         with fmu.start(interface) if initialise else fmu.open(interface) as instance:
             status = _status(call, instance)
             if status != ERROR:

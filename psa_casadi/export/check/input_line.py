@@ -3,6 +3,7 @@
 import numpy as np
 
 from psa_casadi.export.common.variable_table import INPUT_LINE
+from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.importer.calls import CO_SIMULATION
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.units import FloatArray
@@ -39,7 +40,8 @@ def _share(fmu: Fmu, rise: float) -> float:
 
 def _moved(fmu: Fmu, line: float, rise: float, parts: int) -> FloatArray:
     """Return the states, in nominal values, after two steps; the second one in parts."""
-    size, inputs = fmu.step_size, fmu.names("input")
+    fixed, inputs = fixed_step_of(fmu.directory), fmu.names("input")
+    size = fmu.step_size if fixed is None else _PARTS * fixed  # a part must be a multiple of it
     names = fmu.states() or fmu.sampled()
     sizes: FloatArray = np.array([fmu.nominals[n] for n in names])
     values = {INPUT_LINE.name: line}

@@ -1,6 +1,6 @@
 """The checks that run the foreign code of an FMU, in turn; their process may end in any of them."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
 from psa_casadi.errors import InputError
@@ -15,23 +15,33 @@ from psa_casadi.export.check.events import (
 )
 from psa_casadi.export.check.input_line import input_line_error
 from psa_casadi.export.check.playback import played_again
-from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, figure, stopped
+from psa_casadi.export.check.rows import (
+    BREAKDOWNS,
+    LEFT_OUT,
+    LEFT_OUT3,
+    CheckRow,
+    count,
+    figure,
+    stopped,
+)
 from psa_casadi.export.check.structure import (
     adjoint_error,
     directional_error,
     equation_error,
     incomplete_dependencies,
+    settled_start_error,
     wrong_start,
 )
 from psa_casadi.export.check.task import Task
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.common.variable_table import INPUT_LINE
+from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 
-_DIRECTIONAL_LIMIT = 1e-5
-_ADJOINT_LIMIT = 1e-10
 _EQUATION_LIMIT = 1e-9
 _LINE_LIMIT = 0.05
+#: Both starts come of runs at tolerances of 1e-6 and less.
+_START_LIMIT = 1e-5
 
 #: The name of a check that begins now, or the row of the one that began last.
 Progress = Iterator[str | CheckRow]
@@ -51,26 +61,19 @@ def measured(task: Task) -> Progress:
 
 
 def _of_instances(fmu: Fmu, task: Task) -> Progress:
+    fixed = fixed_step_of(fmu.directory) is not None
+    left_out = (*LEFT_OUT, *LEFT_OUT3) if fixed else ()
     made: list[CheckRow] = []
     for name, kind in _INTERFACES.items():
-        yield name
-        made.append(count(name, _instantiates, fmu, kind))
-        yield made[-1]
+        if name not in left_out:
+            yield name
+            made.append(count(name, _instantiates, fmu, kind))
+            yield made[-1]
     if not all(row.passed for row in made):
         return
-    for name, call in (_CALLS | (_CALLS3 if fmu.version == 3 else {})).items():
-        yield name
-        yield count(name, call, fmu)
-    yield "directional derivatives"
-    yield figure("directional derivatives", _DIRECTIONAL_LIMIT, directional_error, fmu)
-    if fmu.version == 3:
-        yield "adjoint derivatives"
-        yield figure("adjoint derivatives", _ADJOINT_LIMIT, adjoint_error, fmu)
-    if INPUT_LINE.name in fmu.references:
-        yield "line of the input"
-        yield figure("line of the input", _LINE_LIMIT, input_line_error, fmu)
+    yield from _of_calls(fmu, left_out)
     if task.truth:
-        yield from _of_model(fmu, task.truth)
+        yield from _of_model(fmu, task.truth, left_out)
     for playback in task.playbacks:
         yield playback.name
         try:
@@ -79,13 +82,32 @@ def _of_instances(fmu: Fmu, task: Task) -> Progress:
             yield stopped(playback.name, f"the run stopped: {error}")
 
 
-def _of_model(fmu: Fmu, truth: Truth) -> Progress:
+def _of_calls(fmu: Fmu, left_out: Collection[str]) -> Progress:
+    third = fmu.version == 3
+    calls = _CALLS | (_CALLS3 if third else {})
+    figures = _FIGURES | (_FIGURES3 if third else {})
+    if INPUT_LINE.name in fmu.references:
+        figures["line of the input"] = (_LINE_LIMIT, input_line_error)
+    for name in (*calls, *figures):
+        if name in left_out:
+            continue
+        yield name
+        yield (
+            count(name, calls[name], fmu) if name in calls else figure(name, *figures[name], fmu)
+        )
+
+
+def _of_model(fmu: Fmu, truth: Truth, left_out: Collection[str]) -> Progress:
     yield "start of a run"
     yield count("start of a run", wrong_start, fmu, truth)
-    yield "event indicators of the model"
-    yield count("event indicators of the model", wrong_indicators, fmu, truth)
-    yield "equations"
-    yield figure("equations", _EQUATION_LIMIT, equation_error, fmu, truth)
+    if truth.settled_starts:
+        yield "settled start"
+        yield figure("settled start", _START_LIMIT, settled_start_error, fmu, truth)
+    if "equations" not in left_out:
+        yield "event indicators of the model"
+        yield count("event indicators of the model", wrong_indicators, fmu, truth)
+        yield "equations"
+        yield figure("equations", _EQUATION_LIMIT, equation_error, fmu, truth)
     try:
         for run in truth.runs:
             yield run.name
@@ -126,4 +148,10 @@ _CALLS: dict[str, Callable[[Fmu], Iterable[str]]] = {
 _CALLS3: dict[str, Callable[[Fmu], Iterable[str]]] = {
     "intermediate update": intermediate_update,
     "event mode": event_mode,
+}
+_FIGURES: dict[str, tuple[float, Callable[[Fmu], float]]] = {
+    "directional derivatives": (1e-5, directional_error),
+}
+_FIGURES3: dict[str, tuple[float, Callable[[Fmu], float]]] = {
+    "adjoint derivatives": (1e-10, adjoint_error),
 }

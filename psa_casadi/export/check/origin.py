@@ -8,9 +8,11 @@ import casadi as ca
 
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fmu.archive import DESCRIPTIONS
-from psa_casadi.export.fmu.dependencies import Key, dependencies, without_sampled
-from psa_casadi.export.fmu.sources import FROM_CASADI, compiled_files, source_files, token_of
+from psa_casadi.export.fmu.archive import planned_step
+from psa_casadi.export.fmu.dependencies import Key, at_the_start, dependencies, without_sampled
+from psa_casadi.export.fmu.fixed import FIXED_ENTRY, fixed_entry, fixed_step_of
+from psa_casadi.export.fmu.sources import FROM_CASADI
+from psa_casadi.export.fmu.texts import exported_texts
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.model.compose import Model
 
@@ -32,12 +34,20 @@ def wrong_start_values(archive: Archive, model: Model) -> Iterator[str]:
 def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
     """The dependencies are the sparsity of the model's Jacobian: none missing, none superfluous."""
     names = {(v.kind, v.index): v.name for v in variable_table(model)}
-    found = {names[unknown]: known for unknown, known in dependencies(model.structure).items()}
-    initial = {n: {names[k]: kind for k, kind in known.items()} for n, known in found.items()}
-    truth = {
-        n: {names[k]: kind for k, kind in without_sampled(known).items()}
-        for n, known in found.items()
-    }
+
+    def named(found: dict[Key, dict[Key, str]]) -> dict[str, dict[str, str]]:
+        return {
+            names[unknown]: {names[k]: kind for k, kind in known.items()}
+            for unknown, known in found.items()
+        }
+
+    found = dependencies(model.structure)
+    truth = named({unknown: without_sampled(known) for unknown, known in found.items()})
+    initial = named(at_the_start(model))
+    if fixed_step_of(archive.directory) is not None:  # there parameters are constants
+        for claims in (*truth.values(), *initial.values()):
+            for parameter in model.parameter_names:
+                claims.pop(parameter, None)
     yield from _listed(archive, names)
     described = archive.description
     indicators = described.eventIndicators if archive.version == 3 else []
@@ -81,14 +91,17 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
         return
     found = {p.relative_to(archive.directory).as_posix(): p for p in archive.directory.rglob("*")}
     untouched = _as_found(archive) if other_casadi(archive) else {}
-    bare = source_files(model, archive.identifier, "", archive.version) | untouched
-    token = token_of(model, archive.identifier, bare, archive.version)
+    step = fixed_step_of(archive.directory)
+    fixed = planned_step(model, archive.identifier, archive.version, step) if step else None
+    token, texts, xml = exported_texts(
+        model, archive.identifier, archive.version, fixed, given=untouched
+    )
     if token != archive.token:
         yield f"the token is {archive.token}, not {token}"
-    texts = source_files(model, archive.identifier, token, archive.version) | untouched
-    describe = DESCRIPTIONS[archive.version]
     expected = {f"sources/{name}": text for name, text in texts.items()}
-    expected[_XML] = describe(model, archive.identifier, token, compiled_files(texts))
+    expected[_XML] = xml
+    if fixed:
+        expected[FIXED_ENTRY] = fixed_entry(fixed).decode("utf-8")
     for name, text in sorted(expected.items()):
         if name not in found:
             yield f"{name} is missing"

@@ -6,14 +6,14 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE, Instance
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.instance3 import Instance3
 
 FloatArray = npt.NDArray[np.float64]
-IndexArray = npt.NDArray[np.int64]
 _POINTS = 3
-#: Columns and rows of the derivatives of a step that are compared.
+#: Knowns and unknowns whose derivatives through a step are compared.
 _MOST = 24
 #: Difference that rounding may make, as a share of the nominal value.
 _ROUNDING = 1e-12
@@ -115,9 +115,9 @@ def adjoint_error(fmu: Fmu) -> float:
     """Return the largest difference of adjoint from directional derivatives, FMI 3.0 only.
 
     Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step,
-    there of at most `_MOST` columns and rows, for each of which the step is made again. Each row is
-    in nominal units of the knowns, relative to its largest entry. Sampled states are held; a step
-    into which an instant falls is not differentiated.
+    there for at most `_MOST` knowns and unknowns: the step is made again for each column, and for
+    every few knowns of a row. Each row is in nominal units of the knowns, relative to its largest
+    entry. Sampled states are held; a step into which an instant falls is not differentiated.
     """
     generator = np.random.default_rng(4)
     unknowns = [*fmu.names("output"), *(u.variable.name for u in fmu.description.derivatives)]
@@ -132,26 +132,26 @@ def adjoint_error(fmu: Fmu) -> float:
         instance.set({n: point[n] for n in fmu.names("input")})
         instance.step(0.0, fmu.step_size)
         through = [] if fmu.sampled() else fmu.states()
-        return max(worst, _transposed(instance, [*unknowns, *through], knowns, size, _MOST))
+        few, among = _some([*unknowns, *through]), _some(knowns)
+        size = np.array([fmu.nominals[k] for k in among])
+        return max(worst, _transposed(instance, few, among, size))
 
 
 def _transposed(
-    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray, most: int = 10**6
+    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray
 ) -> float:
-    """Return the largest difference of the matrix by rows from the one by columns, `most` of each.
-
-    Those that are left out lie evenly among the others.
-    """
-    across, down = (_some(len(names), most) for names in (knowns, unknowns))
-    columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))[across]]
-    rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))[down]]
-    forward, backward = np.array(columns).T[down] * size[across], np.array(rows) * size
+    """Return the largest difference of the matrix by rows from the one by columns."""
+    columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))]
+    rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))]
+    forward, backward = np.array(columns).T * size, np.array(rows) * size
     largest = np.max(np.abs(backward), axis=1, initial=1e-300)
-    return float(np.max(np.abs(forward - backward[:, across]) / largest[:, None]))
+    return float(np.max(np.abs(forward - backward) / largest[:, None]))
 
 
-def _some(count: int, most: int) -> IndexArray:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+def _some(names: list[str]) -> list[str]:
+    """Return at most `_MOST` names, evenly among all."""
+    places = np.linspace(0, len(names) - 1, min(len(names), _MOST)).astype(np.int64)
+    return [names[k] for k in np.unique(places)]
 
 
 def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
@@ -159,7 +159,9 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
 
     That is at the start values of its states and inputs, with the outputs that follow from them.
     """
-    for interface, kind in ((CO_SIMULATION, "co-simulation"), (MODEL_EXCHANGE, "model exchange")):
+    kinds = {CO_SIMULATION: "co-simulation", MODEL_EXCHANGE: "model exchange"}
+    for interface in fmu.interfaces():
+        kind = kinds[interface]
         with fmu.start(interface) as instance:
             found = instance.get(list(truth.starts))
         others = [
@@ -174,6 +176,22 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
                 f" {len(others) - 1} more values differ; compare with the model that was exported,"
                 " with its --start-voltage and --history"
             )
+
+
+def settled_start_error(fmu: Fmu, truth: Truth) -> float:
+    """Return how far states and voltage are from those of a start at another `start_voltage`.
+
+    In usual sizes; they are those of the model settled there after a rise from 0 V.
+    """
+    names = list(truth.settled_starts or {})
+    expected, size = np.array(list((truth.settled_starts or {}).values())).T
+    worst = 0.0
+    for interface in fmu.interfaces():
+        values = {START_VOLTAGE: truth.start_voltage}
+        with fmu.start(interface, values=values) as instance:
+            error = np.abs(instance.get(names) - expected) / size
+        worst = max(worst, float(np.max(error)))
+    return worst
 
 
 def equation_error(fmu: Fmu, truth: Truth) -> float:

@@ -13,7 +13,7 @@ class Run:
     """One run: where its inputs and points are, what must come of it, how far off it may be.
 
     `expected` (n, ny) at `times` (n,); `integrated` says that model exchange is used; a `tolerance`
-    of None is the importer's.
+    of None is the importer's. `scale` (ny,) and `by` are those of the truth unless given.
     """
 
     name: str
@@ -23,6 +23,8 @@ class Run:
     limit: float
     tolerance: float | None = None
     integrated: bool = False
+    scale: FloatArray | None = None
+    by: str = ""
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,10 @@ class Truth:
     """The equations of a model, the runs to compare with, and why there are no more of them.
 
     `f` and `switches` take time and the vectors of states, inputs, parameters and sampled states.
-    `starts` are the values of states, inputs and outputs before anything is set. `compared` names
-    what the runs compare, `scale` (ny,) its size, `by` who computed it.
+    `starts` are the values of states, inputs and outputs before anything is set, `settled_starts`
+    those of states and voltage, each with its usual size, where the FMU is told to begin settled at
+    `start_voltage` [V]; None if they are not known. `compared` names what the runs compare, `scale`
+    (ny,) its size, `by` who computed it.
     """
 
     state_names: tuple[str, ...]
@@ -48,3 +52,5 @@ class Truth:
     scale: FloatArray
     runs: tuple[Run, ...]
     problem: str = ""
+    start_voltage: float = 0.0
+    settled_starts: dict[str, tuple[float, float]] | None = None

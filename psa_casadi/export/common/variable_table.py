@@ -13,11 +13,11 @@ class Variable:
     """One variable as FMI describes it, in SI units.
 
     `kind` is time, state, derivative, input, output, parameter, indicator (zero where a derivative
-    has a kink), sampled (a state that changes at sample instants only) or option (how the FMU takes
-    its inputs, no part of the model); `index` is its place in the vector of its kind; the value
-    reference is the place in the table. Only a state, an input, a parameter, an option and a
-    sampled state have a `start`; a derivative has no nominal; an indicator, of which only the sign
-    counts, has neither unit nor nominal.
+    has a kink), sampled (a state that changes at sample instants only) or option (how the FMU
+    begins and takes its inputs, no part of the model); `index` is its place in the vector of its
+    kind; the value reference is the place in the table. Only a state, an input, a parameter, an
+    option and a sampled state have a `start`; a derivative has no nominal; an indicator, of which
+    only the sign counts, has neither unit nor nominal.
     """
 
     name: str
@@ -39,10 +39,35 @@ INPUT_LINE = Variable(
 )  # fmt: skip
 
 
+#: Name and place, among the options, of the parameter that settles an instance at a voltage.
+START_VOLTAGE, START_INDEX = "start_voltage", 1
+#: The parameters that are no part of a model.
+OPTIONS = (INPUT_LINE.name, START_VOLTAGE)
+
+
+def starts_at_voltage(model: Model) -> bool:
+    """Whether an FMU of the model has the parameter `start_voltage`.
+
+    It has a voltage to be held at, and nothing in it waits for a sample instant.
+    """
+    return "voltage" in model.input_names and not model.structure.sampled
+
+
+def _start_voltage(model: Model) -> Variable:
+    """Return the parameter whose value other than that of the export settles the states anew."""
+    voltage = next(i for i in model.structure.inputs if i.name == "voltage")
+    return Variable(
+        START_VOLTAGE, "option", START_INDEX, voltage.unit,
+        "voltage at which it begins settled; at this value with the start values given here",
+        voltage.display_unit, voltage.start, nominal_value(voltage.nominal, model.values),
+    )  # fmt: skip
+
+
 def variable_table(model: Model) -> tuple[Variable, ...]:
     """Return time, states, derivatives, inputs, outputs, parameters, indicators, sampled states.
 
-    Last, where there are inputs, comes the option `input_line` of co-simulation.
+    Last come the options: where there are inputs `input_line` of co-simulation, and `start_voltage`
+    where a voltage is among them.
 
     This is the layout of `fmi_data.h`. The indicator of a switch is named `switch.<name>`, as FMI's
     structured names have parentheses for der() only.
@@ -88,6 +113,7 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
             for i, q in enumerate(s.sampled)
         ),
         *([INPUT_LINE] if s.inputs else []),
+        *([_start_voltage(model)] if starts_at_voltage(model) else []),
     ]  # fmt: skip
     _refuse(model, table)
     return tuple(table)

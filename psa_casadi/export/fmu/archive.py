@@ -15,24 +15,11 @@ from psa_casadi.export.fmu.communication_step import held_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.evidence_files import META_DATA, PAGE, EvidenceFiles, evidence_files
-from psa_casadi.export.fmu.fixed import (
-    FIXED_ENTRY,
-    fixed_description,
-    fixed_entry,
-    fixed_sources,
-    use_of,
-)
-from psa_casadi.export.fmu.model_description import model_description
-from psa_casadi.export.fmu.model_description3 import model_description3
+from psa_casadi.export.fmu.fixed import FIXED_ENTRY, fixed_entry, use_of
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
 from psa_casadi.export.fmu.reference_results import reference_entries
-from psa_casadi.export.fmu.sources import (
-    compiled_files,
-    export_token,
-    source_files,
-    token_of,
-)
 from psa_casadi.export.fmu.terminals import terminal_entries
+from psa_casadi.export.fmu.texts import DESCRIPTIONS, exported_texts
 from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
@@ -41,8 +28,6 @@ from psa_casadi.simulation.stepper import SimulationError
 
 #: Where an FMU carries the model it was made from.
 MODEL_ENTRY = "resources/model.json"
-#: The writer of modelDescription.xml of each version of the standard.
-DESCRIPTIONS = {2: model_description, 3: model_description3}
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -88,18 +73,8 @@ def export_fmu(
     exported = model if include_sensor else model.plant()
     if validity_output:
         exported = with_validity(exported)
-    fixed = None
-    if step is None:
-        token = export_token(exported, identifier, fmi)
-        texts = source_files(exported, identifier, token, fmi)
-        xml = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
-    else:
-        fixed = fixed_step(exported, name=identifier, step=step)
-        bare = fixed_sources(source_files(exported, identifier, "", fmi), fixed)
-        token = token_of(exported, identifier, bare, fmi)
-        texts = fixed_sources(source_files(exported, identifier, token, fmi), fixed)
-        ordinary = DESCRIPTIONS[fmi](exported, identifier, token, compiled_files(texts))
-        xml = fixed_description(ordinary, fixed)
+    fixed = None if step is None else planned_step(exported, identifier, fmi, step)
+    _, texts, xml = exported_texts(exported, identifier, fmi, fixed)
     entries = {
         "modelDescription.xml": xml.encode("utf-8"),
         **_companions(exported, fmi, parameter_sets, fixed),
@@ -113,6 +88,16 @@ def export_fmu(
     with atomic_path(path) as temporary:
         write_archive(temporary, entries)
     return Path(path)
+
+
+def planned_step(model: Model, identifier: str, fmi: int, step: float) -> FixedStep:
+    """Return the fixed step [s] of an FMU, its errors as its importers get them.
+
+    They hold inputs over a step in FMI 3.0, which has no derivatives of inputs. Raises as
+    `fixed_step`.
+    """
+    hold = "zero" if fmi == 3 else "linear"
+    return fixed_step(model, name=identifier, step=step, hold=hold)
 
 
 def _companions(model: Model, fmi: int, samples: int, fixed: FixedStep | None) -> dict[str, bytes]:

@@ -5,7 +5,8 @@ from functools import cache
 import casadi as ca
 
 from psa_casadi.component import Expression
-from psa_casadi.model.compose import Structure
+from psa_casadi.export.common.variable_table import START_INDEX, starts_at_voltage
+from psa_casadi.model.compose import Model, Structure
 
 Key = tuple[str, int]
 
@@ -29,6 +30,20 @@ def dependencies(structure: Structure) -> dict[Key, dict[Key, str]]:
             through = {known: "dependent" for source in sources for known in source}
             result[unknown] = {**found, **through}
     return result
+
+
+def at_the_start(model: Model) -> dict[Key, dict[Key, str]]:
+    """Return the same while a model is initialised.
+
+    Where it has the parameter `start_voltage`, states and voltage start as that has it.
+    """
+    found = dependencies(model.structure)
+    if not starts_at_voltage(model):
+        return found
+    voltage = model.input_names.index("voltage")
+    moved = {("input", voltage), *(("state", i) for i in range(len(model.state_names)))}
+    through: dict[Key, str] = {("option", START_INDEX): "dependent"}
+    return {u: {**how, **through} if moved & how.keys() else how for u, how in found.items()}
 
 
 def without_sampled(found: dict[Key, str]) -> dict[Key, str]:

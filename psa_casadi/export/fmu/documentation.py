@@ -11,7 +11,7 @@ from psa_casadi.export.common.html_page import page, table_of
 from psa_casadi.export.common.icon import ICONS, drawing_of, svg
 from psa_casadi.export.common.markup import force_scale, generation_tool, time_scale, what_it_is
 from psa_casadi.export.common.publication import LICENSE_ENTRY
-from psa_casadi.export.common.variable_table import Variable, variable_table
+from psa_casadi.export.common.variable_table import Variable, starts_at_voltage, variable_table
 from psa_casadi.export.fmu.communication_step import SHARE, STEPS_PER_PERIOD, HeldStep
 from psa_casadi.export.fmu.reference_results import FOLDER, NOTES
 from psa_casadi.model.compose import Model
@@ -41,6 +41,12 @@ the memory that the voltages before it have left."""
 _STARTING = """An input that is set to another value before the first step is a step at the first
 instant: the states do not follow it into a new rest. `psa simulate` starts as this FMU does with
 the same --start-voltage and --history; without them it starts settled at its first voltage."""
+_SET_START = """ The parameter start_voltage does that: set to another value than {voltage:.6g} V
+before the initialization ends, it lets the voltage and all states begin as after a rise from 0 V to
+it within 1 s, settled but for what remembers the rise (hysteresis, creep), with the parameters and
+other inputs of then. A state or the voltage that was set itself keeps what it was set to, in
+whatever order. The start values of the tables, with the history behind them, are those of
+{voltage:.6g} V."""
 #: Movement within the time that the model needs to settle, over the nominal size, that is none.
 _AT_REST = 1e-6
 
@@ -153,7 +159,8 @@ def _start(model: Model) -> str:
     rates = np.array(s.f(0.0, *groups, model.parameter_vector(), *sampled)[0]).ravel()
     spent = np.abs(rates) * time_scale(model) / model.state_nominals()
     moves = "stays there" if np.max(spent, initial=0.0) < _AT_REST else "moves from there"
-    return f"{where} While its inputs keep their start values it {moves}. {_STARTING}"
+    settling = _SET_START.format(voltage=voltage) if starts_at_voltage(model) else ""
+    return f"{where} While its inputs keep their start values it {moves}. {_STARTING}{settling}"
 
 
 def _start_values(model: Model) -> dict[str, float]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import number, xml_text
+from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.fixed_step.planning import FixedStep
 from psa_casadi.export.fixed_step.probe import STEPS, shown_output
 from psa_casadi.export.fixed_step.source import function_code
@@ -65,11 +66,13 @@ def use_of(fixed: FixedStep) -> str:
     """Return what the page of the FMU says of its steps."""
     found = ", ".join(f"{e.voltage} {e.error:.1e}" for e in fixed.errors)
     output = shown_output(fixed.plan.model)
+    line = "held" if fixed.plan.held else "linear"
     return (
         f"Co-simulation takes steps of {fixed.plan.step:g} s: the same operations each time,"
         " without iteration or allocation. A communication step is a multiple of it; another one is"
         " an error. Parameters are constants, for whose values the step was made. Largest errors of"
-        f" {output} over its range, measured at export on voltages of {STEPS} steps: {found}."
+        f" {output} over its range, measured at export on voltages of {STEPS} steps, {line} over"
+        f" each: {found}."
     )
 
 
@@ -94,7 +97,7 @@ def _constants(root: ET.Element, *, third: bool) -> None:
     for place, variable in enumerate(variables, start=1):
         if third:
             variable.attrib.pop("intermediateUpdate", None)
-        if variable.get("causality") == "parameter" and variable.get("name") != "input_line":
+        if variable.get("causality") == "parameter" and variable.get("name") not in OPTIONS:
             variable.set("causality", "local")
             variable.set("variability", "constant")
             variable.set("initial", "exact")

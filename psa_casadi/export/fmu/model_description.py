@@ -21,8 +21,8 @@ from psa_casadi.export.common.markup import (
 )
 from psa_casadi.export.common.publication import published
 from psa_casadi.export.common.variable_table import Variable, variable_table
-from psa_casadi.export.fmu.dependencies import dependencies, without_sampled
-from psa_casadi.model.compose import Model, Structure
+from psa_casadi.export.fmu.dependencies import at_the_start, dependencies, without_sampled
+from psa_casadi.model.compose import Model
 
 __all__ = ["LOG_CATEGORIES", "describe", "generation_tool", "model_description", "time_scale"]
 
@@ -51,7 +51,7 @@ def model_description(model: Model, identifier: str, token: str, sources: Sequen
     variables = ET.SubElement(root, "ModelVariables")
     for reference, variable in enumerate(table):
         _variable(variables, reference, variable)
-    _structure(ET.SubElement(root, "ModelStructure"), model.structure, table)
+    _structure(ET.SubElement(root, "ModelStructure"), model, table)
     return xml_text(root)
 
 
@@ -99,8 +99,9 @@ def _variable(parent: ET.Element, reference: int, variable: Variable) -> None:
     ET.SubElement(scalar, "Real", attributes)
 
 
-def _structure(parent: ET.Element, structure: Structure, table: Sequence[Variable]) -> None:
-    found = dependencies(structure)
+def _structure(parent: ET.Element, model: Model, table: Sequence[Variable]) -> None:
+    structure = model.structure
+    found, initially = dependencies(structure), at_the_start(model)
     places = {(v.kind, v.index): place for place, v in enumerate(table, start=1)}
     outputs = [("output", i) for i in range(len(structure.outputs))]
     rates = [("derivative", i) for i in range(len(structure.states))]
@@ -110,7 +111,7 @@ def _structure(parent: ET.Element, structure: Structure, table: Sequence[Variabl
         )
         element = ET.SubElement(parent, tag) if chosen else parent
         for unknown in chosen:
-            listed = found[unknown] if unknowns is None else without_sampled(found[unknown])
+            listed = initially[unknown] if unknowns is None else without_sampled(found[unknown])
             known = {places[k]: kind for k, kind in listed.items()}
             attributes = {
                 "index": str(places[unknown]),

@@ -19,8 +19,8 @@ from psa_casadi.export.common.markup import (
 )
 from psa_casadi.export.common.publication import published
 from psa_casadi.export.common.variable_table import Variable, variable_table
-from psa_casadi.export.fmu.dependencies import Key, dependencies, without_sampled
-from psa_casadi.model.compose import Model, Structure
+from psa_casadi.export.fmu.dependencies import Key, at_the_start, dependencies, without_sampled
+from psa_casadi.model.compose import Model
 
 _COMMON = (
     "canGetAndSetFMUState",
@@ -73,7 +73,7 @@ def model_description3(model: Model, identifier: str, token: str, sources: Seque
     variables = ET.SubElement(root, "ModelVariables")
     for reference, variable in enumerate(table):
         _variable(variables, reference, variable)
-    _structure(ET.SubElement(root, "ModelStructure"), model.structure, table)
+    _structure(ET.SubElement(root, "ModelStructure"), model, table)
     return xml_text(root)
 
 
@@ -92,12 +92,13 @@ def _variable(parent: ET.Element, reference: int, variable: Variable) -> None:
     ET.SubElement(parent, "Float64", attributes)
 
 
-def _structure(parent: ET.Element, structure: Structure, table: Sequence[Variable]) -> None:
+def _structure(parent: ET.Element, model: Model, table: Sequence[Variable]) -> None:
     """Append Output, ContinuousStateDerivative, InitialUnknown and EventIndicator, in this order.
 
     FMI 3.0 knows no "tunable" in an InitialUnknown; there it is "dependent".
     """
-    found = dependencies(structure)
+    structure = model.structure
+    found, at_start = dependencies(structure), at_the_start(model)
     references = {(v.kind, v.index): reference for reference, v in enumerate(table)}
     outputs: list[Key] = [("output", i) for i in range(len(structure.outputs))]
     rates: list[Key] = [("derivative", i) for i in range(len(structure.states))]
@@ -111,7 +112,7 @@ def _structure(parent: ET.Element, structure: Structure, table: Sequence[Variabl
     ):
         for unknown in unknowns:
             initially = tag == "InitialUnknown"
-            listed = found[unknown] if initially else without_sampled(found[unknown])
+            listed = at_start[unknown] if initially else without_sampled(found[unknown])
             known = {references[k]: kind for k, kind in listed.items()}
             if initially:
                 known = {

@@ -129,6 +129,15 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     return kept.read_bytes()
 
 
+def make_compiler_ready() -> None:
+    """Let the `ziglang` compiler make its own parts for this machine's platform.
+
+    It does so at its first use, in 4 s; nothing happens where it is not installed.
+    """
+    if has_zig():
+        compile_library({"nothing.c": "int psa_nothing;\n"}, "nothing", host_platform())
+
+
 def _compiled(work: Path, texts: Mapping[str, str], command: Sequence[str], output: str) -> Path:
     """Run a compiler in a folder, with the sources; return the path of the file it wrote."""
     for name, text in texts.items():

@@ -1,12 +1,9 @@
 """The C sources of an exported model: hand-written logic, generated functions and data."""
 
-import hashlib
 import itertools
 import math
-import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import casadi as ca
@@ -15,11 +12,12 @@ import numpy as np
 from psa_casadi.component import Expression
 from psa_casadi.export.common.markup import xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
-from psa_casadi.export.common.variable_table import Variable, variable_table
-from psa_casadi.export.fmu.model_description import model_description
-from psa_casadi.export.fmu.model_description3 import model_description3
+from psa_casadi.export.common.variable_table import (
+    Variable,
+    starts_at_voltage,
+    variable_table,
+)
 from psa_casadi.export.fmu.validity import seen_duration, seen_inputs
-from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import c_arguments, c_slopes, generate_c
 from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
@@ -28,7 +26,7 @@ from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
 LOGIC = (
     "derivatives.c", "instance.c", "instants.c", "linear.c", "log.c", "model_adjoint.c",
     "model_casadi.c", "model_directional.c", "sampling.c", "snapshot.c", "snapshot_fault.c",
-    "solver.c", "step_derivatives.c", "validity.c", "values.c",
+    "solver.c", "start.c", "step_derivatives.c", "validity.c", "values.c",
     "fmi_data.h", "instance.h", "instants.h", "linear.h", "model.h", "solver.h",
 )  # fmt: skip
 #: The files of `fmu_src` that speak one version of FMI.
@@ -67,23 +65,6 @@ Make each model a library of its own: two of them have functions of the same nam
 """
 
 
-def write_sources(
-    model: Model, directory: Path, *, name: str | None = None, fmi: int = 2
-) -> list[Path]:
-    """Write all sources of a model's FMU to a folder and return the paths, sorted.
-
-    The folder is made if it does not exist. The sources compile alone; its README.txt has the line.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    identifier = name or model.name
-    written = []
-    texts = source_files(model, identifier, export_token(model, identifier, fmi), fmi)
-    for file_name, text in sorted(texts.items()):
-        atomic_write(directory / file_name, text)
-        written.append(directory / file_name)
-    return written
-
-
 def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dict[str, str]:
     """Return the text of every file in the folder sources, by its name; `fmi` is 2 or 3."""
     structure = model.structure
@@ -94,7 +75,7 @@ def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dic
     texts |= {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[fmi]}
     texts |= generate_c(structure, sensitivities=False)
     texts["model_derivatives.c"] = _c_code(derivatives)
-    texts["fmi_config.h"] = _config(derivatives)
+    texts["fmi_config.h"] = _config(model, derivatives)
     texts["fmi_data.c"] = _data(model, variable_table(model), identifier, token)
     names = compiled_files(texts)
     flags = " ".join(OPTIMISE)
@@ -107,20 +88,6 @@ def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dic
 def compiled_files(texts: Iterable[str]) -> list[str]:
     """Return the names that are C files, sorted."""
     return sorted(n for n in texts if n.endswith(".c"))
-
-
-def export_token(model: Model, identifier: str, fmi: int = 2) -> str:
-    """Return the token (GUID) of an export: a hash of its description and its sources."""
-    return token_of(model, identifier, source_files(model, identifier, "", fmi), fmi)
-
-
-def token_of(model: Model, identifier: str, texts: Mapping[str, str], fmi: int) -> str:
-    """Return the token of an export with these sources, which were made with an empty token."""
-    describe = model_description if fmi == 2 else model_description3
-    digest = hashlib.sha256(describe(model, identifier, "", compiled_files(texts)).encode("utf-8"))
-    for name, text in sorted(texts.items()):
-        digest.update(name.encode("utf-8") + b"\0" + text.encode("utf-8") + b"\0")
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16])) + "}"
 
 
 def _derivatives(structure: Structure) -> tuple[ca.Function, ca.Function]:
@@ -158,7 +125,7 @@ def _c_code(functions: Sequence[ca.Function]) -> str:
     return _GENERATED_HEAD + str(generator.dump())
 
 
-def _config(functions: Sequence[ca.Function]) -> str:
+def _config(model: Model, functions: Sequence[ca.Function]) -> str:
     sizes = {
         "ARG": max(8, *(f.sz_arg() for f in functions)),
         "RES": max(4, *(f.sz_res() for f in functions)),
@@ -166,6 +133,8 @@ def _config(functions: Sequence[ca.Function]) -> str:
         "W": max(1, *(f.sz_w() for f in functions)),
     }
     lines = [f"#define PSA_DERIVATIVES_SZ_{name} {size}" for name, size in sizes.items()]
+    place = model.input_names.index("voltage") if starts_at_voltage(model) else -1
+    lines.append(f"#define PSA_VOLTAGE ({place})")
     return "\n".join(["#ifndef PSA_FMI_CONFIG_H", "#define PSA_FMI_CONFIG_H", *lines, "#endif", ""])
 
 
@@ -184,6 +153,21 @@ def _row(variable: Variable) -> str:
 def _vector(name: str, size: str, values: Sequence[float]) -> str:
     body = ", ".join(_number(v) for v in [*values, 0.0])
     return f"const double {name}[{size} + 1] = {{{body}}};"
+
+
+def _settling(model: Model) -> list[str]:
+    """Return what a settled start needs to know of states and parameters."""
+    kinds = ["MEMORY_SETTLES" if q.settles else "MEMORY_STAYS" for q in model.structure.states]
+    memory = [
+        f"PSA_{kind if q.memory else 'MEMORY_NONE'}"
+        for kind, q in zip(kinds, model.structure.states, strict=True)
+    ]
+    gains = {c.gain for c in model.effects}
+    flags = [str(int(name in gains)) for name in model.parameter_names]
+    return [
+        f"const int psa_memory[PSA_NX + 1] = {{{', '.join([*memory, '0'])}}};",
+        f"const int psa_gains[PSA_NP + 1] = {{{', '.join([*flags, '0'])}}};",
+    ]
 
 
 def _switch_scales(model: Model, nominals: Sequence[float]) -> list[float]:
@@ -221,6 +205,7 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         _vector("psa_start_inputs", "PSA_NU", starts("input")),
         _vector("psa_start_parameters", "PSA_HELD", held),
         _vector("psa_state_nominals", "PSA_NX", nominals or [1.0]),
+        *_settling(model),
         _vector("psa_switch_scales", "PSA_NZ", scales),
         *_seen(model),
         "",

@@ -105,6 +105,11 @@ class Archive:
     def __exit__(self, *_: object) -> None:
         self._held.close()
 
+    def interfaces(self) -> tuple[int, ...]:
+        """Return which of co-simulation (1) and model exchange (0) the description announces."""
+        said = ((1, self.description.coSimulation), (0, self.description.modelExchange))
+        return tuple(kind for kind, announced in said if announced is not None)
+
     @property
     def prefix(self) -> str:
         """What the names of all C functions start with."""
@@ -118,6 +123,10 @@ class Archive:
     def tunable(self) -> list[str]:
         """Return the names of the parameters that may be set between steps."""
         return [v.name for v in self.description.modelVariables if v.variability == "tunable"]
+
+    def constants(self) -> list[str]:
+        """Return the names of the constants."""
+        return [v.name for v in self.description.modelVariables if v.variability == "constant"]
 
     def names(self, causality: str) -> list[str]:
         """Return the names of the variables of one causality, in the order of the description."""

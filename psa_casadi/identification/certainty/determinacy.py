@@ -19,6 +19,8 @@ FloatArray = npt.NDArray[np.float64]
 DETERMINED_WIDTH = 0.5
 #: Standard deviation of ln(k_P / k_B) where it is assumed: within a factor of two.
 ASSUMED_RATIO_SPREAD = 0.7
+#: Smallest eigenvalue over the largest, negative, that is still rounding.
+_ROUNDING = 1e-9
 _NORMAL_95 = 1.959963984540054
 
 
@@ -62,7 +64,7 @@ def determinacy(
     if assumed is not None:
         covariance = covariance + np.outer(assumed, assumed)
     of_values = slopes @ covariance[:count, :count] @ slopes.T
-    errors: FloatArray = np.sqrt(np.diag(of_values))
+    errors: FloatArray = np.sqrt(np.maximum(np.diag(of_values), 0.0))
     intervals, undetermined, on_bound = {}, [], []
     for k, name in enumerate(unknowns.names):
         value, half = fit.model.values[name], _NORMAL_95 * errors[k]
@@ -122,8 +124,16 @@ def covariance_of(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray:
             lags = lags[:1]  # colour never makes intervals shorter than white residuals do
         spread += scaled.T @ convolved(scaled, np.concatenate([lags[:0:-1], lags]))
     inverse = np.linalg.pinv(curvature, hermitian=True)
-    covariance: FloatArray = inverse @ spread @ inverse
-    return 0.5 * (covariance + covariance.T)
+    sandwich: FloatArray = inverse @ spread @ inverse
+    sandwich = 0.5 * (sandwich + sandwich.T)
+    sizes = np.linalg.eigvalsh(sandwich)
+    if sizes[0] >= -_ROUNDING * sizes[-1]:
+        return sandwich
+    # correlations cut off at their last lag are no covariance: what they add to white ones, then
+    sizes, directions = np.linalg.eigh(spread - curvature)
+    longer = (directions * np.maximum(sizes, 0.0)) @ directions.T
+    more: FloatArray = inverse + inverse @ longer @ inverse
+    return 0.5 * (more + more.T)
 
 
 def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | None:
@@ -138,7 +148,7 @@ def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | N
     if "k_P" not in p or "k_P" in free:
         return None
     softer = 1.0 / (1.0 + p["k_P"] / p["k_B"])  # d ln force / d ln k_P at the same displacement
-    forces = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
+    forces = [n for n in ("k_L", "A", "beta", "gamma", "delta", "h_ref") if n in p]
     change = {n: softer * p[n] for n in forces} | {n: p[n] for n in ("k_P", "c_P", "m_P")}
     curvature = np.diag(1.0 / fit.unknowns.prior**2)
     pull = np.zeros(fit.unknowns.size)

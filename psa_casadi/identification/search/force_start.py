@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import log
 
+import casadi as ca
 import numpy as np
 
 from psa_casadi.errors import PsaError
@@ -32,7 +33,7 @@ from psa_casadi.identification.start.linear_response import FloatArray
 from psa_casadi.identification.start.vector_fitting import Response, contributions, vector_fit
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.simulation.simulate import simulate_record
+from psa_casadi.simulation.simulate import record_inputs, simulate_record
 
 #: Samples that one record and all together may have, and the fewest that count.
 _MOST, _ALL, _FEWEST = 6_000, 12_000, 16
@@ -159,15 +160,18 @@ def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
 
 
 def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
-    """Return a record's simulated force, linear part and hysteresis (samples,) [N].
+    """Return a record's simulated force in front of the lag (samples,) [N].
 
     `number` is the record's place in the fit; the error is far below what sensors see. Raises
     PsaError where it cannot be simulated.
     """
-    start = fit.start(number)
-    states = simulate_record(fit.model, record, memory=start, rtol=_FORCE_RTOL).states
-    force: FloatArray = fit.model.values["k_L"] * states["u"] + states["f_H"]
-    return force
+    found = simulate_record(fit.model, record, memory=fit.start(number), rtol=_FORCE_RTOL)
+    s = fit.model.structure
+    states = np.array([found.states[n] for n in fit.model.state_names])
+    inputs = record_inputs(fit.model, record, record.n).T
+    force = ca.Function("force", [s.time, s.x, s.u, s.p], [s.sums["free_force"]])
+    values = force(record.time[None, :], states, inputs, fit.model.parameter_vector())
+    return np.asarray(values, dtype=np.float64).reshape(-1)
 
 
 def _linear_fits(best: Fit, parts: Sequence[Excerpt]) -> list[LinearFit]:
@@ -215,6 +219,6 @@ def _values(best: Fit, theta: FloatArray) -> dict[str, float]:
         "m_B": q_b * k_b,
     }
     scale = static_compliance(p) / static_compliance({**p, **found})
-    found |= {n: scale * p[n] for n in _FORCES}
+    found |= {n: scale * p[n] for n in _FORCES if n in p}
     bounds = {n: best.model.parameter(n).bounds for n in found}
     return {n: float(np.clip(v, *bounds[n])) for n, v in found.items()}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.components import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.search.force_start import retuned
@@ -29,7 +30,10 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
 
 #: Parameters that voltage and displacement determine in every record with loops.
-CORE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "c")
+CORE = (
+    *("k_L", "A", "beta", "gamma", "delta", "n", *MEMORY_SPECTRUM.fitted),
+    *("tau", "R_s", "c_P", "c_B", "c"),
+)
 
 #: Where there are more starts than finalists, all get the first evaluations, those the rest.
 _QUICK, _FINALISTS, _FIRST = 12, 3, 5

@@ -26,9 +26,11 @@ _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
 _HYSTERESIS_SHARE = 0.1
 
-#: Shapes of loop to start from: A, beta, gamma over k_L, and n.
+#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The second saturates early, far
+#: within the range; from the others a fit of such a loop ends with a steep A and no bend.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
     {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
+    {"A": -0.35, "beta": 0.6, "gamma": 0.02, "n": 1.4},
     {"A": -0.15, "beta": 0.05, "gamma": 0.05, "n": 1.1},
     {"A": -0.3, "beta": 0.1, "gamma": 0.1, "n": 1.05},
 )
@@ -120,7 +122,13 @@ def ordinary_values(model: Model, records: Sequence[Record]) -> dict[str, float]
     """
     k_l = max(abs(static_slope(records)), 1e-12) / static_compliance(model.values)
     loop = {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
-    return {"k_L": k_l, **loop, **_lags(model.values, min(r.sample_time for r in records))}
+    shape = loop if has_loop(model) else {}
+    return {"k_L": k_l, **shape, **_lags(model.values, min(r.sample_time for r in records))}
+
+
+def has_loop(model: Model) -> bool:
+    """Whether the model's hysteresis is Bouc-Wen's, whose shapes of loop are known."""
+    return "A" in model.values
 
 
 def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:

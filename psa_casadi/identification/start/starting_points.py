@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.loop import loop_start
-from psa_casadi.identification.start.ordinary import loop_starts
+from psa_casadi.identification.start.ordinary import has_loop, loop_starts
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 
@@ -24,10 +24,7 @@ def starting_points(
     The loop that the records show comes first, then shapes that loops usually have: fewer of them
     where the records show a loop, and where they show dynamics to try.
     """
-    shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
-    shown = loop_start(model, records)
-    if shown is not None:
-        shapes = [("the records' loops", shown), *shapes[: 1 if linear else 2]]
+    shapes = _shapes(model, records, fewer=bool(linear))
     if not linear:
         return shapes
     dynamics = _dynamics(model, linear, min(r.sample_time for r in records))
@@ -36,6 +33,19 @@ def starting_points(
         (f"dynamics {k}", _moved(model, shapes[0][1], other))
         for k, other in enumerate(dynamics[1:], 2)
     ]
+
+
+def _shapes(
+    model: Model, records: Sequence[Record], *, fewer: bool
+) -> list[tuple[str, dict[str, float]]]:
+    """Return shapes of loop; the model's own where its hysteresis is none of Bouc-Wen's."""
+    if not has_loop(model):
+        return [("the model's own loop", {})]
+    shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
+    shown = loop_start(model, records)
+    return (
+        shapes if shown is None else [("the records' loops", shown), *shapes[: 1 if fewer else 2]]
+    )
 
 
 def resolved(

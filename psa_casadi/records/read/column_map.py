@@ -10,6 +10,8 @@ _NAMES = ", ".join(COLUMNS)
 _PART = re.compile(
     r"(?P<name>[^=]*)=(?P<array>[^\[\]]*?)(?::(?P<unit>[^:\[\]]*)|\[(?P<in>[^]]*)\])?"
 )
+#: A unit with what 1 in the file is in it.
+_SCALED = re.compile(r"(?P<scale>[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)\s*(?P<unit>[^\d\s].*)")
 _FORM = "write NAME=ARRAY:UNIT, several joined by commas, such as time=t:ms,displacement=y:um"
 
 
@@ -19,7 +21,8 @@ def parse_columns(text: str) -> ColumnMap:
     NAME is a column of a record. ARRAY is a column's name in the header of a CSV or Parquet file,
     or a MATLAB array: a field of a structure is written `log.u`, the second column of a matrix
     `m.2`. Without UNIT the header's own unit counts, else the SI unit; a displacement is never
-    guessed.
+    guessed. A number before UNIT says what 1 in the file is, whatever the header says: `10um` for
+    the volts of a sensor of 10 um/V.
 
     Raises:
         InputError: every part that is not of this form, names no column or no unit of it.
@@ -41,8 +44,15 @@ def parse_columns(text: str) -> ColumnMap:
         elif name in found:
             problems.add(f"{where}: '{name}' is given twice; remove one of the two.")
         else:
+            scaled = _SCALED.fullmatch(unit.strip()) if unit else None
+            scale = float(scaled["scale"]) if scaled else None
+            unit = scaled["unit"] if scaled else unit
             if unit is not None:
                 check_unit(COLUMNS[name], unit, where, problems)
-            found[name] = Source(match["array"].strip(), unit)
+            if scale is not None and not 0.0 < abs(scale) < float("inf"):
+                problems.add(
+                    f"{where}: the scale {scale:g} leaves nothing of the numbers; correct it."
+                )
+            found[name] = Source(match["array"].strip(), unit, scale)
     problems.raise_if_any()
     return found

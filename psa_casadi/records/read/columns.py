@@ -1,12 +1,11 @@
-"""The columns a record may have, and the header that names them."""
+"""The columns a record may have, their units, and which array of a file is which of them."""
 
-import difflib
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.header_names import understood
 from psa_casadi.units import parse_unit, units_of
 
 
@@ -47,10 +46,20 @@ class Field:
 
 @dataclass(frozen=True)
 class Source:
-    """The array that holds a column, and its unit; None where the file or the column says it."""
+    """The array that holds a column, and its unit; None where the file or the column says it.
+
+    A `scale` that is given says what 1 in the file is: 10 with the unit um is 10 um, as of a
+    sensor's volts.
+    """
 
     array: str
     unit: str | None
+    scale: float | None = None
+
+    def __str__(self) -> str:
+        """Return it as `--columns` has it."""
+        scale = "" if self.scale is None else f"{self.scale:g}"
+        return self.array if self.unit is None else f"{self.array}:{scale}{self.unit}"
 
 
 #: Which array of a file is which column: sources by the name of the column.
@@ -62,164 +71,31 @@ SI_UNITS = {
     "monitor_voltage": "V", "charge": "C", "strain": "1",
 }  # fmt: skip
 
-_HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
+
+def ready_line(sources: ColumnMap) -> str:
+    """Return the option that says which array is which column, as a shell takes it."""
+    line = ",".join(f"{name}={source}" for name, source in sources.items())
+    if os.name == "nt" or _SPECIAL.search(line):  # PowerShell takes a comma for its own
+        line = f'"{line}"'
+    if any(source.scale is not None for source in sources.values()):
+        return f"--columns {line} (with your units; ':10um' says that 1 in the file is 10 um)"
+    return f"--columns {line} (with your units)"
 
 
-def parse_header(
-    texts: Sequence[str],
-    required: Sequence[str],
-    where: str,
-    problems: Problems,
-    wanted: ColumnMap | None = None,
-) -> Mapping[str, Field]:
-    """Return the columns that a header line `name [unit],name [unit],...` names.
+def usual_source(name: str, array: str, unit: str | None = None) -> Source:
+    """Return an array as the source of a column: in the unit that it states, else in the usual one.
 
-    `wanted` says which name stands for which column where the header does not use the columns'
-    own names. `where` (file and line) begins every sentence added to `problems`: no header, a
-    column missing, misspelled or there twice, a unit that is missing or wrong.
+    A stated unit that measures something else, as of a sensor's volts, waits for a scale.
     """
-    wanted = wanted or {}
-    counted = bool(wanted) and all(source.array in texts for source in wanted.values())
-    if all(_is_number(text) for text in texts) and not counted:
-        example = ",".join(COLUMNS[name].example for name in required)
-        numbered = {name: str(k) for k, name in enumerate(required, 1)}
-        problems.add(
-            f"{where}: found '{','.join(texts)[:60]}', expected a header; write a first line such "
-            f"as '{example}', or say which column is which: {ready_line(numbered)}"
-        )
-        return {}
-    fields: dict[str, Field] = {}
-    strangers: list[tuple[int, str]] = []
-    for index, text in enumerate(texts):
-        match = _HEADER.fullmatch(text.strip())
-        own = match["name"].strip() if match else text
-        name = _column_of(own, text, wanted)
-        open_unit = match is not None and match["unit"] is None and name not in wanted
-        if match is None or name not in COLUMNS or (open_unit and name in required):
-            strangers.append((index, text.strip()))
-        elif name in fields:
-            problems.add(
-                f"{where}, column {index + 1}: '{name}' stands twice in the header (first as "
-                f"column {fields[name].index + 1}); rename or remove one of the two."
-            )
-        else:
-            place = f"{where}, column '{own if name in wanted else name}'"
-            unit = _agreed_unit(name, match["unit"], wanted, place, problems)
-            fields[name] = Field(index, unit)
-    strangers = _by_other_names(strangers, fields, required, wanted, where, problems)
-    names = [m["name"] if (m := _HEADER.fullmatch(text)) else text for _, text in strangers]
-    _report_absent(fields, names, wanted, where, problems)
-    _report_missing(fields, names, [r for r in required if r not in wanted], where, problems)
-    return fields
+    usual = SI_UNITS.get(name, "um")
+    if unit is None:
+        return Source(array, usual)
+    wrong = Problems()
+    check_unit(COLUMNS[name], unit, "", wrong)
+    return Source(array, usual, 1.0) if wrong else Source(array, None)
 
 
-def _by_other_names(
-    strangers: Sequence[tuple[int, str]],
-    fields: dict[str, Field],
-    required: Sequence[str],
-    wanted: ColumnMap,
-    where: str,
-    problems: Problems,
-) -> list[tuple[int, str]]:
-    """Add the columns that go by a laboratory's name for them; return the cells that do not.
-
-    What has a column's own name keeps it. Two cells for one column, or one without a unit, are told
-    with the line to type, once for all of them.
-    """
-    known = [(index, text, understood(text)) for index, text in strangers]
-    open_ones = [n for n in COLUMNS if n not in fields and n not in wanted]
-    unclear: dict[str, list[str]] = {}
-    for column in open_ones:
-        cells = [(i, t, n.unit) for i, t, n in known if n is not None and n.column == column]
-        with_unit = [c for c in cells if c[2] is not None]
-        if len(with_unit) == 1:
-            index, text, unit = with_unit[0]
-            check_unit(COLUMNS[column], unit, f"{where}, column '{text}'", problems)
-            fields[column] = Field(index, unit or "")
-        elif cells and column in required:
-            unclear[column] = [text for _, text, _ in cells]
-            fields[column] = Field(cells[0][0], SI_UNITS.get(column, "um"))
-    left = [(index, text) for index, text, name in known if name is None]
-    if unclear:
-        told = (
-            f"'{name}' {'has no unit' if len(own) == 1 else 'may be more than one column'}"
-            f" ({', '.join(own)})"
-            for name, own in unclear.items()
-        )
-        texts = {name: own[0] for name, own in unclear.items()}
-        others = (text for _, text in left if text)
-        texts |= {name: next(others, "") for name in required if name not in (*fields, *wanted)}
-        line = ready_line({name: texts[name] for name in required if texts.get(name)}, wanted)
-        examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
-        problems.add(
-            f"{where}: {', '.join(told)}; write {examples} in the header, or say which, and in"
-            f" which unit: {line}"
-        )
-    return left
-
-
-def ready_line(cells: Mapping[str, str], wanted: ColumnMap | None = None) -> str:
-    """Return the option that says which cell of the header is which column; units as usual.
-
-    It holds what `wanted` says already.
-    """
-    parts = [
-        f"{name}={own.array}" + ("" if own.unit is None else f":{own.unit}")
-        for name, own in (wanted or {}).items()
-    ]
-    parts += [f"{name}={own}:{SI_UNITS.get(name, 'um')}" for name, own in cells.items()]
-    return f"--columns {','.join(parts)} (with your units)."
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"\s+", "_", name.strip().lower())
-
-
-def _column_of(own: str, text: str, wanted: ColumnMap) -> str:
-    """Return the column that a cell of a header stands for, or its name itself."""
-    for name, source in wanted.items():
-        if _plain(source.array) in (_plain(own), _plain(text)):
-            return name
-    return "" if _plain(own) in wanted else _plain(own)
-
-
-def _agreed_unit(
-    name: str, own: str | None, wanted: ColumnMap, where: str, problems: Problems
-) -> str:
-    """Return the unit that the header or `wanted` gives; the two must not disagree."""
-    given = wanted[name].unit if name in wanted else None
-    unit = own or given or (SI_UNITS.get(name) if name in wanted else None)
-    check_unit(COLUMNS[name], unit, where, problems)
-    if own and given and not _same_unit(own, given):
-        problems.add(
-            f"{where}: the header gives the unit '{own}', --columns gives '{given}'; leave the one "
-            f"in --columns out, or correct it."
-        )
-    return unit or ""
-
-
-def _same_unit(one: str, other: str) -> bool:
-    try:
-        return parse_unit(one).name == parse_unit(other).name
-    except InputError:
-        return True  # the unknown one was told already
-
-
-def _report_absent(
-    fields: Mapping[str, Field],
-    strangers: Sequence[str],
-    wanted: ColumnMap,
-    where: str,
-    problems: Problems,
-) -> None:
-    """Complain of names in `wanted` that the header does not have."""
-    for name, source in wanted.items():
-        if name not in fields:
-            found = ", ".join(filter(None, [*fields, *strangers])) or "nothing"
-            problems.add(
-                f"{where}: '{source.array}', which --columns names for '{name}', is not in the "
-                f"header (found: {found[:120]}); correct --columns."
-            )
+_SPECIAL = re.compile(r"[^\w.,=:+/%@-]")
 
 
 def check_unit(column: Column, unit: str | None, where: str, problems: Problems) -> None:
@@ -242,50 +118,6 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
     if parsed.quantity not in column.quantities and not compound:
         problems.add(
             f"{where}: the unit '{unit}' does not measure {column.quantities[0]}; correct it to "
-            f"one of {accepted}."
+            f"one of {accepted}, or say what 1 in the file is: --columns {column.name}=NAME:10"
+            f"{SI_UNITS.get(column.name, 'um')}."
         )
-
-
-def _report_missing(
-    fields: Mapping[str, Field],
-    strangers: Sequence[str],
-    required: Sequence[str],
-    where: str,
-    problems: Problems,
-) -> None:
-    absent = [name for name in COLUMNS if name not in fields]
-    meant = {
-        near[0]: _plain(name)
-        for name in strangers
-        if (near := difflib.get_close_matches(_plain(name), absent, n=1, cutoff=0.8))
-    }
-    missing = [name for name in absent if name in required and name not in meant]
-    for name in absent:
-        if name in meant:
-            problems.add(
-                f"{where}: the column '{meant[name]}' is unknown; if '{name}' is meant, correct "
-                f"the header to '{COLUMNS[name].example}', else give it a less similar name."
-            )
-        elif name in required:
-            found = ", ".join([*fields, *filter(None, strangers)]) or "nothing"
-            problems.add(
-                f"{where}: the column '{name}' is missing (found: {found[:120]}); add it to the "
-                f"header as '{COLUMNS[name].example}'{_or_type(name, missing, strangers)}."
-            )
-
-
-def _or_type(name: str, missing: Sequence[str], strangers: Sequence[str]) -> str:
-    """Return, behind the last missing column, the option that says which cells are meant."""
-    others = [s.strip() for s in strangers if s.strip() and not set(s) & set(",=:[]")]
-    if name != missing[-1] or len(others) < len(missing):
-        return " (or give --sample-time)" if name == "time" else ""
-    line = ready_line(dict(zip(missing, others, strict=False))).removesuffix(".")
-    return f", or say which column it is: {line}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return not text.strip()
-    return True

@@ -53,10 +53,10 @@ _UNIT_OF = {word: unit for unit, words in UNIT_WORDS.items() for word in words}
 #: What names the place of a channel behind the quantity: `Current Position of axis 1`.
 _OF_A_PLACE = re.compile(r" of [\w ]*?(axis|chan|channel)\s*:?\s*\w+$")
 _COLUMN_OF = {alias: column for column, names in ALIASES.items() for alias in names}
-#: A name and its unit: in brackets of any form, after a slash, an underscore or a space.
+#: A name and its unit: in brackets of any form, after a slash, comma, underscore or space.
 _FORMS = (
     re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]*)[\])}]"),
-    re.compile(r"(?P<name>.*?)\s*/\s*(?P<unit>\S+)"),
+    re.compile(r"(?P<name>.*?)\s*[/,]\s*(?P<unit>\S+)"),
     re.compile(r"(?P<name>.*)[_ ](?P<unit>[^_ ]+)"),
 )
 _DIGITS = re.compile(r"[0-9.+-]")

@@ -1,8 +1,8 @@
 """Text that instruments write in a form of their own, told as a plain table.
 
-LabVIEW measurement files (`.lvm`) and the data recorders of PI controllers (GCS arrays) keep the
-names of the columns and the sample time in a head. The table has the same number of lines, so that
-a mistake is told with the line of the file.
+LabVIEW measurement files (`.lvm`), the data recorders of PI controllers (GCS arrays) and
+oscilloscopes by Rigol keep the names of the columns and the sample time in a head. The table has
+the same number of lines, so that a mistake is told with the line of the file.
 
 Sources: National Instruments, "Specification for the LabVIEW Measurement File (.lvm)"; Physik
 Instrumente, "GCS Array Data Format".
@@ -29,6 +29,9 @@ def instrument_lines(path: str, lines: Sequence[str]) -> Sequence[str]:
     """
     if lines[0].strip().startswith("LabVIEW Measurement"):
         return _labview(path, lines)
+    names = [cell.strip() for cell in lines[0].strip().rstrip(",").split(",")]
+    if names[0] == "X" and names[-2:] == ["Start", "Increment"] and len(lines) > 1:
+        return _oscilloscope(path, lines, names[1:-2])
     head = lines[:_MOST_LINES]
     ends = (k for k, line in enumerate(head) if re.fullmatch(r"#\s*END_HEADER\s*", line))
     end = next(ends, None)
@@ -51,6 +54,21 @@ def _data_recorder(path: str, lines: Sequence[str], end: int) -> Sequence[str]:
         rows.append("\t".join([f"{k * step:.12g}", *cells]) if line.strip() else "")
         k += bool(line.strip())
     return [*[""] * end, "\t".join(["time [s]", *names]), *rows]
+
+
+def _oscilloscope(path: str, lines: Sequence[str], channels: Sequence[str]) -> Sequence[str]:
+    """Return an oscilloscope's table, whose rows are counted, with the time in their place."""
+    units = [cell.strip() for cell in lines[1].strip().rstrip(",").split(",")]
+    start, step = _number(units[-2]) if len(units) > 1 else math.nan, units[-1]
+    width, interval = len(channels), _positive(f"{path}: line 2", "Increment", step)
+    named = zip(channels, map(unit_named, units[1:]), strict=False)
+    header = ["time [s]", *(f"{name} [{unit}]" if unit else name for name, unit in named)]
+    rows, k = [], 0
+    for line in lines[2:]:
+        cells = line.split(",")[1 : 1 + width]
+        rows.append(",".join([f"{start + k * interval:.12g}", *cells]) if line.strip() else "")
+        k += bool(line.strip())
+    return ["", ",".join(header), *rows]
 
 
 def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:

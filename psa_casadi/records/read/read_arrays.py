@@ -18,6 +18,7 @@ from psa_casadi.records.read.columns import (
     Source,
     check_unit,
     ready_line,
+    usual_source,
 )
 from psa_casadi.records.read.file_bytes import read_bytes
 from psa_casadi.records.read.hdf5_process import series_apart
@@ -67,7 +68,7 @@ def read_arrays(
         elif name in required:
             problems.add(
                 f"{path}: no array is named '{name}' ({_listed(arrays)}); say which one it is:"
-                f" {_line(arrays, required)}{_OR_STEP if name == 'time' else ''}"
+                f" {_line(arrays, required)}.{_OR_STEP if name == 'time' else ''}"
             )
     if not columns or _lengths_differ(path, columns, wanted, problems):
         return None
@@ -121,7 +122,7 @@ def _line(arrays: Arrays, required: Sequence[str]) -> str:
     for name in required:
         if name not in texts:
             texts[name] = next(left, "ARRAY")
-    return ready_line({name: texts[name] for name in required})
+    return ready_line({name: usual_source(name, texts[name]) for name in required})
 
 
 def _listed(arrays: Arrays) -> str:

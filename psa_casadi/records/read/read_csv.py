@@ -11,8 +11,9 @@ are allowed in `displacement` (an empty cell or nan).
 from collections.abc import Sequence
 
 from psa_casadi.errors import Problems
-from psa_casadi.records.read.columns import ColumnMap, parse_header
+from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.records.read.csv_table import CsvText, load_text, parse_numbers
+from psa_casadi.records.read.header import parse_header
 from psa_casadi.records.read.layout import cells_of
 from psa_casadi.records.read.samples import Samples
 

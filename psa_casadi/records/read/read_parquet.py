@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.columns import ColumnMap, parse_header
+from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.records.read.file_bytes import check_size, read_bytes, reason_of
+from psa_casadi.records.read.header import parse_header
 from psa_casadi.records.read.samples import Samples, whole_samples
 from psa_casadi.units import FloatArray
 

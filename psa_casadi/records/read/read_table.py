@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import Problems
-from psa_casadi.records.read.columns import ColumnMap, parse_header
+from psa_casadi.records.read.columns import ColumnMap
+from psa_casadi.records.read.header import parse_header
 from psa_casadi.records.read.samples import Samples, whole_samples
 from psa_casadi.units import FloatArray
 

@@ -30,7 +30,7 @@ from psa_casadi.records.read.read_csv import read_csv
 from psa_casadi.records.read.read_parquet import read_parquet
 from psa_casadi.records.read.read_table import Table, read_table
 from psa_casadi.records.read.read_xlsx import read_xlsx
-from psa_casadi.records.read.samples import Samples
+from psa_casadi.records.read.samples import Samples, scaled
 from psa_casadi.records.record import Record
 from psa_casadi.units import parse_unit, to_si
 
@@ -62,7 +62,8 @@ def read_record(
 
     `need_displacement` demands a displacement column with values, as a comparison does;
     `need_excitation` a voltage that changes, as a fit does. `columns` names the arrays of the file
-    that are the columns, such as "time=t:ms,voltage=log.u,displacement=m.2:um" (`parse_columns`).
+    that are the columns, such as "time=t:ms,voltage=log.u,displacement=m.2:um" (`parse_columns`);
+    `displacement=CH2:10um` says that 1 in the file is 10 um.
     `sample_time` [s] gives the time of a file without one.
 
     Raises:
@@ -76,6 +77,7 @@ def read_record(
     samples = reader(str(path), required, wanted, problems)
     samples = _timed(samples, sample_time, problems)
     if samples is not None:
+        samples = scaled(samples, wanted)
         _check(samples, problems, need_excitation=need_excitation)
     problems.raise_if_any()
     if samples is None:
@@ -141,6 +143,7 @@ def record_from(
     samples = read_table(table, name, required, wanted, problems)
     samples = _timed(samples, sample_time, problems)
     if samples is not None:
+        samples = scaled(samples, wanted)
         _check(samples, problems, need_excitation=False)
     problems.raise_if_any()
     if samples is None:

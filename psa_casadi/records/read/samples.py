@@ -1,11 +1,12 @@
 """What every file format is read to: named columns of numbers, each cell with its place."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.units import FloatArray
 
@@ -26,6 +27,14 @@ class Samples:
     values: FloatArray
     lines: NDArray[np.int64]
     reported: NDArray[np.bool_]
+
+
+def scaled(samples: Samples, wanted: ColumnMap) -> Samples:
+    """Return samples with every column multiplied by the scale that `wanted` gives it."""
+    scales = {name: source.scale for name, source in wanted.items() if source.scale is not None}
+    if not scales:
+        return samples
+    return replace(samples, values=samples.values * [scales.get(n, 1.0) for n in samples.units])
 
 
 def whole_samples(

@@ -10,22 +10,26 @@ from numpy.typing import ArrayLike
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
+from psa_casadi.records.read.columns import COLUMNS, SI_UNITS
+from psa_casadi.records.record import Record
 from psa_casadi.units import parse_unit
 
 _NAME = re.compile(r"[a-z]\w*(?:\.\w+)* \[(?P<unit>[^\[\]]+)\]", re.IGNORECASE)
 
 
-def write_record(path: str | os.PathLike[str], columns: Mapping[str, ArrayLike]) -> None:
-    """Write columns to a CSV file, whole or not at all.
+def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, ArrayLike]) -> None:
+    """Write a record, or columns, to a CSV file, whole or not at all.
 
-    The keys are the header, `name [unit]` each; the values, shape (n,), are written in that unit as
-    the shortest decimal number that reads back as the same float. nan becomes an empty cell.
+    A record is written in SI units. The keys of columns are the header, `name [unit]` each; the
+    values, shape (n,), are written in that unit as the shortest decimal number that reads back as
+    the same float. nan becomes an empty cell.
 
     Raises:
         InputError: a key is not `name [unit]`, a unit is unknown, the columns differ in length or
             there are none, or the file cannot be written.
     """
-    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in columns.items()}
+    named = _columns_of(columns) if isinstance(columns, Record) else columns
+    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in named.items()}
     problems = Problems()
     if not arrays:
         problems.add(f"{path}: there are no columns to write; give at least one.")
@@ -41,6 +45,12 @@ def write_record(path: str | os.PathLike[str], columns: Mapping[str, ArrayLike])
     cells = [map(_cell, array.tolist()) for array in arrays.values()]
     lines = [",".join(arrays), *map(",".join, zip(*cells, strict=True)), ""]
     atomic_write(path, "\n".join(lines))
+
+
+def _columns_of(record: Record) -> dict[str, ArrayLike]:
+    units = {**SI_UNITS, "displacement": record.displacement_unit, "displacement_2": "m"}
+    columns = {name: getattr(record, name) for name in COLUMNS}
+    return {f"{name} [{units[name]}]": v for name, v in columns.items() if v is not None}
 
 
 def _check_name(name: str, problems: Problems) -> None:

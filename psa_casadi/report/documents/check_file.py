@@ -23,7 +23,10 @@ class CheckedRow:
 
 @dataclass(frozen=True)
 class CheckFile:
-    """The checks of an FMU; `compared` says whether there was a model to compare with."""
+    """The checks of an FMU; `compared` says whether there was a model to compare with.
+
+    `left_out` names the checks that this kind of FMU has nothing for.
+    """
 
     format: Literal["psa_casadi.check/1"]
     package_version: str
@@ -31,6 +34,7 @@ class CheckFile:
     passed: bool
     compared: bool
     rows: tuple[CheckedRow, ...]
+    left_out: tuple[str, ...] = ()
 
 
 def check_file(report: CheckReport) -> dict[str, Any]:
@@ -42,4 +46,5 @@ def check_file(report: CheckReport) -> dict[str, Any]:
         for r in report.rows
     )
     passed, compared = report.passed, report.compared
-    return asdict(CheckFile(FORMAT, __version__, str(report.path), passed, compared, tuple(rows)))
+    path, left_out = str(report.path), report.left_out
+    return asdict(CheckFile(FORMAT, __version__, path, passed, compared, tuple(rows), left_out))

@@ -40,7 +40,7 @@ class FittedRecord:
 
 @dataclass(frozen=True)
 class AdvisedRecord:
-    """A record that would tell more, how often, and the parameters that it would determine."""
+    """A record to measure next: how often, and the parameters that it would determine."""
 
     sentence: str
     parameters: tuple[str, ...]

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from psa_casadi.files import atomic_write
 from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.live_part import LiveModel, add_live
 from psa_casadi.report.words.tables import Table
 
 
@@ -36,12 +37,14 @@ def write_design_page(
     tables: Sequence[TitledTableLike] = (),
     figures: Sequence[Picture] = (),
     badges: Sequence[str] = (),
+    live: LiveModel | None = None,
 ) -> None:
     """Write the page of a design, whole or not at all.
 
     The first sentence of `summary` is the result, the others follow as a list; then come the
     figures (plots as `psa_casadi.report.plots.theme.styled` makes them) and the tables
-    with their notes. `badges` are short marks under the title, such as "2,000 samples".
+    with their notes. `badges` are short marks under the title, such as "2,000 samples". `live` is
+    a model that runs in the page on the designed voltage.
 
     Raises InputError when `path` cannot be written to.
     """
@@ -54,6 +57,8 @@ def write_design_page(
         page.section("Figures")
     for picture in figures:
         page.picture(picture)
+    if live is not None:
+        add_live(page, live)
     for titled in tables:
         page.section(titled.title)
         page.table(titled.table, {"FAIL": "bad", "pass": "good"})

@@ -8,6 +8,7 @@ from psa_casadi.files import atomic_write
 from psa_casadi.report.page.budget_part import add_budget
 from psa_casadi.report.page.cause_part import add_causes, add_evidence
 from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.live_part import add_live, live_diagnosis
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
 from psa_casadi.report.page.record_part import add_records, points_each
 from psa_casadi.report.plots.figure import diagnosis_figure
@@ -17,9 +18,9 @@ from psa_casadi.report.words.phrases import (
     VERDICTS,
     added,
     gain_sentence,
+    in_page_unit,
     length_scale,
     listing,
-    micro,
     number,
     one_unit,
     percent,
@@ -44,13 +45,18 @@ def write_report(
     *,
     origin: str = "measured",
     small: bool = False,
+    still: bool = False,
 ) -> None:
     """Write the page of a diagnosis, whole or not at all: the story first, then the details.
 
     `origin`, "measured" or "synthetic", is what the page calls the records. A `small` page, below
-    1 MB, has one picture in place of the plots. Raises InputError when `path` cannot be written to.
+    1 MB, has one picture in place of the plots. Unless it is to be `still`, the model runs in the
+    page: sliders for its parameters, switches for its effects.
+
+    Raises InputError when `path` cannot be written to.
     """
     d, series = diagnosis, series_of(diagnosis)
+    live = None if still else live_diagnosis(d, series)  # compiles beside what follows
     page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin), small=small)
     counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
     with one_unit(length_scale(d.base_errors.holdout_rms_m, counts=counts)):
@@ -60,6 +66,8 @@ def write_report(
         _picture(page, series, origin)
         page.tiles(_tiles(d))
         add_budget(page, d)
+        if live is not None:
+            add_live(page, live)
         add_misfit(page, d)
         add_evidence(page, d)
         add_causes(page, d)
@@ -67,7 +75,8 @@ def write_report(
         _gain(page, d)
         _rest(page, d)
         _details(page, d, series, origin)
-    atomic_write(path, page.text())
+        text = page.text()
+    atomic_write(path, text)
 
 
 def _badges(d: Diagnosis, origin: str) -> list[str]:
@@ -154,6 +163,6 @@ def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str
         page.paragraph(note, "note")
     if d.noise:
         page.section("Noise")
-        page.bullets(micro(n.sentence) for n in d.noise)
+        page.bullets(in_page_unit(n.sentence) for n in d.noise)
     page.section("Records")
     page.table(record_table(d.experiments, origin))

@@ -1,11 +1,12 @@
 """One self-contained HTML page: style, script, sections, tables and plots, nothing from the net."""
 
 import base64
+import hashlib
 import io
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
@@ -24,6 +25,12 @@ from psa_casadi.version import __version__
 _FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
 _HASH = re.compile(r"[0-9a-f]{64}")
 _WIDE = 28
+#: The scripts of a model that runs in a page, by what it does there, in their order.
+_LIVE = ("live_model.js", "live_plot.js", "live_zoom.js", "live_knobs.js")
+LIVE_SCRIPTS = {
+    "report": (*_LIVE, "live.js", "live_start.js"),
+    "playground": (*_LIVE, "voltages.js", "playground.js", "live_start.js"),
+}
 
 
 @dataclass(frozen=True)
@@ -42,12 +49,12 @@ class Document:
     """
 
     def __init__(self, title: str, badges: Sequence[str], *, small: bool = False) -> None:
-        self._title, self.small = title, small
+        self._title, self.small, self._alive = title, small, ""
         marks = "".join(
             f'<span class="badge {_text(b.split()[0])}">{_text(b)}</span>' for b in badges
         )
         self._head = f"<h1>{_text(title)}</h1><p>{marks}</p>"
-        self._top: list[str] = []
+        self._top: list[str | Callable[[], str]] = []
         self._parts = self._top
         self._sections: list[tuple[str, str]] = []
 
@@ -130,29 +137,71 @@ class Document:
         if not self.small:
             self._parts.append(f'<div class="pair">{"".join(map(_figure, pictures))}</div>')
 
+    def live(self, told: Callable[[], Mapping[str, Any] | str]) -> None:
+        """Add a model that runs in the page.
+
+        What live.js must know of it is asked for when all else is there; words say why it is not.
+        """
+
+        def part() -> str:
+            found = told()
+            if isinstance(found, str):
+                return f'<p class="note">{_text(found)}</p>'
+            self._alive = found["kind"]
+            return (
+                f'<div class="live">{_json(found)}<p class="note still-note">With scripts on, the'
+                " model runs here: sliders for its parameters, switches for its effects.</p></div>"
+            )
+
+        self._parts.append(part)
+
     def text(self) -> str:
-        """Return the page."""
-        style, script = (
-            files("psa_casadi.report.page").joinpath(name).read_text(encoding="utf-8")
-            for name in ("page.css", "page.js")
-        )
+        """Return the page; no script runs in it but its own, and it asks for nothing outside."""
         contents = "".join(f'<a href="#{n}">{_text(title)}</a>' for n, title in self._sections)
         body = [self._head, *self._top]
         if self._sections:
             body += [f'<nav aria-label="contents">{contents}</nav>', *self._parts]
+        told = [part if isinstance(part, str) else part() for part in body]
+        style = _source("page.css") + (_source("live.css") if self._alive else "")
+        library = [] if self.small else [get_plotlyjs()]
+        scripts = [] if self.small else [_source("page.js")]
+        scripts += ["\n".join(map(_source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
         return (
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            + _policy([*library, *scripts])
+            + '<meta name="viewport" content="width=device-width, initial-scale=1">'
             f"<title>{_text(self._title)}</title><style>{style}</style>"
-            + ("" if self.small else f"<script>{get_plotlyjs()}</script>")
+            + "".join(f"<script>{text}</script>" for text in library)
             + "</head>\n<body><main>\n"
-            + "\n".join(body)
+            + "\n".join(told)
             + f"\n<footer>{_text(_made())}</footer>"
             + f'\n<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
             + "\n</main>"
-            + ("" if self.small else f"<script>{script}</script>")
+            + "".join(f"<script>{text}</script>" for text in scripts)
             + "\n</body></html>\n"
         )
+
+
+def _source(name: str) -> str:
+    """Return a style or script that lies beside this file."""
+    return files("psa_casadi.report.page").joinpath(name).read_text(encoding="utf-8")
+
+
+def _policy(scripts: Iterable[str]) -> str:
+    """Return what a browser is told to refuse: all scripts but these, and all requests."""
+    digests = (hashlib.sha256(text.encode()).digest() for text in scripts)
+    allowed = " ".join(f"'sha256-{base64.b64encode(d).decode('ascii')}'" for d in digests)
+    rules = (
+        "default-src 'none'", "style-src 'unsafe-inline'", "img-src data: blob:",
+        f"script-src 'wasm-unsafe-eval' {allowed}", "base-uri 'none'", "form-action 'none'",
+    )  # fmt: skip
+    return f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">'
+
+
+def _json(content: object) -> str:
+    """Return data for a script; "<" is escaped so that no text in it can end the script."""
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json">{text}</script>'
 
 
 def _made() -> str:

@@ -15,6 +15,7 @@ from psa_casadi.records import write_record
 from psa_casadi.records.record import Record
 from psa_casadi.report.page.design_page import write_design_page
 from psa_casadi.report.page.document import Picture
+from psa_casadi.report.page.live_part import live_design
 from psa_casadi.report.plots.theme import styled
 from psa_casadi.report.words.phrases import (
     interval_text,
@@ -28,6 +29,7 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, MEASURED_COLOUR
 from psa_casadi.report.words.tables import Table
+from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray, convert
 
 _COLOURS = (EXTENDED_COLOUR, BASE_COLOUR, MEASURED_COLOUR)
@@ -60,8 +62,15 @@ def write_experiment_page(
     design: Separated | Informative,
     model: Model,
     rivals: Mapping[str, Rival],
+    *,
+    still: bool = False,
 ) -> None:
-    """Write the page of a designed experiment; raises InputError where it cannot be written."""
+    """Write the page of a designed experiment, in which the model runs unless it is to be `still`.
+
+    Raises InputError where it cannot be written.
+    """
+    played = design.record.time, design.record.voltage
+    live = None if still else live_design(model, (*played, simulate(model, *played).displacement))
     several = isinstance(design, Separated)
     title = "Experiment that separates effects" if several else "Experiment for the parameters"
     responses = {n: r.predict(design.record, r.truth) for n, r in rivals.items()}
@@ -72,6 +81,7 @@ def write_experiment_page(
         tables=design_tables(design, model),
         figures=(voltage_picture(design.record), response_picture(design.record, responses)),
         badges=(f"{design.record.n} samples", f"{number(design.limits.duration)} s"),
+        live=live,
     )
 
 

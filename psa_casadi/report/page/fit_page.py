@@ -9,6 +9,7 @@ from psa_casadi.files import atomic_write
 from psa_casadi.identification.certainty.profile import Profile, profile_sentences
 from psa_casadi.identification.identify import Identification
 from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.live_part import LiveModel, add_live, live_fit
 from psa_casadi.report.page.record_part import add_records
 from psa_casadi.report.plots.figure import fit_figure
 from psa_casadi.report.plots.finding_plots import correlation_plot, determinacy_plot
@@ -38,17 +39,20 @@ def write_fit_report(
     origin: str = "measured",
     profiles: Sequence[Profile] = (),
     small: bool = False,
+    still: bool = False,
 ) -> None:
     """Write the page of an identification, whole or not at all.
 
     It shows what the records determine, measured and model, and what the residual is.
     `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
     beside the determinacy. A `small` page, below 1 MB, has one picture in place of the plots.
+    Unless it is to be `still`, the model runs in the page.
     Raises InputError when `path` cannot be written to.
     """
     series = series_of_fit(found)
+    live = None if still else live_fit(found, series)
     with one_unit(_scale(series)):
-        page = fit_page(found, series, origin=origin, profiles=profiles, small=small)
+        page = fit_page(found, series, origin=origin, profiles=profiles, small=small, live=live)
     atomic_write(path, page)
 
 
@@ -59,8 +63,12 @@ def fit_page(
     origin: str = "measured",
     profiles: Sequence[Profile] = (),
     small: bool = False,
+    live: LiveModel | None = None,
 ) -> str:
-    """Return the page; `series` are the records of the identification with the model's curve."""
+    """Return the page; `series` are the records of the identification with the model's curve.
+
+    `live` is the model if it is to run in the page.
+    """
     figures = [residual_figures(s, s.curves[0]) for s in series]
     graded = grades(found)
     count = len(series)
@@ -69,6 +77,8 @@ def fit_page(
     _verdict(page, found, figures, graded, origin, _scale(series))
     if small:
         page.still(fit_figure(found, origin=origin), "The fit in one picture")
+    if live is not None:
+        add_live(page, live)
     _determined(page, found, graded)
     if profiles:
         page.section("Profile likelihoods")

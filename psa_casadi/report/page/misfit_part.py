@@ -8,7 +8,14 @@ from psa_casadi.diagnosis.residual.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.page.document import Document, Picture
 from psa_casadi.report.plots.view_plots import spectrum_view_plot, view_named, view_plot
-from psa_casadi.report.words.phrases import added, length_scale, micro, number, percent, weight
+from psa_casadi.report.words.phrases import (
+    added,
+    in_page_unit,
+    length_scale,
+    number,
+    percent,
+    weight,
+)
 from psa_casadi.report.words.tables import Table
 
 #: Views that say much the same: one of each family is drawn.
@@ -117,7 +124,7 @@ def split_table(before: Misfit, after: Misfit | None, *, counts: bool) -> Table:
 def _sentences(page: Document, misfits: Sequence[Misfit]) -> None:
     order = sorted(misfits, key=lambda m: -weight(m))
     for m in order[:_RECORDS]:
-        page.bullets(map(micro, m.sentences[:_SENTENCES]))
+        page.bullets(map(in_page_unit, m.sentences[:_SENTENCES]))
     if len(order) > _RECORDS:
         page.paragraph(
             f"These are the {_RECORDS} of {len(order)} records with the largest error over their"

@@ -12,7 +12,11 @@ from psa_casadi.diagnosis.result import Alternative, Candidate, Cause, Decision,
 from psa_casadi.model.compose import Model
 from psa_casadi.units import convert
 
-_MICRO = re.compile(r"(?<=\d) um\b")
+#: A length in a sentence.
+_LENGTH = re.compile(r"(?P<number>[+-]?\d[\d.]*(?:e[+-]?\d+)?) (?P<unit>mm|um|nm)\b")
+_METRES = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9}
+#: A length in a sentence stays in its own unit where the page's would give a larger number.
+_LARGEST = 1000.0
 
 #: What a record may be: measured on a device, or computed.
 ORIGINS = ("measured", "synthetic")
@@ -88,16 +92,28 @@ def percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def micro(sentence: str) -> str:
-    """Return a sentence with "um" after a number written as "µm", as the pages write it."""
-    return _MICRO.sub(" µm", sentence)
+def in_page_unit(sentence: str) -> str:
+    """Return a sentence with its errors in the unit of the page, and "µm" for "um"."""
+    page = _PAGE.get()
+
+    def shown(length: re.Match[str]) -> str:
+        unit = length["unit"].replace("u", "µ")
+        if page is None or page.unit in ("counts", unit):
+            return f"{length['number']} {unit}"
+        value = page.factor * _METRES[length["unit"]] * float(length["number"])
+        if abs(value) >= _LARGEST:
+            return f"{length['number']} {unit}"
+        sign = "+" if length["number"].startswith("+") else ""
+        return f"{sign}{float(f'{value:.1e}'):g} {page.unit}"
+
+    return _LENGTH.sub(shown, sentence)
 
 
 def strongest_sentence(misfits: Sequence[Misfit]) -> str:
     """Return the sentence that says most of what is wrong, "" if nothing is above the noise."""
     told = [m for m in misfits if len(m.sentences) > 1]
     if told:
-        return micro(max(told, key=weight).sentences[1])
+        return in_page_unit(max(told, key=weight).sentences[1])
     return ""
 
 

@@ -61,16 +61,20 @@ class Series:
     @property
     def time_scale(self) -> Scale:
         """The unit to show times in: `shown = factor * seconds`."""
-        span = float(self.time[-1] - self.time[0])
-        if span >= 1.0:
-            return Scale("s", 1.0)
-        return Scale("ms", 1e3) if span >= 1e-3 else Scale("µs", 1e6)
+        return time_scale(float(self.time[-1] - self.time[0]))
 
     @property
     def residual_scale(self) -> Scale:
         """The unit to show residuals in."""
         largest = max(float(np.nanmax(np.abs(self.residual(c)))) for c in self.curves)
         return length_scale(largest, counts=self.counts)
+
+
+def time_scale(span: float) -> Scale:
+    """Return the unit to show times of a span [s] in: `shown = factor * seconds`."""
+    if span >= 1.0:
+        return Scale("s", 1.0)
+    return Scale("ms", 1e3) if span >= 1e-3 else Scale("µs", 1e6)
 
 
 def series_of(d: Diagnosis) -> tuple[Series, ...]:

@@ -141,6 +141,8 @@ def effect_page(effect: Component, width: int = 100) -> str:
 def check_sentence(report: "CheckReport") -> str:
     """Say how the check of an FMU ended."""
     against = "" if report.compared else " There was no model to compare it with."
+    if report.left_out:
+        against += f" Left out, as its step is fixed: {listing(report.left_out)}."
     if report.passed:
         return f"{Path(report.path).name} passed all {len(report.rows)} checks.{against}"
     failed = listing([r.name for r in report.failures])

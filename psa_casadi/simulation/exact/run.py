@@ -32,9 +32,9 @@ LANES = 4
 #: Tried steps over the samples, times 2^coarsest, beyond which a run is left to the stepper, which
 #: takes the time of 10 to 60 of them for a sample: at this tolerance of a step, and as its root
 #: below. A set in lanes has no other way.
-_MOST, _AT, _MOST_IN_LANES = 60, 1e-6, 100_000
+MOST, AT, _MOST_IN_LANES = 60, 1e-6, 100_000
 #: Time steps that differ by less than this share count as one, and so many may differ by more.
-_ALIKE, _LENGTHS = 1e-6, 8
+ALIKE, LENGTHS = 1e-6, 8
 #: Vectors of four numbers whatever the processor; strict C99 has no vectors.
 _FLAGS = ("-std=gnu99", "-fno-math-errno")
 #: With -O1 a model compiles in 0.5 s, with -O3 in 1.2 s, and runs as fast within 10 %. Many sets
@@ -131,14 +131,14 @@ def time_steps(t: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
     """
     steps = np.diff(t)
     mean = float(steps.mean())
-    if float(np.abs(steps - mean).max()) <= _ALIKE * mean:
+    if float(np.abs(steps - mean).max()) <= ALIKE * mean:
         return np.array([mean]), np.zeros(steps.size, np.int32)
     order = np.argsort(steps, kind="stable")
     sizes = steps[order]
-    begins = np.concatenate([[True], np.diff(sizes) > _ALIKE * sizes[1:]])
+    begins = np.concatenate([[True], np.diff(sizes) > ALIKE * sizes[1:]])
     groups = np.cumsum(begins) - 1
     count = int(groups[-1]) + 1
-    if count > _LENGTHS:
+    if count > LENGTHS:
         raise NotExact(f"the record has {count} different time steps")
     which = np.empty(steps.size, np.int32)
     which[order] = groups
@@ -183,7 +183,7 @@ def run_exact(
     if everything:
         arrays |= {"x": np.empty((n, nx)), "y": np.empty((n, len(model.output_names)))}
     library = _library(model.structure, output, 1)
-    most = int(_MOST * max(1.0, _AT / tolerance) ** 0.5 * n) << coarsest
+    most = int(MOST * max(1.0, AT / tolerance) ** 0.5 * n) << coarsest
     how = {"tolerance": tolerance, "coarsest": coarsest, "steps_limit": most}
     cost = _run(library, (t, u, hold), arrays, sets=1, count=count, **how)
     return ExactSteps(

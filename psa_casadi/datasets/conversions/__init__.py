@@ -1,0 +1,1 @@
+"""What becomes of an original: each conversion is deterministic to the byte."""

@@ -1,0 +1,1 @@
+"""A model in a page: compiled to WebAssembly, and described for its sliders."""

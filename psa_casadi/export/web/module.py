@@ -1,0 +1,173 @@
+"""A model as a WebAssembly module: parameters and a record in, states and outputs out.
+
+The module is the C code that integrates models everywhere else: exact steps, the stepper behind
+them, and the state at the start of a record (`fmu_src/page`). It has no import but functions of
+JavaScript's `Math`.
+"""
+
+import hashlib
+import logging
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import casadi as ca
+
+from psa_casadi.cache import cached
+from psa_casadi.errors import InputError, MachineError
+from psa_casadi.model.compose import Model, Structure
+from psa_casadi.simulation.codegen import PRAGMAS, c_arguments, c_slopes, generate_c
+from psa_casadi.simulation.compiler import has_zig, run_compiler, sources_directory, zig_command
+from psa_casadi.simulation.exact.generate import generate
+from psa_casadi.simulation.exact.graph import Unprintable
+from psa_casadi.simulation.exact.run import ALIKE, AT, FINEST, LENGTHS, MOST
+from psa_casadi.simulation.exact.split import split_of
+from psa_casadi.simulation.stepper import SOURCES
+from psa_casadi.simulation.ways import (
+    AGREE,
+    LADDER,
+    SHOWN,
+    SMALLEST_STEP_RTOL,
+    STEP_SHARE,
+    STILL,
+    TIGHTEST,
+)
+
+_PAGE_SOURCES = ("page/page.c", "page/settle.c", "page/library.c")
+#: What a page calls, and how many bytes of stack it has.
+_EXPORTS = (
+    "reserve", "parameters", "nominal", "deviation", "start", "times", "inputs", "states",
+    "outputs", "steps", "way", "run",
+)  # fmt: skip
+_STACK = 1 << 20
+#: For the compiler, of every module.
+WEB_FLAGS = (
+    "--target=wasm32-freestanding", "-std=gnu99", "-O2", "-ffp-contract=off", "-fno-math-errno",
+    "-fbuiltin", "-msimd128", "-mbulk-memory",
+)  # fmt: skip
+
+
+def web_module(model: Model) -> bytes:
+    """Return the WebAssembly module of a model's equations; its values are set in the page.
+
+    What was compiled is kept. Raises MachineError without the `ziglang` compiler, InputError for a
+    model with sampled states, which no page runs.
+    """
+    return _compiled(model.structure)()
+
+
+def begun_module(model: Model) -> "Future[bytes | None]":
+    """Compile a model's module beside other work; the result is None where there is none.
+
+    The log then says why, unless the compiler is not installed.
+    """
+    nothing: Future[bytes | None] = Future()
+    nothing.set_result(None)
+    if not has_zig() or model.sampled_names:
+        return nothing
+    compiled = _compiled(model.structure)  # the text is CasADi's, which takes one thread
+    pool = ThreadPoolExecutor(max_workers=1)
+    found = pool.submit(copy_context().run, _or_none, compiled)
+    pool.shutdown(wait=False)
+    return found
+
+
+def _or_none(compiled: Callable[[], bytes]) -> bytes | None:
+    try:
+        return compiled()
+    except (MachineError, OSError) as error:
+        logging.getLogger("psa_casadi").warning("The page stays still: %s", error)
+        return None
+
+
+@cache
+def _compiled(structure: Structure) -> Callable[[], bytes]:
+    """Return what gives the module's bytes, once its text is there or it is found in the cache."""
+    if structure.sampled:
+        names = ", ".join(s.name for s in structure.sampled)
+        raise InputError(
+            [f"A page cannot run sampled states ({names}); leave the sampled components out."]
+        )
+    command = [*zig_command(), *WEB_FLAGS]  # before anything is made: raises where there is none
+    texts = module_texts(structure)
+    folder = sources_directory()
+    digest = hashlib.sha256(repr((version("ziglang"), command[1:])).encode())
+    digest.update(repr(sorted(texts.items())).encode())
+    for path in sorted([*folder.glob("*.[ch]"), *folder.glob("page/*.[ch]")]):
+        digest.update(path.name.encode() + path.read_bytes())
+    name = f"{digest.hexdigest()[:32]}.wasm"
+    return lambda: cached("web", name, lambda work: _compile(work, texts)).read_bytes()
+
+
+def module_texts(structure: Structure) -> Mapping[str, str]:
+    """Return the generated files of a module by their names."""
+    s = structure
+    outputs = [o.name for o in s.outputs]
+    shown = next((n for n in SHOWN if n in outputs), None)
+    exact = None if shown is None else _exact_model(s, shown)
+    by_input = ca.Function(
+        "psa_by_input", c_arguments(s), [ca.densify(ca.jacobian(c_slopes(s), s.u))], {"cse": True}
+    )
+    generator = ca.CodeGenerator("by_input.c", {"with_header": False})
+    generator.add(by_input)
+    return {
+        **generate_c(s, sensitivities=False),
+        **({} if exact is None else {"exact_model.h": exact}),
+        "by_input.c": PRAGMAS + generator.dump(),
+        "page_config.h": _config(s, by_input, exact=exact is not None),
+    }
+
+
+def _exact_model(structure: Structure, shown: str) -> str | None:
+    """Return the text that lets a model take exact steps, None where it cannot."""
+    split = split_of(structure)
+    try:
+        return None if isinstance(split, str) else generate(split, shown)
+    except Unprintable:
+        return None
+
+
+def _config(structure: Structure, by_input: ca.Function, *, exact: bool) -> str:
+    s = structure
+    names = list(s.parameter_names)
+    gains = [names.index(c.gain) for c in s.components if c.gain is not None]
+    ladder = ", ".join(f"{{{share!r}, {coarsest}}}" for share, coarsest in LADDER)
+    numbers = {
+        "EXACT": int(exact), "LADDER": f"{{{ladder}}}", "AGREE": AGREE, "TIGHTEST": TIGHTEST,
+        "STILL": STILL, "STEP_SHARE": STEP_SHARE, "SMALLEST_RTOL": SMALLEST_STEP_RTOL,
+        "MOST": MOST, "AT": AT, "ALIKE": ALIKE, "LENGTHS": LENGTHS, "FINEST": FINEST,
+        "GAINS": len(gains), "SZ_ARG": max(4, by_input.sz_arg()), "SZ_RES": by_input.sz_res(),
+        "SZ_IW": max(1, by_input.sz_iw()), "SZ_W": max(1, by_input.sz_w()),
+    }  # fmt: skip
+    lists = {
+        "memory": [int(q.memory) for q in s.states],
+        "settles": [int(q.settles) for q in s.states],
+        "gains": gains,
+    }
+    lines = ["#ifndef PAGE_CONFIG_H", "#define PAGE_CONFIG_H"]
+    lines += [f"#define PAGE_{name} {value}" for name, value in numbers.items()]
+    for name, values in lists.items():
+        body = ", ".join(map(str, [*values, 0]))
+        lines.append(f"static const int page_{name}[] __attribute__((unused)) = {{{body}}};")
+    return "\n".join([*lines, "#endif", ""])
+
+
+def _compile(work: Path, texts: Mapping[str, str]) -> Path:
+    """Compile the module in a folder and return its path there."""
+    for name, text in texts.items():
+        (work / name).write_text(text, encoding="utf-8")
+    folder = sources_directory()
+    sources = [*_PAGE_SOURCES, *SOURCES, *(["exact.c"] if "exact_model.h" in texts else [])]
+    command = [
+        *zig_command(), *WEB_FLAGS, "-I.", f"-I{folder / 'page'}", f"-I{folder}",
+        *(str(folder / name) for name in sources), "model.c", "by_input.c",
+        "-Wl,--no-entry", "-Wl,--strip-all", f"-Wl,-z,stack-size={_STACK}",
+        *(f"-Wl,--export=page_{name}" for name in _EXPORTS), "-o", "model.wasm",
+    ]  # fmt: skip
+    run_compiler(command, work)
+    if not (work / "model.wasm").is_file():
+        raise MachineError(f"The C compiler {command[0]} wrote no module of WebAssembly.")
+    return work / "model.wasm"

@@ -1,0 +1,214 @@
+// A page's model, alive: measured against model, loop and residual, drawn again while one drags.
+psaLive.report = function (box, told, run) {
+  'use strict';
+  var make = psaLive.make, values = told.parameters.map(function (p) { return p.value; });
+  var fitted = values.slice(), record = null, waiting = false, corrected = {checked: false}, last = null;
+
+  told.records.forEach(function (r) {
+    r.t = r.t ? psaLive.doubles(r.t) : Float64Array.from({length: r.n}, function (_, k) { return k * r.step; });
+    r.measured = psaLive.singles(r.measured);
+    r.correction = r.correction ? psaLive.singles(r.correction) : null;
+    Object.keys(r.inputs).forEach(function (n) { r.inputs[n] = psaLive.doubles(r.inputs[n]); });
+    r.voltage = r.inputs.voltage;
+    r.time = r.t.map(function (t) { return told.time.factor * t; });
+    r.shown = r.measured.map(function (y) { return told.length.factor * y; });
+    r.judged = judged(r);
+  });
+
+  // Samples that errors are of: those held out, else all; and those that find the offset.
+  function judged(r) {
+    var held = new Uint8Array(r.t.length), any = false;
+    r.held.forEach(function (span) { for (var k = span[0]; k <= span[1]; k += 1) { held[k] = 1; any = true; } });
+    return {held: held, any: any};
+  }
+
+  function rms(r, residual, held) {
+    var sum = 0, count = 0;
+    for (var k = 0; k < residual.length; k += 1) {
+      if (isFinite(residual[k]) && (held === null || r.judged.held[k] === held)) { sum += residual[k] * residual[k]; count += 1; }
+    }
+    return Math.sqrt(sum / Math.max(1, count));
+  }
+
+  function mean(r, residual) {
+    var sum = 0, count = 0;
+    for (var k = 0; k < residual.length; k += 1) {
+      if (isFinite(residual[k]) && !r.judged.held[k]) { sum += residual[k]; count += 1; }
+    }
+    return count ? sum / count : 0;
+  }
+
+  function simulate(r, at, quick) {
+    var found = run({values: at, t: r.t, inputs: r.inputs, deviation: r.deviation, settle: true, rest: r.rest, quick: quick});
+    if (found.status) { return found; }
+    var y = found.outputs[told.shown];
+    for (var k = 0; k < y.length; k += 1) { y[k] += corrected.checked && r.correction ? r.correction[k] : 0; }
+    return {status: 0, way: found.way, y: y};
+  }
+
+  function missed(r, y) { return r.measured.map(function (m, k) { return m - y[k]; }); }
+
+  // The sensor's offset is found again for other values, as a fit does: the mean residual stays the fit's.
+  function answer(r, quick) {
+    var now = simulate(r, values, quick);
+    if (now.status) { return now; }
+    var shift = told.design ? 0 : mean(r, missed(r, now.y)) - r.center;
+    now.y = now.y.map(function (y) { return y + shift; });
+    now.residual = missed(r, now.y);
+    r.fitted = r.fitted || now.y; // the first run is at the fitted values
+    return now;
+  }
+
+  // --- what is seen
+  var plots = ['time', 'loop', 'residual'].map(function (name) {
+    return make('canvas', {role: 'img', 'aria-label': told.captions[name]});
+  });
+  function figure(k) {
+    return make('figure', {}, [make('figcaption', {text: told.captions[['time', 'loop', 'residual'][k]]}), plots[k]]);
+  }
+  var legend = make('div', {className: 'legend'});
+  told.legend.forEach(function (row) {
+    var span = make('span', {text: row[1]});
+    span.style.setProperty('--own', 'var(' + row[0] + ')');
+    legend.appendChild(span);
+  });
+  var output = make('output', {}), status = make('span', {role: 'status'});
+
+  function length(metres) { return +(told.error.factor * metres).toPrecision(3) + ' ' + told.error.unit; }
+
+  function say(now) {
+    if (now.status) { output.textContent = 'With these values the model cannot be run: ' + now.reason + '.'; return; }
+    var which = record.judged.any ? 1 : null, size = rms(record, now.residual, which);
+    var was = rms(record, missed(record, record.fitted), which);
+    if (told.design) {
+      output.textContent = 'Off the ' + told.aim + ' by ' + length(size) + ' rms, ' +
+        +(100 * size / record.range).toPrecision(2) + ' % of its range. As it was: ' + length(was) + '.';
+      return;
+    }
+    var text = (record.judged.any ? 'Error on held-out samples' : 'Error') + ': ' + length(size) + ' rms, ' +
+      +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.noise) + '.';
+    if (record.base > record.noise && told.extended) {
+      var left = Math.max(0, size * size - record.noise * record.noise) / (record.base * record.base - record.noise * record.noise);
+      text += left < 1
+        ? ' Of the base model\u2019s error above the noise (in power) ' + Math.round(100 * (1 - left)) + ' % is removed.'
+        : ' That is more than the base model leaves, which was fitted by itself: ' + length(record.base) + '.';
+    }
+    output.textContent = text;
+  }
+
+  function draw(now) {
+    if (now.status) { return; }
+    var f = told.length.factor, g = told.error.factor, r = record, model = now.y.map(function (y) { return f * y; });
+    var held = r.held.map(function (s) { return [r.time[s[0]], r.time[s[1]]]; });
+    var was = r.fitted.map(function (y) { return f * y; });
+    var moved = knobs.moved().length > 0 || corrected.checked;
+    psaLive.plot(plots[0], {
+      x: 'time [' + told.time.unit + ']', y: 'displacement [' + told.length.unit + ']', bands: held, reach: zoom.reach,
+      curves: [{x: r.time, y: r.shown, colour: '--measured', dots: true}]
+        .concat(moved ? [{x: r.time, y: was, colour: '--fitted', width: 1}] : [])
+        .concat([{x: r.time, y: model, colour: '--model'}])
+    });
+    var part = psaLive.stretch(r.time, zoom.reach);
+    psaLive.plot(plots[1], {
+      x: 'voltage [V]', y: 'displacement [' + told.length.unit + ']',
+      curves: [{x: part(r.voltage), y: part(r.shown), colour: '--measured', dots: true}, {x: part(r.voltage), y: part(model), colour: '--model', width: 1}]
+    });
+    var ends = [r.time[0], r.time[r.time.length - 1]];
+    psaLive.plot(plots[2], {
+      x: 'time [' + told.time.unit + ']', y: told.aim + ' minus model [' + told.error.unit + ']', bands: held, reach: zoom.reach,
+      curves: [{x: r.time, y: now.residual.map(function (e) { return g * e; }), colour: '--model', width: 1}]
+        .concat((r.noise > 0 ? [2, -2] : []).map(function (k) {
+          return {x: ends, y: [k * g * r.noise, k * g * r.noise], colour: '--measured', dash: [5, 4], width: 1};
+        }))
+    });
+  }
+
+  function redraw() {
+    if (!waiting) { return; }
+    waiting = false;
+    var began = performance.now(), now = answer(record, true), ran = performance.now();
+    say(now);
+    draw(now);
+    last = {run: ran - began, draw: performance.now() - ran, samples: record.t.length};
+  }
+  function later() {
+    if (waiting) { return; }
+    waiting = true;
+    requestAnimationFrame(redraw);
+    setTimeout(redraw, 60); // a page that is not seen gets no frames
+  }
+
+  var zoom = psaLive.zoom([plots[0], plots[2]], function () {
+    return [record.time[0], record.time[record.time.length - 1]];
+  }, later);
+
+  // --- what is moved
+  var knobs = psaLive.knobs(told, values, later), switches = [];
+  if (told.records.some(function (r) { return r.correction; })) {
+    corrected = make('input', {type: 'checkbox'});
+    corrected.addEventListener('change', later);
+    switches.push(make('label', {className: 'switch'}, [
+      corrected, document.createTextNode('unnamed correction'), make('small', {text: told.correction})
+    ]));
+  }
+  var chosen = make('select', {}, told.records.map(function (r, k) {
+    return make('option', {value: String(k), text: r.name});
+  }));
+  function choose() {
+    var now = values.slice(), corrects = corrected.checked;
+    record = told.records[Number(chosen.value)];
+    note.textContent = record.note;
+    zoom.forget();
+    if (!record.fitted) {
+      corrected.checked = false;
+      knobs.move(fitted);
+      answer(record, true);
+      corrected.checked = corrects;
+      knobs.move(now);
+    }
+    later();
+  }
+  chosen.addEventListener('change', choose);
+  var note = make('p', {className: 'note'});
+
+  function button(text, act) {
+    var node = make('button', {type: 'button', text: text});
+    node.addEventListener('click', act);
+    return node;
+  }
+  function named() {
+    var found = {};
+    told.parameters.forEach(function (p, i) { found[p.name] = values[i]; });
+    return JSON.stringify(found);
+  }
+  var buttons = [
+    button('Reset', function () { corrected.checked = false; knobs.move(fitted, true); status.textContent = ''; later(); }),
+    button('Copy these values', function () {
+      psaLive.copy(named(), function (done) { status.textContent = done ? 'Copied, in SI units.' : 'The browser refused.'; });
+    })
+  ];
+  if (told.file) {
+    buttons.push(button('Download MODEL.json', function () {
+      psaLive.save('MODEL.json', psaLive.file(told, values), 'application/json');
+    }));
+  }
+  var choice = told.records.length > 1
+    ? [make('label', {className: 'field', text: 'Record'}, [chosen])] : [];
+  [
+    make('div', {className: 'bar'}, choice.concat(buttons, [status])), legend,
+    make('div', {className: 'large'}, [figure(0)]), make('div', {className: 'pair'}, [figure(1), figure(2)]), output, note
+  ].concat(knobs.nodes(function (p) { return p.free || p.interval; }, switches)).forEach(function (n) { box.appendChild(n); });
+  choose();
+  window.addEventListener('resize', later);
+  window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', later);
+  // for whoever measures or drives the page by script
+  box.psa = {
+    values: values, redraw: redraw, last: function () { return last; }, set: function (name, value) {
+      var at = values.slice();
+      at[told.parameters.findIndex(function (p) { return p.name === name; })] = value;
+      knobs.move(at);
+      waiting = true;
+      redraw();
+    }, answer: function (quick) { return answer(record, quick); }, file: function () { return psaLive.file(told, values); }
+  };
+};

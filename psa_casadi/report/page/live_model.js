@@ -1,0 +1,64 @@
+// A model of psa_casadi in WebAssembly: parameters and a record in, a trajectory out. SI units.
+var psaLive = {};
+
+psaLive.bytes = function (base64) {
+  'use strict';
+  var text = atob(base64), found = new Uint8Array(text.length);
+  for (var i = 0; i < text.length; i += 1) { found[i] = text.charCodeAt(i); }
+  return found;
+};
+
+// Arrays lie in a page as base64 of little-endian numbers.
+psaLive.doubles = function (base64) { return new Float64Array(psaLive.bytes(base64).buffer); };
+psaLive.singles = function (base64) { return Float64Array.from(new Float32Array(psaLive.bytes(base64).buffer)); };
+
+psaLive.reasons = {
+  1: 'the step size became too small', 2: 'a value is not finite', 3: 'too many steps were needed',
+  10: 'there is no equilibrium to start from', 11: 'the browser gives no more memory'
+};
+
+// Promise of a model. `told` lists inputs, outputs, states, parameters, as live_data.py writes them.
+psaLive.load = function (told) {
+  'use strict';
+  function run(page, asked) {
+    var n = asked.t.length, nu = told.inputs.length;
+    function view(at, count) { return new Float64Array(page.memory.buffer, at, count); }
+    if (page.page_reserve(n)) { return {status: 11, reason: psaLive.reasons[11]}; }
+    view(page.page_parameters(), told.parameters.length).set(asked.values);
+    view(page.page_nominal(), told.states.length).set(asked.nominals || told.nominals);
+    view(page.page_deviation(), told.states.length).set(told.states.map(function (s) {
+      return (asked.deviation && asked.deviation[s.name]) || 0;
+    }));
+    view(page.page_start(), told.states.length).set(asked.start || told.states.map(function (s) { return s.start; }));
+    view(page.page_times(), n).set(asked.t);
+    var inputs = view(page.page_inputs(), n * nu);
+    told.inputs.forEach(function (input, j) {
+      var given = asked.inputs[input.name];
+      for (var k = 0; k < n; k += 1) { inputs[k * nu + j] = given ? given[k] : input.start; }
+    });
+    var settle = !asked.start && (asked.settle || !told.starts_itself);
+    var status = page.page_run(asked.rtol || 1e-6, asked.hold === 'zero' ? 1 : 0, settle ? (asked.rest ? 2 : 1) : 0,
+      asked.quick ? 1 : 0, told.shown_nominal);
+    function columns(at, names) {
+      var all = view(at, n * names.length), found = {};
+      names.forEach(function (row, i) {
+        var column = new Float64Array(n);
+        for (var k = 0; k < n; k += 1) { column[k] = all[k * names.length + i]; }
+        found[row.name] = column;
+      });
+      return found;
+    }
+    if (status) { return {status: status, reason: psaLive.reasons[status]}; }
+    return {
+      status: 0, way: page.page_way() ? 'exact steps' : 'stepper', steps: page.page_steps(),
+      outputs: columns(page.page_outputs(), told.outputs), states: columns(page.page_states(), told.states)
+    };
+  }
+  function runner(instance) { return function (asked) { return run(instance.exports, asked); }; }
+  var bytes = psaLive.bytes(told.wasm), imports = {Math: Math};
+  try {
+    return Promise.resolve(runner(new WebAssembly.Instance(new WebAssembly.Module(bytes), imports)));
+  } catch (refused) { // browsers of before 2023 compile so much only beside the page's own work
+    return WebAssembly.instantiate(bytes, imports).then(function (made) { return runner(made.instance); });
+  }
+};

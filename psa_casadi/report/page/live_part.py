@@ -1,0 +1,255 @@
+"""The part of a page whose model is alive: the records that it runs on, and how they began."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.export.web.module import begun_module
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.shared_starts import shared_starts
+from psa_casadi.identification.identify import Identification
+from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
+from psa_casadi.report.page.document import Document
+from psa_casadi.report.page.live_data import doubles, live_data, singles
+from psa_casadi.report.words.phrases import added, handy_scale, length_scale
+from psa_casadi.report.words.series import Series, spans, time_scale
+from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
+from psa_casadi.simulation.exact.run import ALIKE
+
+FloatArray = npt.NDArray[np.float64]
+IndexArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Samples of all records in a page, and records; of more, those that the model misses most.
+_SAMPLES, _RECORDS = 12_000, 6
+#: Left-out samples may be off the line between their neighbours by this share of the range.
+_BENT = 5e-3
+
+
+@dataclass(frozen=True, eq=False)
+class LiveRecord:
+    """A record that a model runs on, arrays (n,) in SI units: what it is compared with, and how.
+
+    `deviation` holds the start of states off where the voltage puts them, `center` the residual of
+    the model as it was fitted, `base` the base model's rms error, `correction` what an unnamed
+    correction adds. It begins in motion, or at `rest`.
+    """
+
+    name: str
+    time: FloatArray
+    inputs: Mapping[str, FloatArray]
+    measured: FloatArray
+    held_out: BoolArray
+    residual: FloatArray
+    deviation: Mapping[str, float]
+    noise: float
+    base: float = 0.0
+    correction: FloatArray | None = None
+    rest: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LiveModel:
+    """A model that a page is to hold, with the compilation of its module that has begun.
+
+    `aim` is what it is compared with; a `design` has neither noise nor a sensor with an offset.
+    """
+
+    model: Model
+    module: "Future[bytes | None]"
+    records: Sequence[LiveRecord]
+    aim: str = "measured"
+    design: bool = False
+    extended: bool = False
+    correction: str = ""
+    counts: bool = False
+
+
+def live_diagnosis(d: Diagnosis, rows: Sequence[Series]) -> LiveModel:
+    """Begin what makes the model of a diagnosis alive; `rows` are its `series_of`."""
+    patch = d.patch
+    beyond = (
+        [] if patch is None else [p - x for p, x in zip(patch.predicted, d.extended, strict=True)]
+    )
+    return LiveModel(
+        model=d.model,
+        module=begun_module(d.model),
+        records=_fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond),
+        extended=added(d),
+        correction="" if patch is None else f"{patch.name}, as it was found: it does not follow",
+        counts=any(s.counts for s in rows),
+    )
+
+
+def live_fit(found: Identification, rows: Sequence[Series]) -> LiveModel:
+    """Begin what makes the model of an identification alive; `rows` are its `series_of_fit`."""
+    return LiveModel(
+        model=found.model,
+        module=begun_module(found.model),
+        records=_fitted_records(found.model, found.fit, found.experiments, rows, []),
+        counts=any(s.counts for s in rows),
+    )
+
+
+def live_design(
+    model: Model,
+    record: tuple[FloatArray, FloatArray, FloatArray],
+    wanted: FloatArray | None = None,
+    *,
+    rest: bool = False,
+) -> LiveModel:
+    """Begin what lets a model run on a designed voltage.
+
+    `record` is time [s], voltage [V] and the model's displacement [m]; `wanted` the path that it is
+    to follow, where there is one. The model begins in motion, or at `rest`.
+    """
+    time, voltage, shown = record
+    aim = shown if wanted is None else wanted
+    row = LiveRecord(
+        name="design", time=time, inputs={"voltage": voltage}, measured=aim,
+        held_out=np.zeros(len(time), dtype=bool), residual=aim - shown, deviation={}, noise=0.0,
+        rest=rest,
+    )  # fmt: skip
+    words = "design" if wanted is None else "path"
+    return LiveModel(model, begun_module(model), [row], aim=words, design=True)
+
+
+def _fitted_records(
+    model: Model,
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    series: Sequence[Series],
+    beyond: Sequence[FloatArray],
+) -> list[LiveRecord]:
+    """Return the records of a fit; `beyond` is what an unnamed correction adds to each."""
+    theta = shared_starts(model, fit.unknowns, fit.theta, experiments)[0]
+    rows = []
+    for k, (e, s) in enumerate(zip(experiments, series, strict=True)):
+        columns = {n: getattr(e.record, n, None) for n in model.input_names}
+        rows.append(
+            LiveRecord(
+                name=s.name,
+                time=s.time,
+                inputs={n: v for n, v in columns.items() if v is not None},
+                measured=s.measured,
+                held_out=s.held_out,
+                residual=s.residual(s.curves[-1]),
+                deviation=fit.unknowns.start(theta, k),
+                noise=s.noise,
+                base=_judged_rms(s.residual(s.curves[0]), s.held_out),
+                correction=beyond[k] if beyond else None,
+            )
+        )
+    return rows
+
+
+def add_live(page: Document, live: LiveModel) -> None:
+    """Add sliders, switches and plots of the model, or why the page stays still."""
+    page.section("Change the model and see")
+    page.paragraph(
+        "Sliders are the model's parameters (bar below: 95 % interval), switches its effects. The"
+        " model runs in this page; nothing leaves it."
+    )
+
+    def told() -> dict[str, Any] | str:
+        module = live.module.result()
+        if module is not None:
+            return _told(live, module)
+        cure = "" if has_zig() else f" It takes a compiler: {INSTALL_ZIG}"
+        return f"In this page the model does not run.{cure}"
+
+    page.live(told)
+
+
+def _told(live: LiveModel, module: bytes) -> dict[str, Any]:
+    shown = sorted(live.records, key=_miss, reverse=True)[:_RECORDS]
+    first, counts = shown[0], live.counts
+    time = time_scale(float(first.time[-1] - first.time[0]))
+    length = handy_scale(_range(first), counts=counts)
+    largest = max(float(np.nanmax(np.abs(r.residual))) for r in shown)
+    error = length_scale(largest or 1e-2 * _range(first), counts=counts)
+    legend = [["--measured", live.aim], ["--model", "model"], ["--fitted", "as it was"]]
+    return {
+        "kind": "report",
+        **live_data(live.model, module),
+        "records": [_record(r, _SAMPLES // len(shown)) for r in shown],
+        **{
+            name: {"unit": scale.unit, "factor": scale.factor}
+            for name, scale in (("time", time), ("length", length), ("error", error))
+        },
+        "extended": live.extended,
+        "design": live.design,
+        "aim": live.aim,
+        "correction": live.correction,
+        "legend": legend,
+        "captions": {
+            "time": "Displacement over time",
+            "loop": "Displacement over voltage",
+            "residual": f"{live.aim} minus model".capitalize(),
+        },
+    }
+
+
+def _miss(r: LiveRecord) -> float:
+    """Return the error over the spread, by which records are chosen."""
+    return float(np.sqrt(np.nanmean(r.residual**2))) / (float(np.nanstd(r.measured)) or 1.0)
+
+
+def _range(r: LiveRecord) -> float:
+    return float(np.nanmax(r.measured) - np.nanmin(r.measured))
+
+
+def _judged_rms(residual: FloatArray, held_out: BoolArray) -> float:
+    """Return the rms of a residual over the samples held out, or all if none is."""
+    counted = held_out if held_out.any() else np.ones(len(residual), dtype=bool)
+    return float(np.sqrt(np.nanmean(residual[counted] ** 2)))
+
+
+def _record(r: LiveRecord, limit: int) -> dict[str, Any]:
+    """Return a record as a page holds it, in SI units, its time from its own first sample on."""
+    part, note = thinned(r.time, r.inputs["voltage"], limit)
+    t = r.time[part] - r.time[0]
+    residual = r.residual[part]
+    fitted = np.isfinite(residual) & ~r.held_out[part]
+    even = len(t) > 2 and float(np.ptp(np.diff(t))) <= ALIKE * float(t[1])
+    return {
+        "name": r.name,
+        "note": note,
+        "t": None if even else doubles(t),
+        "n": len(t),
+        "step": float(t[-1] / (len(t) - 1)),
+        "inputs": {n: doubles(v[part]) for n, v in r.inputs.items()},
+        "measured": singles(r.measured[part]),
+        "held": spans(r.held_out[part]),
+        "center": float(np.mean(residual[fitted])) if fitted.any() else 0.0,
+        "deviation": dict(r.deviation),
+        "noise": r.noise,
+        "rest": r.rest,
+        "range": _range(r),
+        "base": r.base,
+        "correction": None if r.correction is None else singles(r.correction[part]),
+    }
+
+
+def thinned(t: FloatArray, v: FloatArray, limit: int) -> tuple[IndexArray, str]:
+    """Return at most `limit` samples of a record and what must be said of them.
+
+    Every so-manieth one if the voltage is straight between them, else those of the beginning: a
+    model's answer to a voltage with its corners cut is that to another voltage.
+    """
+    n = len(t)
+    if n <= limit:
+        return np.arange(n), ""
+    every = -(-n // limit)
+    part = np.arange(0, n, every)
+    last = part[-1] + 1
+    off = np.abs(np.interp(t[:last], t[part], v[part]) - v[:last])
+    if float(np.max(off)) <= _BENT * float(np.ptp(v)):
+        return part, f"Of {n} samples each {every}th is here; the model runs on these."
+    return np.arange(limit), f"Of {n} samples these are the first {limit}."

@@ -1,0 +1,124 @@
+"""The benchmark `exam`: plants of another author (`tests/exam`), their diagnoses and marks."""
+
+import os
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.report.words.tables import Table
+from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.exam.marks import Answer, Named, mark
+from tests.exam.play import write
+from tests.exam.record import Record
+from tests.exam.records import RECORDS
+
+#: A quick run takes one of so many records.
+QUICK = 4
+#: The groups of the records by title, in the order of the counts.
+GROUPS = (
+    "clean, Bouc-Wen",
+    "clean, other hysteresis",
+    "one cause",
+    "two causes",
+    "foreign cause",
+)
+
+
+@dataclass(frozen=True)
+class Marked:
+    """A record of the exam, what was said of it, its mark, and the processor time [s]."""
+
+    record: Record
+    answer: Answer
+    mark: str
+    seconds: float
+
+    @property
+    def group(self) -> str:
+        """The group that it counts in."""
+        if self.record.group == "clean":
+            return GROUPS[0 if self.record.stack.hysteresis == "Bouc-Wen" else 1]
+        return {"one": GROUPS[2], "two": GROUPS[3], "foreign": GROUPS[4]}[self.record.group]
+
+
+def run(progress: Progress, quick: bool) -> Outcome:
+    """Make, diagnose and mark the records, side by side on all cores."""
+    records = RECORDS[::QUICK] if quick else RECORDS
+    found: list[Marked] = []
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        for job in as_completed([pool.submit(marked, record) for record in records]):
+            one = job.result()
+            found.append(one)
+            progress(
+                f"{len(found)} of {len(records)}: {one.record.name}, {one.record.says}:"
+                f" {one.answer.verdict} {_names(one.answer)}: {one.mark} [{one.seconds:.0f} s]"
+            )
+    places = {record.name: place for place, record in enumerate(records)}
+    found.sort(key=lambda one: places[one.record.name])
+    return Outcome((answers(found), counts(found)))
+
+
+def marked(record: Record) -> Marked:
+    """Make a record as a file, diagnose the file, and mark what is said."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{record.name}.csv"
+        write(record, path)
+        read = read_record(path)
+    begin = time.process_time()
+    answer = _answer(diagnose([read]))
+    return Marked(record, answer, mark(record, answer), time.process_time() - begin)
+
+
+def _answer(found: Diagnosis) -> Answer:
+    causes = (Named(c.effect, c.confidence, tuple(c.cannot_be_told_from)) for c in found.causes)
+    return Answer(found.verdict, tuple(causes))
+
+
+def answers(found: Sequence[Marked]) -> TitledTable:
+    """Return what was said of each record."""
+    rows = tuple(
+        (
+            one.record.name,
+            one.record.stack.hysteresis,
+            f"{one.record.test.voltage}, {one.record.test.frequency:g} Hz",
+            one.record.says,
+            one.answer.verdict,
+            _names(one.answer) or "-",
+            one.mark,
+        )
+        for one in found
+    )
+    head = ("record", "stack", "voltage", "hidden", "verdict", "names", "mark")
+    return TitledTable("Plants of another author", Table(head, rows))
+
+
+def counts(found: Sequence[Marked]) -> TitledTable:
+    """Return how often each mark was given, by group."""
+    rows = []
+    for group in GROUPS:
+        given = Counter(one.mark for one in found if one.group == group)
+        told = "; ".join(f"{count} {name}" for name, count in given.most_common())
+        rows.append((group, str(given.total()), told or "-"))
+    head = ("hidden", "records", "marks")
+    return TitledTable(
+        "Marks by group",
+        Table(head, tuple(rows)),
+        "The marks are explained in tests/exam/marks.py.",
+    )
+
+
+def _names(answer: Answer) -> str:
+    """Return the names with their probabilities and their rivals."""
+    told = []
+    for cause in answer.causes:
+        rivals = f" (or {', '.join(cause.rivals)})" if cause.rivals else ""
+        told.append(f"{cause.effect} {100 * cause.probability:.0f} %{rivals}")
+    return " + ".join(told)

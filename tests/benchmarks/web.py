@@ -1,0 +1,169 @@
+"""Models in pages: size of module and page, how long a redraw takes, how far a quick run errs."""
+
+import gzip
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from pathlib import Path
+
+import numpy as np
+
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.web.module import web_module
+from psa_casadi.model.compose import Model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.report.page.document import Document
+from psa_casadi.report.page.live_part import LiveModel, LiveRecord, add_live
+from psa_casadi.report.page.playground_page import playground
+from psa_casadi.report.words.phrases import number
+from psa_casadi.report.words.tables import Table
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+from psa_casadi.variables import Interval, Provenance
+from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.web_strip import strip
+from tests.browser import Browser, driven, find_browser
+from tests.live_pages import case, run_in_browser
+from tests.report_cases import NOISE
+
+#: What a redraw of so many samples may take [ms].
+SAMPLES, ALLOWED = 5000, 50.0
+_MODELS: dict[str, tuple[str, ...]] = {
+    "base": (),
+    "hysteresis memory": ("hysteresis_memory",),
+    "creep, memory, load": ("slow_creep", "hysteresis_memory", "load_stiffness"),
+    "every effect": tuple(EFFECTS),
+}
+#: Effects of the page in the strip of pictures.
+_STRIP = ("slow_creep", "hysteresis_memory")
+#: Moves a slider over and over; a pixel that is read back makes the browser finish its picture.
+_DRAG = """
+var box = document.querySelector('.live'), rows = [];
+for (var k = 0; k < {times}; k += 1) {{
+  var began = performance.now();
+  box.psa.set('k_L', {value} * (1 + 0.002 * k));
+  box.querySelectorAll('canvas').forEach(function (c) {{
+    c.getContext('2d').getImageData(0, 0, 1, 1);
+  }});
+  rows.push([box.psa.last().run, performance.now() - began]);
+}}
+tell(rows);
+"""
+
+
+def run(progress: Progress, quick: bool) -> Outcome:
+    """Return the tables of sizes, redraw times and errors."""
+    names = list(_MODELS)[:2] if quick else list(_MODELS)
+    sizes, times, errors = [], [], []
+    with tempfile.TemporaryDirectory() as folder:
+        browser = find_browser(Path(folder))
+        for name in names:
+            progress(name)
+            model = _model(_MODELS[name])
+            sizes.append(_size(name, model, Path(folder)))
+            for n in (1000, SAMPLES):
+                page = Path(folder) / "page.html"
+                page.write_text(_page(model, n), encoding="utf-8")
+                drag = _DRAG.format(times=6 if quick else 25, value=model.values["k_L"])
+                times.append(_times(name, n, driven(browser, page, drag, silent=False, timed=True)))
+            errors.append(_error(name, model, browser))
+        progress("playground")
+        whole_page = Path(folder) / "playground.html"
+        whole_page.write_text(playground(), encoding="utf-8")
+        drag = _DRAG.format(times=6 if quick else 25, value=7.3)
+        times.append(
+            _times("playground", 2000, driven(browser, whole_page, drag, silent=False, timed=True))
+        )
+        sizes.append(("playground", "", "", number(whole_page.stat().st_size / 1e3), ""))
+    return Outcome(
+        (
+            TitledTable(
+                "Sizes",
+                Table(("model", "module [kB]", "gzip [kB]", "page [kB]", "compiled in [s]"),
+                      tuple(sizes)),
+                f"A page of {SAMPLES} samples without plots of plotly. What was compiled before"
+                " is taken from the cache.",
+            ),
+            TitledTable(
+                "Redraws while a slider moves",
+                Table(("model", "samples", "model, least [ms]", "all, least [ms]",
+                       "all, median [ms]"), tuple(times)),
+                f"Asked at {SAMPLES} samples: below {ALLOWED:g} ms on two cores.",
+            ),
+            TitledTable(
+                "Error over the range",
+                Table(("model", "one run", "as psa.simulate, against it"), tuple(errors)),
+                "One run is what a slider shows; its error is against a tolerance of 1e-8.",
+            ),
+        ),
+        lambda: strip(_page(_as_fitted(_model(_STRIP)), 2000)),
+    )  # fmt: skip
+
+
+def _model(effects: Sequence[str]) -> Model:
+    model = stack_model("P-885.51")
+    for name in effects:
+        model = model.with_effect(EFFECTS[name])
+        if len(effects) < len(EFFECTS):
+            gain = model.parameter(EFFECTS[name].gain or "")
+            size = gain.typical({**model.values, gain.name: 0.0})
+            model = model.with_values({gain.name: float(np.clip(size, *gain.bounds))})
+    return model
+
+
+def _voltage(n: int) -> tuple[FloatArray, FloatArray]:
+    t = np.linspace(0.0, 2.0, n)
+    return t, 60.0 - 55.0 * np.cos(6.0 * np.pi * t) * np.exp(-0.5 * t)
+
+
+def _page(model: Model, n: int) -> str:
+    t, v = _voltage(n)
+    y = simulate(model, t, v).displacement
+    measured = y + NOISE * np.random.default_rng(1).standard_normal(n)
+    module: Future[bytes | None] = Future()
+    module.set_result(web_module(model))
+    row = LiveRecord(
+        name="record", time=t, inputs={"voltage": v}, measured=measured,
+        held_out=np.zeros(n, dtype=bool), residual=measured - y, deviation={}, noise=NOISE,
+    )  # fmt: skip
+    page = Document("A model in a page", [], small=True)
+    live = LiveModel(model, module, [row])
+    add_live(page, live)
+    return page.text()
+
+
+def _as_fitted(model: Model) -> Model:
+    """Return the model as a fit leaves it: some values are free, each with an interval."""
+    free = ("k_L", "A", "beta", "tau", *(c.gain or "" for c in model.effects))
+    sure = {n: Interval(*sorted((0.9 * model.values[n], 1.1 * model.values[n]))) for n in free}
+    return model.with_values({}, provenance=Provenance(free=free, intervals=sure))
+
+
+def _size(name: str, model: Model, folder: Path) -> tuple[str, ...]:
+    began = time.perf_counter()
+    module = web_module(model)
+    spent = time.perf_counter() - began
+    page = folder / "size.html"
+    page.write_text(_page(model, SAMPLES), encoding="utf-8")
+    sizes = (len(module), len(gzip.compress(module, 9)), page.stat().st_size)
+    return (name, *(number(s / 1e3) for s in sizes), number(spent, 2))
+
+
+def _times(name: str, n: int, rows: Sequence[Sequence[float]]) -> tuple[str, ...]:
+    ran, all_of_it = np.array(rows[2:]).T  # the browser compiles in earnest during the first
+    shown = (ran.min(), all_of_it.min(), float(np.median(all_of_it)))
+    return (name, str(n), *(number(float(x), 2) for x in shown))
+
+
+def _error(name: str, model: Model, browser: Browser) -> tuple[str, ...]:
+    t, v = _voltage(600)
+    quick_one, full = run_in_browser(
+        browser, model, [case(model, t, v, quick=True), case(model, t, v)]
+    )
+    here, tight = (simulate(model, t, v, rtol=r).displacement for r in (1e-6, 1e-8))
+    errors = [
+        float(np.max(np.abs(a - b)) / np.ptp(b))
+        for a, b in ((quick_one["shown"], tight), (full["shown"], here))
+    ]
+    return (name, *(f"{e:.1e}" for e in errors))

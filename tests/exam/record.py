@@ -1,0 +1,110 @@
+"""What defines a record of the exam: stack, voltage, what is hidden, and which names are right."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Values = tuple[float, ...]
+HysteresisKind = Literal[
+    "Bouc-Wen", "Preisach", "relays", "Prandtl-Ishlinskii", "Coleman-Hodgdon", "Duhem"
+]
+Group = Literal["clean", "one", "two", "foreign"]
+
+#: Two resonances of a stack, unless the record has its own: f_1 [Hz], zeta_1, f_2 [Hz], zeta_2.
+MECHANICS = (6e3, 0.02, 21e3, 0.03)
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A stack: its hysteresis, its stroke over the voltages of the test [um], lag R_s C_p [s].
+
+    `bouc_wen` are A, the height of the loop [V], gamma/(beta + gamma), n and delta [1/V];
+    `strain_lag` is a lag of the strain [s].
+    """
+
+    hysteresis: HysteresisKind
+    stroke: float
+    lag: float = 0.8e-3
+    mechanics: tuple[float, float, float, float] = MECHANICS
+    bouc_wen: tuple[float, float, float, float, float] | None = None
+    strain_lag: float = 0.0
+
+
+@dataclass(frozen=True)
+class Test:
+    """What is played and how it is measured.
+
+    Kind of voltage with its frequency [Hz], rate of the samples [Hz] and their number, lowest and
+    highest voltage [V], rms of the noise [% of the range], steps of the simulation between two
+    samples, pole of the noise's colour, and whether the amplifier's monitor is recorded.
+    """
+
+    voltage: str
+    frequency: float
+    rate: float
+    samples: int
+    limits: tuple[float, float]
+    noise: float
+    steps: int = 6
+    colour: float = 0.0
+    monitor: bool = False
+
+    @property
+    def span(self) -> float:
+        """Highest less lowest voltage [V]."""
+        return self.limits[1] - self.limits[0]
+
+    @property
+    def largest(self) -> float:
+        """Largest magnitude of the voltage [V]."""
+        return max(abs(self.limits[0]), abs(self.limits[1]))
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record of the exam.
+
+    `hidden` are the causes by name with their values, `accepted` the names that are right: a set
+    for each cause; of a foreign record the set of what comes nearest.
+    """
+
+    name: str
+    seed: int
+    says: str
+    stack: Stack
+    test: Test
+    hidden: Mapping[str, Values] = field(default_factory=dict)
+    accepted: tuple[frozenset[str], ...] = ()
+
+    @property
+    def group(self) -> Group:
+        """What kind of question it is."""
+        groups: dict[str, Group] = {"c": "clean", "k": "one", "t": "two", "f": "foreign"}
+        return groups[self.name[0]]
+
+    def draws(self, number: int) -> np.random.Generator:
+        """Return the random numbers of one part of the simulation."""
+        return np.random.default_rng(self.seed + number)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A record that is played: its fine times (M,) [s] and their step [s]."""
+
+    record: Record
+    times: Floats
+    step: float
+
+    @property
+    def share(self) -> Floats:
+        """Times as shares of the record's length."""
+        return np.asarray(self.times / self.times[-1])
+
+
+def names(*alternatives: str) -> frozenset[str]:
+    """Return the names that are right for one cause."""
+    return frozenset(alternatives)

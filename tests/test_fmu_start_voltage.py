@@ -1,0 +1,218 @@
+"""The parameter `start_voltage` of an FMU: settled at a voltage, as `psa.settled_at` has it."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fmpy import simulate_fmu
+
+from psa_casadi.component import Component, Equations
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.check.agreement import truth_of
+from psa_casadi.export.check.structure import settled_start_error
+from psa_casadi.export.common.variable_table import START_VOLTAGE, variable_table
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE
+from psa_casadi.export.importer.fmu import Fmu, FmuError, Instance
+from psa_casadi.model.compose import Model
+from psa_casadi.reference import simulate as reference
+from psa_casadi.scratch import temporary_folder
+from psa_casadi.simulation.history import settled_at
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.start import start_state
+from psa_casadi.variables import Parameter, State
+from tests.fmu_models import exported, model_named
+from tests.tiers import slow
+
+STACK = "P-885.51"
+BOTH = pytest.mark.parametrize("fmi", [2, 3])
+INTERFACES = pytest.mark.parametrize("interface", [CO_SIMULATION, MODEL_EXCHANGE])
+
+
+def settled(model: Model, voltage: float) -> dict[str, float]:
+    """Return the states of a model that is settled at a voltage."""
+    return {q.name: q.start for q in settled_at(model, voltage).structure.states}
+
+
+def apart(fmu: Fmu, instance: Instance, expected: dict[str, float]) -> float:
+    """Return the largest difference from values, in nominal ones."""
+    size = np.array([fmu.nominals[n] for n in expected])
+    return float(np.max(np.abs(instance.get(list(expected)) - list(expected.values())) / size))
+
+
+@BOTH
+@INTERFACES
+@pytest.mark.parametrize("voltage", [60.0, -15.0])
+def test_an_instance_begins_settled_at_the_voltage(
+    fmi: int, interface: int, voltage: float
+) -> None:
+    """In both versions and interfaces, as `psa.settled_at`; at the exported value as ever."""
+    model = model_named(STACK).plant()
+    expected = settled(model, voltage) | {"voltage": voltage, START_VOLTAGE: voltage}
+    with Fmu(exported(STACK, fmi)) as fmu:
+        with fmu.start(interface, values={START_VOLTAGE: voltage}) as instance:
+            assert apart(fmu, instance, expected) < 1e-8
+        with fmu.start(interface, values={START_VOLTAGE: 0.0}) as instance:
+            assert apart(fmu, instance, dict.fromkeys(expected, 0.0)) == 0.0
+        assert max(abs(expected[n]) / fmu.nominals[n] for n in model.state_names) > 0.05
+
+
+def test_it_stays_there_and_is_where_the_papers_equations_lead() -> None:
+    """The reference rises from 0 V to 60 V in 1 s and waits for 20 ms."""
+    model, t = model_named(STACK).plant(), np.array([0.0, 1.0, 1.02])
+    true = reference(
+        model.values, lambda s: 60.0 * min(s, 1.0), t, load_force=lambda _: 0.0,
+        breakpoints=[0.0, 1.0, 1.02], rtol=1e-9,
+    ).displacement[-1]  # fmt: skip
+    with Fmu(exported(STACK)) as fmu:
+        with fmu.start(CO_SIMULATION, values={START_VOLTAGE: 60.0}) as slave:
+            begun = slave.get(["displacement"])[0]
+            slave.step(0.0, 0.02)
+            stayed = slave.get(["displacement"])[0]
+        with fmu.start(CO_SIMULATION) as slave:
+            slave.set({"voltage": 60.0})
+            slave.step(0.0, 0.02)
+            stepped = slave.get(["displacement"])[0]
+    assert abs(begun - true) < 2e-4 * true
+    assert abs(stayed - begun) < 1e-9 * true
+    assert abs(stepped - true) > 5e-3 * true  # a step overshoots, which hysteresis remembers
+
+
+@pytest.mark.parametrize(
+    ("fmi", "how"),
+    [(2, {"fmi_type": "CoSimulation"}), (3, {"fmi_type": "ModelExchange", "solver": "CVode"})],
+)
+def test_fmpy_sets_it(fmi: int, how: dict[str, str]) -> None:
+    held = settled_at(model_named(STACK).plant(), 60.0)
+    true = simulate(held, [0.0, 1e-3], [60.0, 60.0]).displacement
+    found = simulate_fmu(
+        str(exported(STACK, fmi)), stop_time=1e-3, output=["displacement"],
+        start_values={START_VOLTAGE: 60.0}, **how,
+    )["displacement"]  # fmt: skip
+    assert np.max(np.abs(found - true[0])) < 1e-8 * true[0]
+    assert len(found) > 2
+
+
+@BOTH
+def test_what_is_set_by_itself_stays_whatever_the_order(fmi: int) -> None:
+    """States and the voltage; parameters and other inputs count as they are at the end."""
+    softer = model_named(STACK).plant().with_values({"k_L": 6.3})
+    own = {"f_H": -40.0, "v_x": 2e-4, "voltage": 55.0}
+    values = {START_VOLTAGE: 60.0, **own, "k_L": 6.3, "load_force": -20.0}
+    at_rest = start_state(softer, [60.0, -20.0], memory={"f_H": -40.0}).x
+    expected = dict(zip(softer.state_names, at_rest.tolist(), strict=True)) | own
+    assert softer.input_names == ("voltage", "load_force")
+    with Fmu(exported(STACK, fmi)) as fmu:
+        for names in (list(values), list(values)[::-1]):
+            with fmu.start(CO_SIMULATION, values={n: values[n] for n in names}) as slave:
+                assert apart(fmu, slave, own) == 0.0
+                assert apart(fmu, slave, expected) < 1e-8
+    assert abs(expected["x"] / settled(softer, 60.0)["x"] - 1.0) > 1e-2
+
+
+def test_within_the_initialization_it_counts_at_once_and_can_be_taken_back() -> None:
+    model = model_named(STACK).plant()
+    with Fmu(exported(STACK)) as fmu, fmu.open(CO_SIMULATION) as slave:
+        slave.require("SetupExperiment", 0, 0.0, 3.0, 0, 0.0)
+        slave.require("EnterInitializationMode")
+        for voltage in (60.0, 25.0):
+            slave.set({START_VOLTAGE: voltage})
+            assert apart(fmu, slave, settled(model, voltage) | {"voltage": voltage}) < 1e-8
+            assert slave.get(["displacement"])[0] == slave.get(["x"])[0]
+        snapshot = slave.save()
+        copy = slave.serialize(snapshot)
+        slave.set({START_VOLTAGE: 0.0})
+        assert apart(fmu, slave, dict.fromkeys((*model.state_names, "voltage"), 0.0)) == 0.0
+        back = slave.deserialize(copy)
+        slave.restore(back)
+        assert apart(fmu, slave, settled(model, 25.0)) < 1e-8
+        for data in (snapshot, back):
+            slave.drop(data)
+        slave.require("ExitInitializationMode")
+        with pytest.raises(FmuError, match="'start_voltage' can be set only before"):
+            slave.set({START_VOLTAGE: 10.0})
+        slave.require("Reset")
+        slave.setup()
+        assert apart(fmu, slave, dict.fromkeys((*model.state_names, START_VOLTAGE), 0.0)) == 0.0
+
+
+def test_the_exported_start_is_that_of_the_exported_value() -> None:
+    """With its history, to the last bit; another value begins without that history."""
+    held = settled_at(model_named(STACK), 60.0, [120.0, 0.0]).plant()
+    starts = {q.name: q.start for q in held.structure.states} | {"voltage": 60.0}
+    with temporary_folder() as folder:
+        fmu = Fmu(export_fmu(held, folder / "held.fmu"))
+    with fmu:
+        for values in ({}, {START_VOLTAGE: 60.0}):
+            with fmu.start(CO_SIMULATION, values=values) as slave:
+                assert slave.get(list(starts)).tolist() == list(starts.values())
+        with fmu.start(CO_SIMULATION, values={START_VOLTAGE: 0.0}) as slave:
+            assert apart(fmu, slave, dict.fromkeys(starts, 0.0)) < 1e-12
+        assert abs(starts["f_H"] - settled(model_named(STACK), 60.0)["f_H"]) > 1.0
+
+
+@pytest.mark.parametrize("voltage", [1e200, -1e300])
+def test_a_voltage_without_a_settled_state_is_an_error_soon(voltage: float) -> None:
+    with Fmu(exported(STACK)) as fmu, fmu.open(CO_SIMULATION) as slave:
+        begin = time.perf_counter()
+        with pytest.raises(FmuError, match="There is no settled state at the start_voltage"):
+            slave.setup(values={START_VOLTAGE: voltage})
+        assert time.perf_counter() - begin < 5.0
+
+
+def test_a_fixed_step_begins_there_too() -> None:
+    model = model_named(STACK).plant()
+    with temporary_folder() as folder:
+        fmu = Fmu(export_fmu(model, folder / "fixed.fmu", step=1e-5))
+    with fmu, fmu.start(CO_SIMULATION, values={START_VOLTAGE: 60.0}) as slave:
+        assert apart(fmu, slave, settled(model, 60.0) | {"voltage": 60.0}) < 1e-8
+        begun = slave.get(["displacement"])[0]
+        slave.step(0.0, 1e-3)
+        assert slave.get(["displacement"])[0] == pytest.approx(begun, rel=1e-9)
+
+
+@slow
+def test_memories_that_relax_and_bent_effects_settle_as_in_the_model() -> None:
+    model = model_named(STACK).plant()
+    for effect in ("slow_creep", "charge_leakage", "saturation_of_strain"):
+        model = model.with_effect(EFFECTS[effect])
+    model = model.with_values({"creep_gain": 0.1, "leak_gain": 0.1, "saturation_gain": 0.1})
+    with temporary_folder() as folder:
+        fmu = Fmu(export_fmu(model, folder / "bent.fmu"))
+    with fmu:
+        for voltage in (60.0, 100.0):
+            with fmu.start(CO_SIMULATION, values={START_VOLTAGE: voltage}) as slave:
+                assert apart(fmu, slave, settled(model, voltage)) < 1e-6
+
+
+def test_only_a_model_with_a_voltage_that_does_not_sample_has_it() -> None:
+    def has(model: Model) -> bool:
+        return START_VOLTAGE in (v.name for v in variable_table(model))
+
+    assert has(model_named(STACK))
+    assert not has(model_named("flexure"))
+    counter = Component(
+        name="counter", description="counts its samples", source="this test",
+        parameters=(Parameter("T_s", 1e-3, "s", (1e-6, 1.0), "sample period"),),
+        sampled=(State("samples", "1", "samples taken", nominal=1.0),), sample_period="T_s",
+        equations=lambda s: Equations(next={"samples": s.samples + 1.0}),
+    )  # fmt: skip
+    assert not has(model_named(STACK).with_components((*BASE, counter)))
+    assert START_VOLTAGE in documentation(model_named(STACK))
+    assert START_VOLTAGE not in documentation(model_named("flexure"))
+
+
+def test_the_check_notices_another_settled_start() -> None:
+    model = model_named(STACK).plant()
+    truth = truth_of(model, 2)
+    assert truth.settled_starts is not None
+    force, size = truth.settled_starts["f_H"]
+    assert abs(force) > 0.01 * size
+    with Fmu(exported(STACK)) as fmu:
+        assert settled_start_error(fmu, truth) < 1e-8
+        assert settled_start_error(fmu, replace(truth, start_voltage=61.0)) > 1e-3
+        stays = {**truth.settled_starts, "f_H": (0.0, size)}
+        assert settled_start_error(fmu, replace(truth, settled_starts=stays)) > 1e-3

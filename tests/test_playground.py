@@ -1,0 +1,158 @@
+"""The playground: every effect on one page, any voltage, and what it tells is what Python says."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.model_file import loads, save_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.report.page.playground_page import playground
+from psa_casadi.simulation.simulate import simulate
+from tests.browser import Browser, driven, find_browser, on_a_phone
+from tests.sampled_models import controller
+from tests.test_report_browser import told_of
+from tests.tiers import slow
+
+pytestmark = pytest.mark.xdist_group("browser")
+
+PLAY = """
+var box = document.querySelector('.live'), found = {};
+function pick(select, text) {
+  var list = Array.prototype.slice.call(select.options);
+  select.value = list.find(function (o) { return o.textContent === text; }).value;
+  select.dispatchEvent(new Event('change'));
+}
+var selects = box.querySelectorAll('select');
+var numbers = box.querySelectorAll('.bar input[type=number]');
+found.stacks = Array.prototype.map.call(selects[0].options, function (o) {
+  return o.textContent; });
+found.switches = Array.prototype.map.call(box.querySelectorAll('.switch'), function (s) {
+  return s.childNodes[1].textContent; });
+found.plain = box.querySelector('output').textContent;
+pick(selects[1], 'sine');
+numbers[4].value = '300'; numbers[4].dispatchEvent(new Event('input'));
+box.querySelector('.switch input').click();
+setTimeout(function () {
+  found.effect = box.querySelector('output').textContent;
+  found.values = box.psa.values.slice();
+  found.csv = box.psa.csv();
+  found.file = box.psa.file();
+  found.knobs = Array.prototype.filter.call(box.querySelectorAll('.knob'), function (k) {
+    return !k.hidden && !k.closest('details'); }).length;
+  pick(selects[0], 'PTBS200');
+  setTimeout(function () {
+    found.other = box.querySelector('output').textContent;
+    var canvas = box.querySelector('canvas'), area = canvas.getBoundingClientRect();
+    [['pointerdown', 0.3], ['pointermove', 0.6]].forEach(function (row) {
+      canvas.dispatchEvent(new PointerEvent(row[0], {pointerId: 1, button: 0,
+        clientX: area.left + row[1] * area.width, clientY: area.top + 0.5 * area.height}));
+    });
+    setTimeout(function () {
+      found.drawn = box.querySelector('output').textContent;
+      found.corners = psaLive.voltages.corners('0 0, 0.1 100; 0.2:50', 5).v;
+      found.read = psaLive.voltages.read(
+        'Zeit;t (ms);U [kV]\\n1;0,0;0,1\\n2;1,0;0,2\\n3;2,0;0,3\\n4;3,5;0,1\\n');
+      found.none = [psaLive.voltages.corners('1 0, 0 5', 5), psaLive.voltages.read('a,b\\n1,2\\n')];
+      found.spent = box.psa.last();
+      tell(found);
+    }, 400);
+  }, 400);
+}, 400);
+"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
+    return find_browser(tmp_path_factory.mktemp("browser"))
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("playground") / "page.html"
+    path.write_text(playground(), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def played(browser: Browser, page: Path) -> dict[str, Any]:
+    found: dict[str, Any] = driven(browser, page, PLAY, "--window-size=1200,2000")
+    return found
+
+
+@slow
+def test_it_has_every_stack_and_effect(played: dict[str, Any], page: Path) -> None:
+    assert set(played["stacks"]) == set(STACKS)
+    assert played["switches"] == [n.replace("_", " ") for n in EFFECTS]
+    assert page.stat().st_size < 0.5e6
+
+
+@slow
+def test_what_it_downloads_is_what_python_simulates(played: dict[str, Any]) -> None:
+    head, *rows = csv.reader(played["csv"].splitlines())
+    table = np.array(rows, dtype=float)
+    assert len(table) == 300
+    t, v = table[:, 0], table[:, head.index("voltage [V]")]
+    assert np.ptp(v) == pytest.approx(120.0, rel=1e-3)
+    model = stack_model("P-885.51").with_effect(EFFECTS["slow_creep"])
+    gain = model.parameter("creep_gain").typical(model.values)
+    model = model.with_values({"creep_gain": gain})
+    wanted = simulate(model, t, v).displacement
+    shown = table[:, head.index("measured_displacement [m]")]
+    assert np.max(np.abs(shown - wanted)) < 2e-6 * np.ptp(wanted)
+
+
+@slow
+def test_its_model_file_has_what_is_switched_on(played: dict[str, Any]) -> None:
+    model = loads(played["file"])
+    base = stack_model("P-885.51")
+    assert [c.name for c in model.effects] == ["slow_creep"]
+    assert {n: model.values[n] for n in base.values} == base.values
+    assert (model.name, model.description) == (base.name, base.description)
+
+
+@slow
+def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) -> None:
+    assert "add up to 0 nm" in played["plain"]
+    said = [played[k] for k in ("plain", "effect", "other", "drawn")]
+    assert len(set(said)) == 4
+    assert all(s.startswith("Stroke ") for s in said)
+    assert played["knobs"] == len(EFFECTS["slow_creep"].parameters)
+    assert list(played["corners"].values()) == [0.0, 50.0, 100.0, 75.0, 50.0]
+    assert list(played["read"]["t"].values()) == pytest.approx([0.0, 1e-3, 2e-3, 3.5e-3])
+    assert list(played["read"]["v"].values()) == pytest.approx([100.0, 200.0, 300.0, 100.0])
+    assert played["none"] == [None, None]
+
+
+@slow
+def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> None:
+    document, console = browser.document(on_a_phone(page))
+    assert console == []
+    found = told_of(document)
+    assert found["outside"] == []
+    assert found["needed"] == found["width"]
+    assert found["smallest"] >= 9
+    assert browser.serious_faults(page) == []
+
+
+@slow
+def test_the_command_plays_a_model_of_ones_own(tmp_path: Path) -> None:
+    model = stack_model("PTBS200").with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02})
+    save_model(model, tmp_path / "m.json")
+    words = ["web", str(tmp_path / "m.json"), "-o", str(tmp_path / "p.html"), "--quiet"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "p.html").read_text(encoding="utf-8")
+    assert "Play with PTBS200" in text
+    assert "0.02" in text
+
+
+def test_what_is_no_stack_is_refused() -> None:
+    with pytest.raises(InputError, match="no stack"):
+        playground(controller())
