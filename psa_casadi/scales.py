@@ -10,6 +10,11 @@ def voltage_scale(p: Values) -> float:
     return abs(p["u_rated"])
 
 
+def stop_scale(p: Values) -> float:
+    """Usual size of a stop element of the hysteresis, a tenth of the rated voltage [V]."""
+    return 0.1 * voltage_scale(p)
+
+
 def force_scale(p: Values) -> float:
     """Force at rated voltage, `k_L u_rated` [N]."""
     return abs(p["k_L"]) * voltage_scale(p)

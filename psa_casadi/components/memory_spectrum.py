@@ -3,9 +3,10 @@
 import math
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.scales import voltage_scale
+from psa_casadi.components.wafers import HOLD_RATE
+from psa_casadi.scales import stop_scale
 from psa_casadi.smooth import stop_rate
-from psa_casadi.variables import Parameter, State, Values
+from psa_casadi.variables import Parameter, State
 
 #: Thresholds over the rated voltage: from a hundredth of it to beyond the widest loop, evenly in
 #: their logarithms, a factor of two apart.
@@ -43,14 +44,10 @@ def _state(index: int) -> State:
         f"z_{index}",
         "V",
         f"stop element {index}, threshold {_THRESHOLDS[index - 1]:g} of the rated voltage",
-        _stop_scale,
+        stop_scale,
         memory=True,
         settles=False,
     )
-
-
-def _stop_scale(p: Values) -> float:
-    return 0.1 * voltage_scale(p)
 
 
 def _cosines(name: str, count: int, text: str, mean: float) -> list[Parameter]:
@@ -82,14 +79,7 @@ MEMORY_SPECTRUM = Component(
     parameters=(
         *_cosines("play", _PLAYS, "the plays", -0.03),
         *_cosines("square", _SQUARES, "the plays' squares", 0.0),
-        Parameter(
-            "hold_rate",
-            0.1,
-            "V/s",
-            (1e-9, 1e6),
-            "voltage rate below which the voltage counts as held",
-            fitted=False,
-        ),
+        HOLD_RATE,
     ),
     states=tuple(_state(i + 1) for i in range(len(_THRESHOLDS))),
     equations=_equations,

@@ -55,6 +55,16 @@ LINEAR_FORCE = Component(
     parameters=(Parameter("k_L", 10.0, "N/V", (1e-6, 1e6), "linear force per volt", log=True),),
 )
 
+#: Of every form of the hysteresis, which rests while the voltage is held.
+HOLD_RATE = Parameter(
+    "hold_rate",
+    0.1,
+    "V/s",
+    (1e-9, 1e6),
+    "voltage rate below which the voltage counts as held",
+    fitted=False,
+)
+
 BOUC_WEN = Component(
     name="bouc_wen",
     description="asymmetric Bouc-Wen hysteresis force",
@@ -77,13 +87,7 @@ BOUC_WEN = Component(
         Parameter(
             "h_ref", 100.0, "N", (1e-9, 1e7), "reference force that makes (|f_H|/h_ref)^n pure"
         ),
-        Parameter(
-            "hold_rate",
-            0.1,
-            "V/s",
-            (1e-9, 1e6),
-            "voltage rate below which the voltage counts as held",
-        ),
+        HOLD_RATE,
     ),
     states=(State("f_H", "N", "hysteresis force", _hysteresis_scale, memory=True, settles=False),),
 )

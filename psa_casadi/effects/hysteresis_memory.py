@@ -5,9 +5,9 @@ import math
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.scales import voltage_scale
+from psa_casadi.scales import stop_scale
 from psa_casadi.smooth import stop_rate
-from psa_casadi.variables import Parameter, State, Values
+from psa_casadi.variables import Parameter, State
 
 #: Narrowest first threshold, over rated voltage. The memory of a ferroelectric is spread over the
 #: loop; a dwell much narrower than the loop is friction or backlash and not this effect.
@@ -50,14 +50,10 @@ def _state(index: int) -> State:
         f"z_m{index}",
         "V",
         f"stop element {index}, threshold {_RATIOS[index - 1]:g} times the first",
-        _stop_scale,
+        stop_scale,
         memory=True,
         settles=False,
     )
-
-
-def _stop_scale(p: Values) -> float:
-    return 0.1 * voltage_scale(p)
 
 
 def _angle(name: str, value: float, text: str) -> Parameter:

@@ -14,9 +14,9 @@ leaves the memory as it is.
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.scales import voltage_scale
+from psa_casadi.scales import stop_scale
 from psa_casadi.smooth import direction, magnitude_power, signed_power, stop_rate
-from psa_casadi.variables import Parameter, State, Values
+from psa_casadi.variables import Parameter, State
 
 #: Force over voltage of the play elements, over k_L: loops of some 10 % of the stroke.
 _SHARE = 0.3
@@ -36,10 +36,6 @@ def _equations(s: Symbols) -> Equations:
         der={"z_r": stop_rate(s, s.z_r, width)},
         add={"free_force": grown * force},
     )
-
-
-def _stop_scale(p: Values) -> float:
-    return 0.1 * voltage_scale(p)
 
 
 RATE_DEPENDENT_HYSTERESIS = Component(
@@ -96,7 +92,7 @@ RATE_DEPENDENT_HYSTERESIS = Component(
             "z_r",
             "V",
             "stop element of the thresholds that grow",
-            _stop_scale,
+            stop_scale,
             memory=True,
             settles=False,
         ),

@@ -56,6 +56,11 @@ def mains_line(frequency: float, record: Record) -> bool:
     return abs(frequency - round(frequency / drive) * drive) > _APART / record.duration
 
 
+def tells_tone(frequency: float, record: Record, *, hum: bool) -> bool:
+    """Whether a record tells a tone [Hz] from its drive; a `hum` on the mains, too."""
+    return not among_harmonics(frequency, record) or (hum and mains_line(frequency, record))
+
+
 def turns(voltage: FloatArray, share: float = 0.1) -> bool:
     """Whether a voltage moves both ways, by this share of its range or more in all."""
     moves = np.diff(voltage)

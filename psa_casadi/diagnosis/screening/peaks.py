@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.drive import among_harmonics, mains_line
+from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.quality.filtering import peaks as highest_peaks
 from psa_casadi.records.split import Experiment
 
@@ -38,11 +38,7 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
     order = highest_peaks(power[lowest:], apart, 5 * _PEAKS) + lowest
     record = experiment.record
-    tones = [
-        k
-        for k in order
-        if not among_harmonics(frequency[k], record) or mains_line(frequency[k], record)
-    ]
+    tones = [k for k in order if tells_tone(frequency[k], record, hum=True)]
     strongest = np.array(tones[:_PEAKS], dtype=int)
     return tuple(float(f) for f in np.sort(frequency[strongest])) or (
         0.1 / experiment.record.sample_time,

@@ -24,7 +24,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column
 from psa_casadi.identification.fitting.prediction import OUTPUT, measured, trace_record
 from psa_casadi.model.compose import Model
-from psa_casadi.records.drive import among_harmonics
+from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.ahead import compiled
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -99,7 +99,7 @@ def _probe_values(
             places = [f for f in peaks[grid] if low < f < high]
             if grid == SPECTRAL_PEAKS and effect.belongs_to != "environment":
                 first = experiments[0].record  # a resonance answers at the drive's harmonics only
-                places = [f for f in places if not among_harmonics(f, first)]
+                places = [f for f in places if tells_tone(f, first, hum=False)]
             grids.append(tuple(places))
         else:
             grids.append(grid)

@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.records.drive import among_harmonics, mains_line
+from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -85,10 +85,11 @@ def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) 
     if any(period > 0.5 * widest for period in periods):
         return False
     tone = cause.tone
-    for record in (e.record for e in experiments if tone is not None):
-        hum = cause.belongs_to == "environment" and mains_line(values[tone or ""], record)
-        if among_harmonics(values[tone or ""], record) and not hum:
-            return False
+    hum = cause.belongs_to == "environment"
+    if tone is not None and not all(
+        tells_tone(values[tone], e.record, hum=hum) for e in experiments
+    ):
+        return False
     for p in cause.parameters:
         if not p.fitted or p.name == cause.gain:
             continue
