@@ -1,7 +1,24 @@
 """What a search found, and what of it is named."""
 
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
 from psa_casadi.diagnosis.budget import Share
-from psa_casadi.diagnosis.judgement import too_small
+from psa_casadi.diagnosis.corrections.correct import Correction
+from psa_casadi.diagnosis.corrections.kinds import KINDS
+from psa_casadi.diagnosis.judgement import (
+    Weighed,
+    too_small,
+    vague_note,
+    verdict_of,
+    withdrawn_names,
+)
+from psa_casadi.diagnosis.screening.evidence import probabilities
+from psa_casadi.diagnosis.search.steps import Step
+from psa_casadi.diagnosis.search.view import View
 
 
 def _share(what: str, share: float) -> Share:
@@ -18,3 +35,51 @@ def test_the_largest_cause_is_always_named() -> None:
     assert too_small([_share("slow_creep", 0.04)]) == ()
     assert too_small([_share("slow_creep", 0.04), _share("drift", 0.03)])[0].what == "drift"
     assert too_small([]) == ()
+
+
+def test_a_probability_is_tempered_by_what_the_whole_model_explains() -> None:
+    evidence = {"drive_lag": 222.0, "sensor_delay": 192.0}
+    assert probabilities(evidence)["drive_lag"] > 0.999
+    # the base has gained 5,700 nats from resonances whose form is approximate too
+    told = probabilities(evidence, 5919.0)
+    assert told["drive_lag"] == pytest.approx(1.0 / (1.0 + np.exp(-30.0 / (0.004 * 5919.0))))
+
+
+def _steps(*names: str, alarm: bool = False) -> list[Step]:
+    """Steps that name effects, each sure of its cause."""
+
+    def step(name: str | None) -> Step:
+        test = SimpleNamespace(alarm=alarm)
+        chosen = None if name is None else SimpleNamespace(causes=(SimpleNamespace(name=name),))
+        chances = {} if name is None else {name: 1.0}
+        view = SimpleNamespace(test=test)
+        return Step(cast(View, view), chosen=cast(Any, chosen), probability=chances)
+
+    return [step(name) for name in (*names, None)]
+
+
+def test_a_cause_without_a_name_is_a_part_that_is_not_explained() -> None:
+    both = _steps("hysteresis_memory", "preload_loss")
+
+    def verdict(steps: list[Step], *unnamed: str) -> str:
+        return verdict_of(steps, missing=True, withdrawn=False, share=0.9, unnamed=unnamed)
+
+    assert verdict(both) == "cause_named"
+    assert verdict(both, "preload_loss") == "partly_explained"
+    assert verdict(both, "hysteresis_memory", "preload_loss") == "unexplained"
+    assert verdict(_steps("hysteresis_memory", alarm=True)) == "partly_explained"
+
+
+def test_notes_say_what_is_not_named_and_why() -> None:
+    curve = next(k for k in KINDS if k.name == "curve")
+    nothing = np.zeros(1)
+    better = Correction(curve, 203.0, 0.0, nothing, (), (), nothing)
+    assert vague_note({}) == ()
+    (note,) = vague_note({"rate_dependent_hysteresis": better})
+    assert note.startswith("rate_dependent_hysteresis: in the extended model and not named")
+    assert curve.sentence in note
+    weighed = Weighed(566.0, 1, 0.75, (), ())
+    every = {"preload_loss": better}
+    (why,) = withdrawn_names(_steps("preload_loss"), weighed, None, every, "")
+    assert curve.sentence in why
+    assert "75 %" in why

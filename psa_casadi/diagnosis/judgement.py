@@ -1,6 +1,6 @@
 """From what a search found to a verdict: do the names stand, and how much do they explain?"""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.diagnosis.budget import Share
@@ -19,10 +19,11 @@ SMALL_NOTE = (
 
 @dataclass(frozen=True)
 class Weighed:
-    """Named causes against the unnamed corrections beside the base.
+    """Causes against the unnamed corrections beside the model without them.
 
-    `evidence` of the causes together over the base; `share` that they remove of the base's excess;
-    `shares` those that the `corrections` would.
+    `evidence` of the causes together over that model, `whole` over the plain base where that model
+    is another; `share` that they remove of its held-out excess; `shares` those that the
+    `corrections` would.
     """
 
     evidence: float
@@ -30,6 +31,7 @@ class Weighed:
     share: float
     corrections: Sequence[Correction]
     shares: Sequence[float]
+    whole: float = 0.0
 
     def beaten_by(self) -> Correction | None:
         """Return the unnamed correction that takes the names away, if there is one.
@@ -43,7 +45,7 @@ class Weighed:
         best = max((c.copies for c in self.corrections), default=0.0)
         alike = min(best, 1.0 - thresholds().form)
         for c, share in zip(self.corrections, self.shares, strict=True):
-            clearly = thresholds().clearly * temperature(max(self.evidence, c.evidence))
+            clearly = thresholds().clearly * temperature(max(self.evidence, self.whole, c.evidence))
             enough = share - thresholds().form
             if c.copies >= alike:
                 enough = thresholds().as_much * share
@@ -59,23 +61,25 @@ def verdict_of(
     missing: bool,
     withdrawn: bool,
     share: float,
+    unnamed: Collection[str] = (),
 ) -> Verdict:
     """Return the verdict on what a search found; the last step is the model with all causes.
 
     `missing` says that the base leaves something, `withdrawn` that an unnamed correction takes the
     names away or held-out samples do not confirm them, `share` of the held-out excess the causes
-    remove.
+    remove; `unnamed` are causes that stay in the model without a name.
     """
     if not missing:
         return "adequate"
-    if len(steps) == 1 or withdrawn:
+    named = [s for s in steps if s.chosen is not None and s.cause.name not in unnamed]
+    if not named or withdrawn:
         return "unexplained"
-    partly = steps[-1].test.alarm
-    if partly and share < thresholds().partly:
+    alarm = steps[-1].test.alarm
+    if alarm and share < thresholds().partly:
         return "unexplained"
-    if told_from(steps[0]):
+    if told_from(named[0]):
         return "ambiguous"
-    return "partly_explained" if partly else "cause_named"
+    return "partly_explained" if alarm or unnamed else "cause_named"
 
 
 def told_from(step: Step) -> tuple[str, ...]:
@@ -96,9 +100,16 @@ def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
 
 
 def withdrawn_names(
-    steps: Sequence[Step], weighed: Weighed, beaten: Correction | None, doubt: str
+    steps: Sequence[Step],
+    weighed: Weighed,
+    beaten: Correction | None,
+    vague: Mapping[str, Correction],
+    doubt: str,
 ) -> tuple[str, ...]:
-    """Say which names were found but not told, and why: `doubt` is that of held-out samples."""
+    """Say which names were found but not told, and why: `doubt` is that of held-out samples.
+
+    An unnamed correction has `beaten` all of them, or some have beaten each of them (`vague`).
+    """
     names = ", ".join(s.cause.name for s in steps if s.chosen is not None)
     if not names:
         return ()
@@ -108,11 +119,26 @@ def withdrawn_names(
     )
     if doubt:
         return (f"{found}; not named, because {doubt}.",)
-    if beaten is None:
-        least = 100 * thresholds().partly
-        return (f"{found}; not named, because that is less than {least:.0f} % and much remains.",)
-    share = weighed.shares[list(weighed.corrections).index(beaten)]
-    return (
-        f"{found}; not named, because an unnamed correction explains more: {beaten.kind.sentence},"
-        f" with {beaten.evidence:.0f} and {100 * share:.0f} %.",
-    )
+    if beaten is not None:
+        share = weighed.shares[list(weighed.corrections).index(beaten)]
+        return (
+            f"{found}; not named, because an unnamed correction explains more:"
+            f" {beaten.kind.sentence}, with {beaten.evidence:.0f} and {100 * share:.0f} %.",
+        )
+    if vague:
+        return (f"{found}; not named: {_each(vague)}.",)
+    least = 100 * thresholds().partly
+    return (f"{found}; not named, because that is less than {least:.0f} % and much remains.",)
+
+
+def vague_note(vague: Mapping[str, Correction]) -> tuple[str, ...]:
+    """Say which causes stay in the model without a name, as corrections describe them better."""
+    if not vague:
+        return ()
+    names = ", ".join(vague)
+    return (f"{names}: in the extended model and not named: {_each(vague)}.",)
+
+
+def _each(vague: Mapping[str, Correction]) -> str:
+    better = "; ".join(f"{c.kind.sentence}, instead of {name}" for name, c in vague.items())
+    return f"beside the model without it, an unnamed correction explains more ({better})"

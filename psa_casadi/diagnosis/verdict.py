@@ -8,7 +8,7 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.alternatives import alternatives
 from psa_casadi.diagnosis.blind_spots import blind_spots, shown
-from psa_casadi.diagnosis.budget import Budget, Removed, budget
+from psa_casadi.diagnosis.budget import Budget, budget
 from psa_casadi.diagnosis.corrections.correct import corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
 from psa_casadi.diagnosis.corrections.patch import patch_of
@@ -23,9 +23,9 @@ from psa_casadi.diagnosis.held_out.errors import (
 from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
 from psa_casadi.diagnosis.judgement import (
     SMALL_NOTE,
-    Weighed,
     told_from,
     too_small,
+    vague_note,
     verdict_of,
     withdrawn_names,
 )
@@ -45,6 +45,7 @@ from psa_casadi.diagnosis.search.hypothesis import Scale
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import same_curves
 from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.weighing import Balance
 from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit
@@ -86,19 +87,10 @@ def conclude(
     floor = pooled_level(noise, errors, colour)
     beyond = held_out_excess(first.fit, experiments, first.predicted, first.screening.colour, noise)
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
-    beside_base = (
-        corrections(first.fit, experiments, colour, last.predicted) if missing and driven else ()
-    )
-    removed = Removed(experiments, first.predicted, floor)
-    share = removed.from_base(last.predicted)
-    weighed = Weighed(
-        evidence=Scale(first.fit, colour, thresholds().price).evidence(last.view.of),
-        causes=len(steps) - 1,
-        share=share,
-        corrections=beside_base,
-        shares=[removed.from_base(c.predicted) for c in beside_base],
-    )
+    balance = Balance(experiments, Scale(first.fit, colour, thresholds().price), floor)
+    weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
     beaten = weighed.beaten_by()
+    vague = {} if beaten is not None else balance.vague(steps)
     gain = gain_of(experiments, first.predicted, last.predicted)
     partly = last.test.alarm and len(steps) > 1
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
@@ -106,12 +98,18 @@ def conclude(
     verdict: Verdict = (
         "not_driven"
         if not driven
-        else verdict_of(steps, missing=missing, withdrawn=bool(beaten or doubt), share=share)
+        else verdict_of(
+            steps,
+            missing=missing,
+            withdrawn=bool(beaten or doubt),
+            share=weighed.share,
+            unnamed=vague,
+        )
     )
     named = [s for s in steps if s.chosen] if verdict in NAMING else []
     final = last if named else first
     patch = patch_of(
-        corrections(last.fit, experiments, colour) if named else beside_base,
+        corrections(last.fit, experiments, colour) if named else weighed.corrections,
         experiments,
         final.view.of.holdout_rms,
         colour,
@@ -133,12 +131,9 @@ def conclude(
         stiffness_given,
         evidence=diagnosis_evidence(final.fit, found, experiments, final.predicted, spent),
     )
-    small = too_small(spent.causes) if partly else ()
-    causes = tuple(
-        _cause(s, last.fit, found, spent)
-        for s in named
-        if s.cause.name not in [c.what for c in small]
-    )
+    small = too_small([c for c in spent.causes if c.what not in vague]) if partly else ()
+    unnamed = {*vague, *(c.what for c in small)}
+    causes = tuple(_cause(s, last.fit, found, spent) for s in named if s.cause.name not in unnamed)
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -158,7 +153,11 @@ def conclude(
         doubt=doubt if verdict in ("adequate", "unexplained") else "",
         notes=(
             *model.provenance.notes,
-            *(withdrawn_names(steps, weighed, beaten, doubt) if verdict == "unexplained" else ()),
+            *(
+                withdrawn_names(steps, weighed, beaten, vague, doubt)
+                if verdict == "unexplained"
+                else vague_note(vague)
+            ),
             *(SMALL_NOTE.format(c.what, 100 * max(c.share, 0.0)) for c in small),
             *coverage_notes(experiments),
         ),

@@ -124,11 +124,11 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
     alone = {**view.estimated(), **{n: found.scale.evidence(c) - own for n, c in fitted.items()}}
     if chosen is None:
         refused = {n for n, c in fitted.items() if c.names not in found.worth}
-        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, task)
+        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, own, task)
     cause = chosen.causes[-1]
     less = _without(found, task, cause)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
-        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), task)
+        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), own, task)
     there = _view(found, less, task)
     beside = {**_fitted(found, less), cause.name: found.best}
     own = found.scale.evidence(less)
@@ -136,12 +136,13 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
         **there.estimated(),
         **{n: found.scale.evidence(c) - own for n, c in beside.items()},
     }
-    for name in _promising(evidence, beside, cause.name):
+    whole = found.scale.evidence(found.best)
+    for name in _promising(evidence, beside, cause.name, whole):
         more = with_cause(less, task.experiments, there.starts_of(name))
         evidence[name] = -np.inf if more is None else found.scale.evidence(more) - own
     refused = {n for n, c in beside.items() if c.names not in found.worth} - {cause.name}
     step = Step(view, fitted, chosen, less, there, beside, alone)
-    return _judged(step, evidence, beside, refused, task)
+    return _judged(step, evidence, beside, refused, whole, task)
 
 
 def _fitted(found: Searched, h: Hypothesis) -> dict[str, Hypothesis]:
@@ -155,9 +156,12 @@ def _judged(
     evidence: Mapping[str, float],
     fitted: Mapping[str, Hypothesis],
     refused: set[str],
+    whole: float,
     task: Task,
 ) -> Step:
     """Return a step with evidence and probability; `refused` effects may not be the answer.
+
+    `whole` is the evidence over the plain base of the model with the cause.
 
     Effects that bend the same curve are refused together, and share what the best of them has.
     """
@@ -170,15 +174,15 @@ def _judged(
         elif refused & set(group):
             refused = refused | set(group)
     shared = levelled(evidence, alike, good)
-    chances = probabilities({n: v for n, v in shared.items() if n not in refused})
+    chances = probabilities({n: v for n, v in shared.items() if n not in refused}, whole)
     return replace(step, evidence=shared, probability=chances)
 
 
 def _promising(
-    evidence: Mapping[str, float], fitted: Mapping[str, Hypothesis], cause: str
+    evidence: Mapping[str, float], fitted: Mapping[str, Hypothesis], cause: str, whole: float
 ) -> list[str]:
     """Return effects of which only an estimate says that they are as likely as the cause."""
-    least = evidence[cause] - thresholds().clearly * temperature(evidence[cause])
+    least = evidence[cause] - thresholds().clearly * temperature(whole)
     return [n for n, e in evidence.items() if n not in fitted and e > least]
 
 
