@@ -88,12 +88,15 @@ def binary(fmi: int, platform: Platform) -> Path:
 
 @cache
 def host(platform: Platform) -> Path:
-    """Compile the importer for a platform and return the program."""
+    """Compile the importer for a platform and return the program.
+
+    With the flags of the library: others would let the compiler make the C library again.
+    """
     windows = platform.suffix == ".dll"
     program = Path(_FOLDER.name) / f"host-{platform.name}{'.exe' if windows else ''}"
     sources = [str(HERE / n) for n in ("host.c", "host_fmi2.c", "host_fmi3.c")]
     target = ["-target", platform.target or ""]
-    options = [*OPTIMISE, *STRICT, "-isystem", str(HEADERS), "-g0"]
+    options = [*OPTIMISE, *platform.flags, *STRICT, "-isystem", str(HEADERS), "-g0"]
     libraries = [] if windows else ["-ldl"]
     command = [*zig_command(), *target, *options, *sources, *libraries, "-o", str(program)]
     run_compiler(command, Path(_FOLDER.name))
