@@ -159,15 +159,18 @@ class Desk:
 
     def stop(self) -> None:
         """Let what runs end and keep what it has."""
-        for own in (self._run, self._export):
-            if own is not None and own.job.status == "running":
-                own.job.stop()
+        for own in self.running():
+            own.job.stop()
 
     def close(self) -> None:
         """End what runs, at once."""
-        for own in (self._run, self._export):
-            if own is not None:
-                own.job.end()
+        for own in self.running():
+            own.job.end()
+
+    def running(self) -> list[Run]:
+        """Return what runs: nothing, or one command."""
+        both = (self._run, self._export)
+        return [r for r in both if r is not None and r.job.status == "running"]
 
     # What is told
 
@@ -207,7 +210,7 @@ class Desk:
                     self._changed()
 
     def _idle(self) -> None:
-        if any(r is not None and r.job.status == "running" for r in (self._run, self._export)):
+        if self.running():
             raise BusyError
 
     def _taken(self, name: str) -> bool:

@@ -43,6 +43,11 @@ class Job:
         """Time [s] that it has run by now, or took."""
         return (self._end or time.monotonic()) - self._begin
 
+    @property
+    def pid(self) -> int | None:
+        """Number of its process, None before it has started."""
+        return None if self._child is None else self._child.pid
+
     def stop(self) -> None:
         """Let it end and keep what it has; after a while it is killed."""
         self._stopped = True

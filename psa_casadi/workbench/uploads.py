@@ -44,7 +44,7 @@ def stored_name(name: str, taken: Callable[[str], bool]) -> str:
 
     The ending is kept, as it says how a file is read.
     """
-    last = re.split(r"[\\/]", visible(name))[-1]
+    last = re.split(r"[\\/]", plain(name))[-1]
     clean = _BARRED.sub("_", last).strip(" .").lstrip("-").strip(" .") or "record"
     stem, dot, ending = clean.rpartition(".")
     stem, ending = (stem, dot + ending) if dot else (ending, "")
