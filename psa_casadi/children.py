@@ -152,6 +152,15 @@ def end_children() -> None:
         kill(child)
 
 
+def interrupt(child: "subprocess.Popen[Any]") -> None:
+    """Ask a child to end and keep what it has, as Ctrl-C does; where that is unknown, kill it."""
+    if sys.platform == "win32":
+        kill(child)
+    elif child.returncode is None:
+        with contextlib.suppress(OSError):
+            os.kill(child.pid, signal.SIGINT)
+
+
 def kill(child: "subprocess.Popen[Any]") -> None:
     """Kill a child with its group, unless it has ended: its number may be another's afterwards."""
     if child.returncode is None:

@@ -194,13 +194,21 @@ def test_diagnose_writes_only_what_is_asked_for_and_can_be_quiet(
                 "displacement [m]": part.displacement,
             },
         )
+    events = tmp_path / "e.jsonl"
     result = done(
-        "diagnose", paths[0], "--holdout", paths[1], "--json", tmp_path / "d.json", "--quiet"
-    )
+        "diagnose", paths[0], "--holdout", paths[1], "--json", tmp_path / "d.json", "--quiet",
+        "--events", events, "--leave-out", "slow_creep",
+    )  # fmt: skip
     assert result.output == ""
-    assert {p.name for p in tmp_path.iterdir()} == {"a.csv", "b.csv", "d.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {"a.csv", "b.csv", "d.json", "e.jsonl"}
     d = json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))
     assert [r["name"] for r in d["records"]] == ["a", "b"]
+    tried = [json.loads(line) for line in events.read_text(encoding="utf-8").splitlines()]
+    assert tried[0]["causes"] == []
+    assert [t["state"] for t in tried].count("best") == 1
+    assert {c["effect"] for c in d["causes"]} <= set(tried[-1]["causes"])
+    assert all("slow_creep" not in t["causes"] for t in tried)
+    assert "slow_creep" in d["notes"][-1]
 
 
 def test_simulate_writes_every_output_with_its_unit(

@@ -78,6 +78,22 @@ def diagnose(
             "--timings", help="Print what each stage took: time, processor time, simulations."
         ),
     ] = False,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--leave-out",
+            help="Effect that is not to be looked for, as one that cannot be there; repeat the"
+            " option for several.",
+        ),
+    ] = None,
+    events: Annotated[
+        Path | None,
+        typer.Option(
+            "--events",
+            help="File that gets a line of JSON for every fit of the search while it runs: its"
+            " causes, evidence, score and errors.",
+        ),
+    ] = None,
     small: SmallOption = False,
     still: StillOption = False,
     columns: ColumnsOption = None,
@@ -102,22 +118,23 @@ def diagnose(
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli import diagnosis_files as files
+            from psa_casadi.cli.events import events_to
             from psa_casadi.cli.inputs import Given
             from psa_casadi.diagnosis.diagnose import diagnose as run
             from psa_casadi.diagnosis.result import DiagnosisInterrupted
-            from psa_casadi.model.own_effects import known_effects
             from psa_casadi.report.words.text import story
             from psa_casadi.report.words.timings import timings_table
         with stage("reading"):
             given, held = Given(effects), holdout or []
             given.stiffness(stiffness)
-            given.outputs({**outputs, "--next": following}, [*records, *held, model])
+            beside = {"--next": following, "--events": events}
+            given.outputs({**outputs, **beside}, [*records, *held, model])
             _keep_apart(given, output, model)
             found = given.records(records, held_out=held, columns=columns, sample_time=sample_time)
-            start = given.model(model)
+            start, table = given.model(model), given.searched(leave_out or ())
             given.check()
         count = len(records)
-        with working("diagnosing", quiet, DIAGNOSE) as progress:
+        with working("diagnosing", quiet, DIAGNOSE) as progress, events_to(events) as watch:
             try:
                 d = run(
                     found[:count],
@@ -125,9 +142,11 @@ def diagnose(
                     model=start,
                     stiffness=stiffness,
                     hysteresis=hysteresis.value if hysteresis else None,
-                    effects=tuple(known_effects(given.effects).values()),
+                    effects=table,
                     progress=progress,
+                    watch=watch,
                 )
+                d = files.noted(d, leave_out or ())
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = following or _beside(json or report)
@@ -135,16 +154,25 @@ def diagnose(
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
-    told_of = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
-    tell_written(*told_of, d.next_experiment.voltage_csv, quiet=quiet)
-    for line in files.models(d, output):
-        show(line, quiet)
-    if unpatched:
-        show(unpatched, quiet)
+    _tell_files(d, outputs, unpatched, quiet)
     if timings:
         show("", quiet)
         show_table(timings_table(spent.stages), quiet)
         show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", quiet)
+
+
+def _tell_files(
+    d: "Diagnosis", outputs: Mapping[str, Path | None], unpatched: str, quiet: bool
+) -> None:
+    """Name the files that were written, and say why a patch is missing."""
+    from psa_casadi.cli import diagnosis_files as files
+
+    told_of = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
+    tell_written(*told_of, d.next_experiment.voltage_csv, quiet=quiet)
+    for line in files.models(d, outputs["--output"]):
+        show(line, quiet)
+    if unpatched:
+        show(unpatched, quiet)
 
 
 def _finish(

@@ -1,6 +1,6 @@
 """The files of `psa diagnose`: what was asked for, and what an interrupt leaves of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,16 @@ def alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative
         (a, output.with_name(f"{output.stem}_{a.instead}_for_{a.cause}.json"))
         for a in d.alternatives
     ]
+
+
+def noted(d: "Diagnosis", left_out: Sequence[str]) -> "Diagnosis":
+    """Say in the notes which effects were not looked for."""
+    from dataclasses import replace
+
+    if not left_out:
+        return d
+    names = ", ".join(dict.fromkeys(left_out))
+    return replace(d, notes=(*d.notes, f"Not looked for, as --leave-out says: {names}."))
 
 
 def models(d: "Diagnosis", output: Path | None) -> list[str]:

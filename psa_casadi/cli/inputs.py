@@ -1,5 +1,6 @@
 """What a command is given, checked as a whole before any long work starts."""
 
+import difflib
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -8,11 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from psa_casadi.component import Component
 from psa_casadi.errors import InputError
 from psa_casadi.files import why_not_written
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
-from psa_casadi.model.own_effects import own_effects
+from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, read_record
@@ -118,6 +120,18 @@ class Given:
             )
             return None
         return model
+
+    def searched(self, left_out: Sequence[str]) -> tuple[Component, ...]:
+        """Return the effects to search, without those that --leave-out names."""
+        known = known_effects(self.effects)
+        for name in dict.fromkeys(left_out):
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+                meant = f"is '{near[0]}' meant? " if near else ""
+                self.add(
+                    f"--leave-out: there is no effect '{name}'; {meant}`psa effects` lists them."
+                )
+        return tuple(c for n, c in known.items() if n not in left_out)
 
     def model_or_stack(
         self,

@@ -51,6 +51,7 @@ def decisions(
             experiments=without_column(experiments, column),
             table=effects,
             keep=lambda _: None,
+            watch=lambda _: None,
         )
         found.append(_decision(column, steps, search(alone), effects, verdict))
     return tuple(found)

@@ -1,6 +1,6 @@
 """Diagnose: fit the base, search for causes, judge."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from psa_casadi.component import Component
@@ -10,7 +10,7 @@ from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
-from psa_casadi.diagnosis.task import Method, Task
+from psa_casadi.diagnosis.task import Method, Task, Tried
 from psa_casadi.diagnosis.thresholds import using
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
@@ -60,6 +60,7 @@ def diagnose(
     effects: Sequence[Component] | None = None,
     method: Method | None = None,
     progress: Progress = lambda _: None,
+    watch: Callable[[Tried], None] = lambda _: None,
 ) -> Diagnosis:
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
@@ -69,8 +70,9 @@ def diagnose(
     `divided`); they choose nothing but whether an extension may stay. `model` is where the base fit
     starts; `stiffness` [N/m] fixes the force scale; `hysteresis` is the form of the base's (see
     `identify`); `effects` is the table to search; `method` can leave parts of the method out (for
-    its ablation). Raises InputError, and DiagnosisInterrupted with the best model so far at a
-    keyboard interrupt once there is one.
+    its ablation). `progress` gets what is done in words, `watch` every hypothesis of the search
+    (`Tried`). Raises InputError, and DiagnosisInterrupted with the best model so far at a keyboard
+    interrupt once there is one.
     """
     method = method or Method()
     given, kept = records_given(records), records_given(holdout)
@@ -94,7 +96,9 @@ def diagnose(
             table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
             said += [*columns.left_out, *preferred]
         so_far: list[Fit] = []
-        task = Task(experiments, tuple(table), method, progress, so_far.append, hidden)
+        task = Task(
+            experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden
+        )
         try:
             # from the end: the screening begins at the front
             with compiled_ahead(start.with_effect(e) for e in reversed(table)):

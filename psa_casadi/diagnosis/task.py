@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.thresholds import Thresholds
@@ -39,12 +40,38 @@ class Method:
     thresholds: Thresholds = field(default_factory=Thresholds)
 
 
+#: Why a hypothesis is told of.
+State = Literal["fitted", "finished", "visited", "best"]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A hypothesis of a search at the moment that it is told of.
+
+    `state` says why: it was "fitted", its fit went on to its end ("finished"), its neighbours are
+    fitted next ("visited"), or it is the answer ("best"). `causes` stand beside the base in the
+    order in which they were added, so that all but the last are the parent's. `evidence` is ln of
+    the Bayes factor over the first base fit, `score` that less the price of the causes. `rms_m`
+    and `holdout_rms_m` [m] are the errors in fitted and in held-out samples, `base_rms_m` and
+    `noise_rms_m` [m] the held-out error of the base and the noise as both are known by now.
+    """
+
+    state: State
+    causes: tuple[str, ...]
+    evidence: float
+    score: float
+    rms_m: float
+    holdout_rms_m: float
+    base_rms_m: float
+    noise_rms_m: float
+
+
 @dataclass(frozen=True)
 class Task:
     """The records, the table of effects to search, the method, and who is told of the progress.
 
-    `keep` gets the best fit so far where a keyboard interrupt ends the search; `hidden` is the
-    share of the readings that a saturated sensor has made.
+    `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
+    interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made.
     """
 
     experiments: tuple[Experiment, ...]
@@ -52,6 +79,7 @@ class Task:
     method: Method = field(default_factory=Method)
     progress: Callable[[str], None] = lambda _: None
     keep: Callable[[Fit], None] = lambda _: None
+    watch: Callable[[Tried], None] = lambda _: None
     hidden: float = 0.0
 
     @property

@@ -74,6 +74,7 @@ class _Search:
             chosen = self.next()
             if chosen is None or len(self.expanded) > _EXPANSIONS:
                 break
+            self.known.tell(chosen, "visited")
             self.visit(chosen)
 
     def result(self) -> Searched:

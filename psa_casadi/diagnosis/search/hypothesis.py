@@ -21,6 +21,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out.errors import held_out_further, held_out_rms, whole_residuals
 from psa_casadi.diagnosis.noise.colour import Colour, rms
 from psa_casadi.diagnosis.screening.evidence import evidence
+from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment
@@ -128,6 +129,20 @@ class Scale:
     def score(self, of: Hypothesis) -> float:
         """Evidence less the price of the causes."""
         return self.evidence(of) - self.price * len(of.causes)
+
+
+def tried(of: Hypothesis, state: State, root: Hypothesis, scale: Scale) -> Tried:
+    """Return what is told of a hypothesis while a search goes on."""
+    return Tried(
+        state,
+        tuple(c.name for c in of.causes),
+        evidence=float(scale.evidence(of)),
+        score=float(scale.score(of)),
+        rms_m=float(of.fit.rms),
+        holdout_rms_m=float(of.holdout_rms),
+        base_rms_m=float(root.holdout_rms),
+        noise_rms_m=float(scale.colour.rms),
+    )
 
 
 def ended(of: Hypothesis) -> Hypothesis:

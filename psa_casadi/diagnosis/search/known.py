@@ -10,11 +10,11 @@ from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.search.fits import to_end
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, tried
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import confirmed, in_character, shows_memory
-from psa_casadi.diagnosis.task import Task
+from psa_casadi.diagnosis.task import State, Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -64,6 +64,7 @@ class Known:
         self.fitted: dict[Names, tuple[str, ...]] = {}
         self.closed: set[Names] = set()
         self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
+        self.tell(root, "finished")
 
     @property
     def root(self) -> Hypothesis:
@@ -79,6 +80,7 @@ class Known:
         self.view(self.best())
         best = self.in_order(self.answer())
         self.view(best)
+        self.tell(best, "best")
         worth = frozenset(n for n, h in self.found.items() if self.worth(h))
         return Searched(best, self.found, self.views, self.fitted, worth, self.scale, self.trials)
 
@@ -134,7 +136,12 @@ class Known:
         old = self.found.get(found.names)
         if old is None or self.scale.evidence(found) > self.scale.evidence(old):
             causes = found.causes if old is None else old.causes
-            self.found[found.names] = replace(found, causes=causes)
+            self.found[found.names] = kept = replace(found, causes=causes)
+            self.tell(kept, "finished" if kept.final else "fitted")
+
+    def tell(self, h: Hypothesis, state: State) -> None:
+        """Tell whoever watches the search of a hypothesis."""
+        self.task.watch(tried(h, state, self.root, self.scale))
 
     def view(self, h: Hypothesis) -> View:
         """Look at what a hypothesis leaves; the noise of all others is told from the best one."""
@@ -203,7 +210,8 @@ class Known:
         for ended in side_by_side(lambda h: to_end(h, self.task.experiments), hypotheses):
             old = self.found[ended.names]
             better = self.scale.evidence(ended) >= self.scale.evidence(old)
-            self.found[ended.names] = ended if better else replace(old, final=True)
+            self.found[ended.names] = kept = ended if better else replace(old, final=True)
+            self.tell(kept, "finished")
 
     def worth(self, h: Hypothesis) -> bool:
         """Whether every cause removes what can be told, and held-out data confirm it."""

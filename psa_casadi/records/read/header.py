@@ -68,6 +68,11 @@ def parse_header(
     return fields
 
 
+def named_columns(texts: Sequence[str]) -> list[tuple[str, str | None]]:
+    """Return of every cell of a header the name and the unit in brackets, None without one."""
+    return [(_name_of(text.strip()), _unit_of(text.strip())) for text in texts]
+
+
 def _by_other_names(
     strangers: Sequence[tuple[int, str]],
     fields: dict[str, Field],

@@ -56,7 +56,7 @@ def read_arrays(
     arrays = LOADERS[os.path.splitext(path)[1].lower()](path, data)
     columns: dict[str, tuple[str, Numbers]] = {}
     for name in COLUMNS:
-        source = wanted.get(name) or _by_name(name, arrays)
+        source = wanted.get(name) or array_of(name, arrays)
         if source is not None and source.array in arrays:
             unit = _unit(path, name, source, arrays[source.array].unit, problems)
             columns[name] = (unit, arrays[source.array].values)
@@ -77,7 +77,7 @@ def read_arrays(
 
 def _unit(path: str, name: str, source: Source, stated: str | None, problems: Problems) -> str:
     """Return the unit of an array, "" where none can be known."""
-    unit = source.unit or stated or SI_UNITS.get(name)
+    unit = unit_of(name, source, stated)
     if unit is not None:
         check_unit(COLUMNS[name], unit, f"{path}: array '{source.array}'", problems)
         return unit
@@ -88,7 +88,12 @@ def _unit(path: str, name: str, source: Source, stated: str | None, problems: Pr
     return ""
 
 
-def _by_name(name: str, arrays: Arrays) -> Source | None:
+def unit_of(name: str, source: Source, stated: str | None) -> str | None:
+    """Return the unit that a source, the file or, of an SI column, its name gives."""
+    return source.unit or stated or SI_UNITS.get(name)
+
+
+def array_of(name: str, arrays: Arrays) -> Source | None:
     """Return the array called `name` or `name_unit`, else the only one that means it.
 
     That one has a unit, or the column's own name in a group.

@@ -56,6 +56,26 @@ def read_parquet(
     return whole_samples(path, hashlib.sha256(data).hexdigest(), "row", columns)
 
 
+def parquet_head(path: str, count: int) -> tuple[list[str], list[list[str]]]:
+    """Return the names of a Parquet file's columns, and its first `count` rows as text.
+
+    Raises:
+        InputError: as `read_parquet`.
+    """
+    data = read_bytes(path)
+    with _told(path):
+        file, schema = _opened(path, data)
+        block = next(file.iter_batches(count, use_threads=False), None)
+        columns = [] if block is None else [block.column(k) for k in range(len(schema.names))]
+        rows = [[_cell(c[k].as_py()) for c in columns] for k in range(len(block or ()))]
+    return list(schema.names), rows
+
+
+def _cell(value: Any) -> str:
+    """Return a value as a table shows it, cut off where it is long."""
+    return "" if value is None else f"{value:.9g}" if isinstance(value, float) else str(value)[:40]
+
+
 @contextmanager
 def _told(path: str) -> Iterator[None]:
     """Tell what pyarrow says of a damaged file, which may be anything."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import ColumnMap
-from psa_casadi.records.read.csv_table import laid_out
+from psa_casadi.records.read.csv_table import CsvText, laid_out
 from psa_casadi.records.read.file_bytes import read_bytes, reason_of
 from psa_casadi.records.read.header_names import columns_known
 from psa_casadi.records.read.read_csv import columns_of
@@ -28,9 +28,19 @@ def read_xlsx(
 ) -> Samples | None:
     """Return the columns of a workbook, or None where none is named; an empty cell becomes nan.
 
-    The sheet is the first that names two columns of a record, else the first that holds anything.
     `wanted` says which name in the header is which column, where they differ. Mistakes are added to
     `problems`; their line is the row of the sheet.
+
+    Raises:
+        InputError: as `workbook_text`.
+    """
+    return columns_of(workbook_text(path), required, wanted, problems)
+
+
+def workbook_text(path: str) -> CsvText:
+    """Return the table of a workbook: of the first sheet that names two columns of a record.
+
+    Where none does, of the first sheet that holds anything.
 
     Raises:
         InputError: the file cannot be read, is no workbook, is too large when unpacked, or openpyxl
@@ -58,8 +68,7 @@ def read_xlsx(
             f"{path}: is no readable Excel workbook ({reason_of(error)}); save it again as .xlsx,"
             " or save the sheet as CSV."
         ) from error
-    text = laid_out(path, hashlib.sha256(data).hexdigest(), lines)
-    return columns_of(text, required, wanted, problems)
+    return laid_out(path, hashlib.sha256(data).hexdigest(), lines)
 
 
 def _check_parts(path: str, data: bytes) -> None:

@@ -1,0 +1,114 @@
+// The first rows of the files, a choice for every column, and the text of --columns that it makes.
+desk.columns = (function () {
+  'use strict';
+  var make = desk.make, units = desk.told.columns;
+
+  // What --columns says now, by the name of the array: {column, unit, scale}.
+  function wanted(text) {
+    var found = {};
+    text.split(',').forEach(function (part) {
+      var m = /^\s*([^=]+)=([^:\[\]]+)(?::\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)?\s*(.*))?$/.exec(part);
+      if (m) { found[m[2].trim()] = {column: m[1].trim(), scale: m[3] || '', unit: m[4] || ''}; }
+    });
+    return found;
+  }
+
+  function option(value, text, chosen) { return make('option', {value: value, selected: chosen}, text); }
+
+  // The choices of one layout: what --columns says, else what the reader takes a column for.
+  function choices(head, text) {
+    var said = wanted(text), taken = Object.keys(said).map(function (n) { return said[n].column; });
+    return head.names.map(function (name, k) {
+      if (name && said[name]) { return said[name]; }
+      var own = Object.keys(head.guess).find(function (c) { return head.guess[c][0] === k; });
+      return own && taken.indexOf(own) < 0 ? {column: own, unit: head.guess[own][1], scale: ''} : {column: '', unit: '', scale: ''};
+    });
+  }
+
+  // A unit that differs from the one in the header needs a number: what 1 in the file is.
+  function line(head, chosen) {
+    var parts = [];
+    chosen.forEach(function (c, k) {
+      if (!c.column || !head.names[k]) { return; }
+      var scale = c.scale || (head.units[k] && head.units[k] !== c.unit ? '1' : '');
+      parts.push(c.column + '=' + head.names[k] + ':' + scale + c.unit);
+    });
+    return parts.join(',');
+  }
+
+  function apply(head, chosen) { return desk.post('/settings', {columns: line(head, chosen)}); }
+
+  function cell(head, chosen, k, id) {
+    var own = chosen[k], name = head.names[k];
+    var what = make('select', {id: id + 'c' + k, disabled: !name, ariaLabel: 'Column ' + (name || k + 1) + ' is'});
+    what.append(option('', 'not used', !own.column));
+    Object.keys(units).forEach(function (c) { what.append(option(c, desk.words(c), c === own.column)); });
+    var unit = make('select', {id: id + 'u' + k, disabled: !own.column || !name, ariaLabel: 'Unit of ' + (name || k + 1)});
+    var listed = units[own.column] || [];
+    if (own.unit && listed.indexOf(own.unit) < 0) { listed = [own.unit].concat(listed); }
+    listed.forEach(function (u) { unit.append(option(u, u, u === own.unit)); });
+    var scale = make('input', {id: id + 's' + k, value: own.scale, inputMode: 'decimal', disabled: unit.disabled,
+      placeholder: '1 is ...', ariaLabel: '1 in ' + (name || k + 1) + ' is so many of the unit', autocomplete: 'off'});
+    what.onchange = function () {
+      chosen.forEach(function (c) { if (what.value && c.column === what.value) { c.column = ''; } });
+      own = chosen[k] = {column: what.value, scale: '', unit: what.value ? head.units[k] : ''};
+      var fits = units[what.value] || [];
+      if (what.value && fits.indexOf(own.unit) < 0) { own.unit = what.value === 'displacement' ? 'um' : fits.find(function (u) { return /^(s|V|N|A|K|C|m|1)$/.test(u); }) || fits[0]; }
+      apply(head, chosen);
+    };
+    unit.onchange = function () { own.unit = unit.value; apply(head, chosen); };
+    scale.onchange = function () { own.scale = scale.value.trim(); apply(head, chosen); };
+    return make('td', {}, what, unit, scale);
+  }
+
+  function table(head, names, text, id) {
+    var chosen = choices(head, text), row = make('tr'), top = make('tr'), body = make('tbody');
+    head.names.forEach(function (name, k) {
+      top.append(make('th', {scope: 'col'}, (name || 'a name with a mark of --columns') + (head.units[k] ? ' [' + head.units[k] + ']' : '')));
+      row.append(cell(head, chosen, k, id));
+    });
+    body.append(row);
+    head.rows.forEach(function (cells) {
+      var line = make('tr');
+      cells.forEach(function (text) { line.append(make('td', {className: 'figure'}, text)); });
+      body.append(line);
+    });
+    var use = make('button', {type: 'button', id: id + 'use'}, 'Read with these columns');
+    use.onclick = function () { apply(head, chosen); };
+    return make('div', {}, make('p', {className: 'note'}, names.join(', ')),
+      make('div', {className: 'scroll', tabIndex: 0, role: 'region', ariaLabel: 'First rows'},
+        make('table', {className: 'mapping'}, make('thead', {}, top), body)), use);
+  }
+
+  function draw(items) {
+    desk.el('curves').replaceChildren.apply(desk.el('curves'), items.map(function (item) {
+      var r = item.seen.record, scale = r.unit === 'm' ? 1e6 : 1, x = r.x.map(function (v) { return v === null ? NaN : scale * v; });
+      var unit = r.unit === 'm' ? 'µm' : 'counts', t = make('canvas'), loop = make('canvas');
+      [t, loop].forEach(function (c, k) { c.setAttribute('role', 'img'); c.ariaLabel = item.name + (k ? ': displacement over voltage' : ': voltage over time'); });
+      requestAnimationFrame(function () {
+        psaLive.plot(t, {x: 'time [s]', y: 'voltage [V]', curves: [{x: r.t, y: r.v, colour: '--model'}]});
+        psaLive.plot(loop, {x: 'voltage [V]', y: 'displacement [' + unit + ']', curves: [{x: r.v, y: x, colour: '--measured', width: 1}]});
+      });
+      var more = r.others.length ? '; also ' + r.others.map(desk.words).join(', ') : '';
+      return make('figure', {}, make('figcaption', {}, item.name),
+        make('p', {className: 'note'}, r.n + ' samples in ' + +r.seconds.toPrecision(4) + ' s' + more), t, loop);
+    }));
+  }
+
+  return function (items, text) {
+    var layouts = {}, seen = items.filter(function (i) { return i.seen && i.seen.head; });
+    seen.forEach(function (i) {
+      var key = JSON.stringify([i.seen.head.names, i.seen.head.units]);
+      (layouts[key] = layouts[key] || {head: i.seen.head, names: []}).names.push(i.name);
+    });
+    desk.filled(desk.el('columns'), JSON.stringify([layouts, text]), function () {
+      var keys = Object.keys(layouts);
+      if (!keys.length) { return [make('p', {className: 'note'}, 'No record yet.')]; }
+      return keys.map(function (key, k) { return table(layouts[key].head, layouts[key].names, text, 'layout' + k); });
+    });
+    var drawn = items.filter(function (i) { return i.seen && i.seen.record; });
+    var key = JSON.stringify(drawn.map(function (i) { return [i.key, i.name, i.seen.record]; }));
+    if (desk.el('curves').shown !== key) { desk.el('curves').shown = key; draw(drawn); }
+    desk.curves = function () { draw(drawn); };
+  };
+})();

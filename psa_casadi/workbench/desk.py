@@ -1,0 +1,238 @@
+"""What lies on the workbench: files, settings, one run; the same for every tab that looks at it."""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any
+
+from psa_casadi.errors import InputError
+from psa_casadi.workbench import run as runs
+from psa_casadi.workbench.previews import preview
+from psa_casadi.workbench.run import Run, Settings
+from psa_casadi.workbench.uploads import (
+    Limits,
+    Upload,
+    received,
+    removed,
+    shown_name,
+    stored_name,
+)
+
+#: What begins the sentence that refuses what a run forbids.
+BUSY = "A diagnosis runs; stop it first, or wait until it has ended."
+
+
+class BusyError(Exception):
+    """Something cannot be done while a command runs."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """A file on the workbench: kept for judging only or not, and how it reads, once it is known."""
+
+    file: Upload
+    held: bool = False
+    seen: dict[str, Any] | None = field(default=None, compare=False)
+
+    @property
+    def is_model(self) -> bool:
+        """Whether it is a MODEL.json to start from, and no record."""
+        return self.file.path.suffix.lower() == ".json"
+
+
+class Desk:
+    """Files, settings and the run in a folder; any thread may ask. `close` ends what runs.
+
+    `effects` are the names that may be left out, `modules` those of a user's own effects.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        effects: Sequence[str],
+        modules: Sequence[str] = (),
+        limits: Limits | None = None,
+        module: str = runs.PSA,
+    ) -> None:
+        self.folder, self.effects, self.limits = folder, tuple(effects), limits or Limits()
+        self._options = [word for name in modules for word in ("--effects", name)]
+        self._module = module
+        self._lock = threading.RLock()
+        self._items: dict[int, Item] = {}
+        self._coming: dict[int, int] = {}
+        self._settings = Settings()
+        self._run: Run | None = None
+        self._export: Run | None = None
+        self._version, self._next, self._number = 1, 1, 0
+
+    # Files
+
+    def add(self, name: str, stream: BufferedIOBase, size: int) -> None:
+        """Take a file and look at it; raises InputError where it cannot be taken."""
+        with self._lock:
+            self._idle()
+            key, self._next = self._next, self._next + 1
+            together = sum(i.file.size for i in self._items.values()) + sum(self._coming.values())
+            if len(self._items) + len(self._coming) >= self.limits.files:
+                raise InputError(f"There are {self.limits.files} files already; remove one first.")
+            if size > self.limits.one or together + size > self.limits.together:
+                raise InputError(f"{shown_name(name)} is larger than may be.")
+            path = self.folder / stored_name(name, self._taken)
+            path_coming = path.with_name(f".{key}")
+            self._coming[key] = size
+        try:
+            received(stream, size, path_coming)
+            with self._lock:
+                self._idle()
+                path = self.folder / stored_name(name, self._taken)
+                path_coming.rename(path)
+                self._items[key] = Item(Upload(key, shown_name(name), path, size))
+                self._changed()
+        finally:
+            removed(path_coming)
+            self._coming.pop(key, None)
+        self._look([key])
+
+    def remove(self, key: int) -> None:
+        """Remove a file."""
+        with self._lock:
+            self._idle()
+            item = self._items.pop(key, None)
+            if item is not None:
+                removed(item.file.path)
+            self._changed()
+
+    def hold(self, key: int, held: bool) -> None:
+        """Keep a record for judging only, or not."""
+        with self._lock:
+            self._idle()
+            if key in self._items:
+                self._items[key] = replace(self._items[key], held=held)
+                self._changed()
+        self._look([key])
+
+    def set(self, given: dict[str, Any]) -> None:
+        """Change settings; the files are read again where that changes how."""
+        with self._lock:
+            self._idle()
+            old, self._settings = self._settings, self._settings.changed(given, self.effects)
+            again = (old.columns, old.sample_time) != (
+                self._settings.columns,
+                self._settings.sample_time,
+            )
+            self._changed()
+        if again:
+            self._look(list(self._items))
+
+    # Runs
+
+    def start(self) -> None:
+        """Begin the diagnosis; raises BusyError while one runs, InputError without a record."""
+        with self._lock:
+            self._idle()
+            records = [i for i in self._items.values() if not i.is_model]
+            fitted = [i.file.path.name for i in records if not i.held]
+            if not fitted:
+                raise InputError("There is no record to fit; give a file that is not held out.")
+            held = [i.file.path.name for i in records if i.held]
+            models = [i.file.path.name for i in self._items.values() if i.is_model]
+            words = runs.diagnosis(fitted, held, models[-1] if models else None, self._settings)
+            runs.clear(self.folder)
+            self._export, self._number = None, self._number + 1
+            self._run = Run(
+                [*words, *self._options], self.folder, self._changed, self._module,
+                ["--events", runs.EVENTS],
+            )  # fmt: skip
+            self._changed()
+
+    def export(self) -> None:
+        """Begin to write the FMU of the extended model."""
+        with self._lock:
+            self._idle()
+            if not (self.folder / runs.MODEL).is_file():
+                raise InputError("There is no extended model yet.")
+            words = ["export", "fmu", "--model", runs.MODEL, "-o", runs.FMU, *self._options]
+            self._export = Run(words, self.folder, self._changed, self._module)
+            self._changed()
+
+    def stop(self) -> None:
+        """Let what runs end and keep what it has."""
+        for own in self.running():
+            own.job.stop()
+
+    def close(self) -> None:
+        """End what runs, at once."""
+        for own in self.running():
+            own.job.end()
+
+    def running(self) -> list[Run]:
+        """Return what runs: nothing, or one command."""
+        both = (self._run, self._export)
+        return [r for r in both if r is not None and r.job.status == "running"]
+
+    # What is told
+
+    def state(self, version: int, number: int, seen: int) -> dict[str, Any]:
+        """Return what has changed for a tab that knows a version and so many events of a run."""
+        with self._lock:
+            told: dict[str, Any] = {"version": self._version}
+            if self._run is not None:
+                self._run.look()
+                new = self._run.events[seen if number == self._number else 0 :]
+                told["run"] = {**self._run.told(), "number": self._number, "events": new}
+            told["export"] = None if self._export is None else self._export.told()
+            if version != self._version:
+                told["items"] = [_told(i) for i in self._items.values()]
+                told["settings"] = vars(self._settings)
+                told["result"] = runs.found(self.folder)
+                told["files"] = runs.files_left(self.folder)
+            return told
+
+    def result(self, name: str) -> Path | None:
+        """Return the place of a file that a run has left, None where there is none of this name."""
+        return self.folder / name if name in runs.files_left(self.folder) else None
+
+    def _look(self, keys: Sequence[int]) -> None:
+        """Look at files again; what was removed or changed meanwhile is left alone."""
+        for key in keys:
+            with self._lock:
+                item, settings = self._items.get(key), self._settings
+            if item is None or item.is_model:
+                continue
+            seen = preview(
+                item.file.path, settings.columns or None, settings.seconds, held=item.held
+            )
+            with self._lock:
+                if self._items.get(key) == item and settings == self._settings:
+                    self._items[key] = replace(item, seen=seen)
+                    self._changed()
+
+    def _idle(self) -> None:
+        if self.running():
+            raise BusyError
+
+    def _taken(self, name: str) -> bool:
+        lower = name.lower()
+        return (
+            lower in runs.RESERVED
+            or lower.startswith("extended_")
+            or any(i.file.path.name.lower() == lower for i in self._items.values())
+        )
+
+    def _changed(self) -> None:
+        with self._lock:
+            self._version += 1
+
+
+def _told(item: Item) -> dict[str, Any]:
+    return {
+        "key": item.file.key,
+        "name": item.file.name,
+        "stored": item.file.path.name,
+        "size": item.file.size,
+        "held": item.held,
+        "model": item.is_model,
+        "seen": item.seen,
+    }

@@ -1,0 +1,152 @@
+"""One diagnosis or export: the command it is, what the search tells meanwhile, what it leaves."""
+
+import json
+import math
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from psa_casadi.errors import InputError
+from psa_casadi.workbench.job import Job
+from psa_casadi.workbench.uploads import removed
+
+#: The module that is the command `psa` in a child.
+PSA = "psa_casadi.cli.child"
+#: The files of a diagnosis, and of an export of its model.
+MODEL, JSON, REPORT, EVENTS, FMU = (
+    "extended.json", "diagnosis.json", "report.html", "events.jsonl", "extended.fmu",
+)  # fmt: skip
+#: Names that what a diagnosis leaves may have beside these.
+_MORE = ("extended_*_for_*.json", "diagnosis_next.csv")
+RESERVED = (MODEL, JSON, REPORT, EVENTS, FMU, "diagnosis_next.csv")
+_FORMS = ("", "bouc-wen", "spectrum", "best")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a person chooses for a diagnosis; texts as the options of the command have them.
+
+    `stiffness` is in N/m, `sample_time` in s, each "" where it is not given.
+    """
+
+    columns: str = ""
+    sample_time: str = ""
+    stiffness: str = ""
+    hysteresis: str = ""
+    leave_out: tuple[str, ...] = ()
+
+    def changed(self, given: Mapping[str, Any], effects: Sequence[str]) -> "Settings":
+        """Return the settings with what is given; raises InputError for what cannot be."""
+        texts = ("columns", "sample_time", "stiffness", "hysteresis")
+        new = {name: str(given[name]).strip()[:2000] for name in texts if name in given}
+        left_out = given.get("leave_out", self.leave_out)
+        if not isinstance(left_out, list | tuple) or not set(left_out) <= set(effects):
+            raise InputError("An effect to leave out is not known.")
+        for name in ("sample_time", "stiffness"):
+            _positive(name, new.get(name, ""))
+        if new.get("hysteresis", "") not in _FORMS:
+            raise InputError("The form of the hysteresis is not known.")
+        if any(not text.isprintable() for text in new.values()):
+            raise InputError("A text has characters that no command line can carry.")
+        return replace(self, **new, leave_out=tuple(e for e in effects if e in left_out))
+
+    @property
+    def seconds(self) -> float | None:
+        """Time [s] from sample to sample, for files without a time."""
+        return float(self.sample_time) if self.sample_time else None
+
+    def options(self) -> list[str]:
+        """Return the options of the command."""
+        given = {
+            "--columns": self.columns, "--sample-time": self.sample_time,
+            "--stiffness": self.stiffness, "--hysteresis": self.hysteresis,
+        }  # fmt: skip
+        named = [f"{option}={text}" for option, text in given.items() if text]
+        return [*named, *(f"--leave-out={name}" for name in self.leave_out)]
+
+
+class Run:
+    """A command that runs or has run in the folder of the files."""
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        folder: Path,
+        ended: Callable[[], None],
+        module: str = PSA,
+        hidden: Sequence[str] = (),
+    ) -> None:
+        """Start it; `hidden` arguments are not part of what a person is shown to type."""
+        self.folder, self.shown = folder, shlex.join(["psa", *arguments])
+        self.events: list[dict[str, Any]] = []
+        self._read = 0
+        self.job = Job(module, [*arguments, *hidden], folder, ended)
+
+    def look(self) -> None:
+        """Read what the search has told since the last look."""
+        path = self.folder / EVENTS
+        if not path.exists():
+            return
+        with path.open("rb") as file:
+            file.seek(self._read)
+            for row in file:
+                if not row.endswith(b"\n"):
+                    break
+                self._read += len(row)
+                self.events.append(json.loads(row))
+
+    def told(self) -> dict[str, Any]:
+        """Return what the page shows of it."""
+        job = self.job
+        return {
+            "command": self.shown,
+            "status": job.status,
+            "seconds": job.seconds,
+            "line": job.told[-1] if job.told else "",
+            "said": list(job.said),
+            "told": list(job.told)[-40:],
+        }
+
+
+def diagnosis(
+    records: Sequence[str], held: Sequence[str], model: str | None, settings: Settings
+) -> list[str]:
+    """Return the arguments of the command that diagnoses records by their names."""
+    kept = [word for name in held for word in ("--holdout", name)]
+    start = ["--model", model] if model else []
+    outputs = ["-o", MODEL, "--json", JSON, "--report", REPORT]
+    return ["diagnose", *records, *kept, *start, *settings.options(), *outputs]
+
+
+def found(folder: Path) -> dict[str, Any] | None:
+    """Return the main figures of the diagnosis that lies in a folder, None where none does."""
+    try:
+        told = json.loads((folder / JSON).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    names = ("verdict", "causes", "errors", "gain", "budget", "remaining", "notes")
+    return {name: told.get(name) for name in names}
+
+
+def files_left(folder: Path) -> dict[str, int]:
+    """Return the files that runs have left in a folder, with their sizes in bytes."""
+    named = [folder / name for name in (REPORT, MODEL, JSON, FMU)]
+    more = [path for pattern in _MORE for path in sorted(folder.glob(pattern))]
+    return {path.name: path.stat().st_size for path in [*named, *more] if path.is_file()}
+
+
+def clear(folder: Path) -> None:
+    """Remove what an earlier run has left."""
+    for name in [*files_left(folder), EVENTS]:
+        removed(folder / name)
+
+
+def _positive(name: str, text: str) -> None:
+    try:
+        good = not text or 0.0 < float(text) < math.inf
+    except ValueError:
+        good = False
+    if not good:
+        raise InputError(f"{name.replace('_', ' ')} is '{text[:40]}'; give a positive number.")

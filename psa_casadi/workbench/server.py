@@ -1,0 +1,193 @@
+"""The local page's server: this machine only, whoever has the address, nothing from outside."""
+
+import contextlib
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, unquote, urlsplit
+
+from psa_casadi.errors import InputError, MachineError
+from psa_casadi.workbench.desk import BUSY, BusyError, Desk
+from psa_casadi.workbench.gate import HOST, Gate
+from psa_casadi.workbench.page import PAGE_POLICY, REPORT_POLICY, door, page
+
+#: The most bytes of a request that is not a file, and how long a connection may be silent [s].
+_MOST_ASKED, _SILENT_S = 2**16, 60.0
+_HTML, _JSON = "text/html; charset=utf-8", "application/json; charset=utf-8"
+_KINDS = {".html": _HTML, ".json": _JSON, ".csv": "text/csv; charset=utf-8"}
+_ALWAYS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class Server(ThreadingHTTPServer):
+    """Serves one desk at one port; a request has a thread of its own."""
+
+    daemon_threads = True
+
+    def __init__(self, port: int, desk: Desk) -> None:
+        super().__init__((HOST, port), _Handler)
+        self.desk, self.gate = desk, Gate(self.server_address[1])
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a browser that has gone."""
+
+
+@contextmanager
+def served(port: int, desk: Desk) -> Iterator[Server]:
+    """Serve a desk while the block runs, at a free port for 0; end its runs afterwards.
+
+    Raises:
+        InputError: the port is taken, or may not be used.
+    """
+    try:
+        server = Server(port, desk)
+    except OSError as error:
+        raise InputError(
+            f"--port {port}: cannot be used ({error.strerror}); choose another one, or leave it out"
+            " for one that is free."
+        ) from error
+    thread = threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+        desk.close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Server
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "psa", ""
+    timeout = _SILENT_S
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Write no log: addresses have the token."""
+
+    def do_GET(self) -> None:
+        parts = urlsplit(self.path)
+        asked = {name: values[-1] for name, values in parse_qs(parts.query).items()}
+        refused = self.server.gate.refused("GET", dict(self.headers))
+        if refused is not None:
+            self._refuse(*refused)
+        elif parts.path == "/" and self.server.gate.opens(asked.get("token", "")):
+            self._send(door(), _HTML, {"Set-Cookie": self.server.gate.cookie, **PAGE_POLICY})
+        elif not self.server.gate.knows(dict(self.headers)):
+            self._refuse(
+                HTTPStatus.FORBIDDEN,
+                "Open the address that the command `psa web --diagnose` has printed.",
+            )
+        elif parts.path == "/":
+            self._send(page(self.server.desk.effects), _HTML, PAGE_POLICY)
+        elif parts.path == "/state":
+            known = (_whole(asked, name) for name in ("version", "run", "seen"))
+            told = self.server.desk.state(*known)
+            self._send(json.dumps(told), _JSON)
+        elif parts.path == "/report":
+            self._send_file("report.html", REPORT_POLICY)
+        elif parts.path.startswith("/files/"):
+            name = unquote(parts.path.removeprefix("/files/"))
+            self._send_file(name, {"Content-Disposition": f'attachment; filename="{name}"'})
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, "There is nothing here.")
+
+    def do_POST(self) -> None:
+        gate, size = self.server.gate, self.headers.get("Content-Length", "")
+        refused = gate.refused("POST", dict(self.headers))
+        if refused is None and not gate.knows(dict(self.headers)):
+            refused = HTTPStatus.FORBIDDEN, "Only the page itself may ask for this."
+        if refused is None and (not size.isascii() or not size.isdecimal()):
+            refused = HTTPStatus.LENGTH_REQUIRED, "The request does not say how long it is."
+        if refused is not None:
+            self._refuse(*refused)
+            return
+        try:
+            self._do(urlsplit(self.path).path, int(size))
+        except BusyError:
+            self._refuse(HTTPStatus.CONFLICT, BUSY)
+        except InputError as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+        except MachineError as error:
+            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+
+    def _do(self, path: str, size: int) -> None:
+        desk = self.server.desk
+        if path == "/files":
+            if size > desk.limits.one:
+                self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The file is larger than may be.")
+                return
+            # what is not read to its end must not be taken for the next request
+            self.close_connection = True
+            desk.add(unquote(self.headers.get("X-Name", "")), self.rfile, size)
+            self.close_connection = False
+        else:
+            if size > _MOST_ASKED:
+                self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "The request is too long.")
+                return
+            given = _object(self.rfile.read(size))
+            acts: dict[str, Callable[[], None]] = {
+                "/remove": lambda: desk.remove(_whole(given, "key")),
+                "/hold": lambda: desk.hold(_whole(given, "key"), given.get("held") is True),
+                "/settings": lambda: desk.set(given),
+                "/start": desk.start,
+                "/stop": desk.stop,
+                "/export": desk.export,
+            }
+            if path not in acts:
+                self._refuse(HTTPStatus.NOT_FOUND, "There is nothing here.")
+                return
+            acts[path]()
+        self._send("{}", _JSON)
+
+    def _send(self, text: str, kind: str, more: dict[str, str] | None = None) -> None:
+        self._answer(HTTPStatus.OK, text.encode(), kind, more or {})
+
+    def _send_file(self, name: str, more: dict[str, str]) -> None:
+        path = self.server.desk.result(name)
+        content = None
+        with contextlib.suppress(OSError):
+            content = path.read_bytes() if path is not None else None
+        if content is None:
+            self._refuse(HTTPStatus.NOT_FOUND, "There is no such file.")
+        else:
+            kind = _KINDS.get(Path(name).suffix, "application/octet-stream")
+            self._answer(HTTPStatus.OK, content, kind, more)
+
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        self.close_connection = True  # a body may be on its way that nobody reads
+        self._answer(status, why.encode(), "text/plain; charset=utf-8", {"Connection": "close"})
+
+    def _answer(self, status: HTTPStatus, data: bytes, kind: str, more: dict[str, str]) -> None:
+        self.send_response(status)
+        for name, value in {**_ALWAYS, "Content-Type": kind, **more}.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+
+def _whole(given: dict[str, Any], name: str) -> int:
+    text = str(given.get(name, ""))
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 0
+
+
+def _object(data: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(data or b"{}")
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise InputError("The request is not understood.")
+    return found

@@ -1,0 +1,95 @@
+"""The local page as people use it: a record is given, columns are mapped, the verdict is read."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.browser import find_browser
+from tests.steered_browser import Steered, steered
+from tests.tiers import slow
+
+pytestmark = pytest.mark.xdist_group("browser")
+DEMO = Path(__file__).parents[1] / "psa_casadi" / "data" / "demo.csv"
+#: A name that is markup where somebody takes it for that.
+HOSTILE = "<img src=x onerror=document.title=1>.csv"
+PICTURES = os.environ.get("PSA_CASADI_PICTURES", "")
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "psa_casadi.cli", "web", "--diagnose", "--no-browser"]
+    (tmp_path / "tmp").mkdir()
+    given = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+    process = subprocess.Popen(
+        command, env=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    yield process.stdout.readline().split()[1]
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=20)[1]
+    assert process.returncode == 0, said
+    assert "Ended" in said
+    assert not list((tmp_path / "tmp").iterdir())
+
+
+def picture(tab: Steered, name: str, width: int = 1100, height: int = 1500, **how: bool) -> None:
+    if PICTURES:
+        tab.look(Path(PICTURES) / f"{name}.png", width, height, **how)
+
+
+@slow
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes with numbers of POSIX")
+def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) -> None:
+    record = tmp_path / HOSTILE
+    text = DEMO.read_text(encoding="utf-8").replace("displacement [um]", "CH2")
+    record.write_text(text, encoding="utf-8")
+    browser = find_browser(tmp_path)
+    with steered(browser) as tab:
+        tab.call("Page.navigate", url=address)
+        tab.until("location.search === '' && document.querySelector('#start')")
+        tab.choose("#pick", record)
+        tab.until("document.querySelector('.problems')")
+        assert tab.run("document.querySelector('#files .name').textContent") == HOSTILE
+        assert tab.run("document.querySelector('#start').disabled")
+        tab.run("s = document.querySelector('#layout0c2'); s.value = 'displacement'; s.onchange()")
+        tab.until("!document.querySelector('#start').disabled")
+        line = "time=time:s,voltage=voltage:V,displacement=CH2:um"
+        assert tab.run("document.querySelector('#set-columns').value") == line
+        picture(tab, "files")
+        tab.run("document.querySelector('#stop').disabled = false")
+        tab.run("document.querySelector('#start').focus()")
+        tab.press("Enter", 13, "\r")
+        tab.until("document.querySelectorAll('#tree li').length > 2", 120)
+        picture(tab, "search")
+        tab.call("Page.navigate", url=address)  # a tab that is opened anew sees the same run
+        tab.until("document.querySelectorAll('#tree li').length > 2")
+        tab.until("!document.querySelector('#result').hidden", 240)
+        tab.until("document.querySelector('#verdict').textContent.startsWith('Verdict: cause')")
+        assert "slow creep" in tab.run("document.querySelector('#verdict').textContent")
+        assert "the answer" in tab.run("document.querySelector('.best').textContent")
+        assert line in tab.run("document.querySelector('#command').textContent")
+        names = "[...document.querySelectorAll('#downloads a[download]')].map(a => a.textContent)"
+        assert {"report.html", "extended.json", "diagnosis.json"} <= set(tab.run(names))
+        assert tab.run("document.title") == "Diagnose records"
+        assert not tab.run("document.querySelector('img')")
+        picture(tab, "result", height=3000)
+        picture(tab, "phone", 390, 2600)
+        picture(tab, "night", height=2200, dark=True)
+        tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844,
+                 deviceScaleFactor=1, mobile=True)  # fmt: skip
+        assert tab.run("document.documentElement.scrollWidth") <= 390
+        asked = [
+            e["params"]["request"]["url"]
+            for e in tab.heard
+            if e.get("method") == "Network.requestWillBeSent"
+        ]
+        own = address.split("?")[0]
+        assert asked
+        assert [u for u in asked if not u.startswith((own, "data:", "blob:"))] == []
+        words = [e["params"] for e in tab.heard if e.get("method") == "Log.entryAdded"]
+        assert [w for w in words if w["entry"]["level"] == "error"] == []
