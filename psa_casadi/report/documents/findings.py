@@ -32,6 +32,8 @@ from psa_casadi.strict_json import parse_json, read_json_text
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 _DIAGNOSIS = "psa_casadi.diagnosis/1"
+#: Names of files that say what is in them, not of which device.
+_PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,7 @@ def _hashes(finding: Finding) -> frozenset[str]:
 
 def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
     """Name findings by their device, else by the shortest end of their path that is their own."""
-    names = [r.finding.device or r.path.stem for r in found]
+    names = [r.finding.device or _name(r.path) for r in found]
     depth = 1
     while len(set(names)) < len(names) and depth < max(len(r.path.parts) for r in found):
         depth += 1
@@ -225,6 +227,12 @@ def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
         own = name if counted[name] == 1 else f"{name} ({counted[name]})"
         out.append(replace(r.finding, device=own))
     return tuple(out)
+
+
+def _name(path: Path) -> str:
+    """Return a file's name; that of its folder where the file's says only what it is."""
+    folder = path.resolve().parent.name
+    return folder if path.stem in _PLAIN_NAMES and folder else path.stem
 
 
 def finding_content(found: Finding) -> dict[str, Any]:

@@ -123,7 +123,7 @@ def error_plots(findings: Sequence[Finding]) -> tuple[Plot, Plot, Plot]:
     for plot, (x_title, y_title) in zip(plots, titles, strict=True):
         styled(plot, _HEIGHT)
         plot.update_xaxes(title_text=x_title)
-        plot.update_yaxes(title_text=y_title)
+        plot.update_yaxes(title_text=y_title, automargin=True)
     return plots[0], plots[1], plots[2]
 
 
@@ -194,7 +194,9 @@ def _over_devices(
             plot.add_hline(float(value), line={"color": INK, "width": 1.0, "dash": dash})
     styled(plot, _HEIGHT)
     plot.update_xaxes(title_text=title, showgrid=False, gridcolor=GRID)
-    return plot.update_yaxes(title_text=f"{e.name} [{unit}]" if unit != "1" else e.name)
+    return plot.update_yaxes(
+        title_text=f"{e.name} [{unit}]" if unit != "1" else e.name, automargin=True
+    )
 
 
 def _shown(
