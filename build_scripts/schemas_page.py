@@ -17,6 +17,7 @@ WRITTEN_BY = {
     "diagnosis": "`psa diagnose --json`",
     "identification": "`psa identify --json`",
     "check": "`psa check --json`",
+    "device": "`psa batch`, in the folder of each device",
 }
 _COUNTED = ("string", "number", "integer")
 Schema = Mapping[str, Any]

@@ -6,7 +6,9 @@ from typing import Annotated
 
 import typer
 
+from psa_casadi.cli.batch import batch
 from psa_casadi.cli.check import check
+from psa_casadi.cli.compare import compare
 from psa_casadi.cli.datasets import datasets
 from psa_casadi.cli.demo import demo
 from psa_casadi.cli.design_experiment import experiment
@@ -71,6 +73,8 @@ app.command(epilog="Example: psa simulate --model model.json --input planned.csv
 app.command(
     epilog="Example: psa diagnose a.csv --holdout b.csv -o extended.json --report report.html"
 )(guarded(diagnose))
+app.command(epilog="Example: psa batch records -o results --report population.html")(guarded(batch))
+app.command(epilog="Example: psa compare before.json after.json -o compare.html")(guarded(compare))
 app.command(epilog="Example: psa effects slow_creep")(guarded(effects))
 app.command(epilog="Example: psa stacks P-885.51")(guarded(stacks))
 app.add_typer(export, name="export")

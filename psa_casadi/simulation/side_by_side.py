@@ -5,15 +5,17 @@ lose little to each other.
 """
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextvars import copy_context
+from contextlib import contextmanager
+from contextvars import ContextVar, copy_context
 from typing import TypeVar
 
 from psa_casadi.interruption import interruptible_work
 
 #: Environment variable with the number of threads; without it there is one for each core.
 VARIABLE = "PSA_CASADI_THREADS"
+_ALONE: ContextVar[bool] = ContextVar("one thread", default=False)
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -36,7 +38,19 @@ def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[
             raise
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Give what runs inside one thread, as where other work fills the cores."""
+    token = _ALONE.set(True)
+    try:
+        yield
+    finally:
+        _ALONE.reset(token)
+
+
 def threads() -> int:
     """Return how many threads work may have: `PSA_CASADI_THREADS`, else one for each core."""
+    if _ALONE.get():
+        return 1
     wanted = os.environ.get(VARIABLE, "")
     return int(wanted) if wanted.isdecimal() and int(wanted) > 0 else os.cpu_count() or 1

@@ -28,6 +28,9 @@ def bench(
         Path | None,
         typer.Option(help="Folder of records of your own, in place of the public ones."),
     ] = None,
+    size: Annotated[
+        int | None, typer.Option(min=8, help="Number of cases, where a benchmark can vary it.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """List the benchmarks, or run one and print its tables."""
@@ -41,11 +44,19 @@ def bench(
     elif folder is not None and BENCHES[name].run_on is None:
         able = ", ".join(b.name for b in BENCHES.values() if b.run_on is not None)
         given.add(f"--folder: the benchmark '{name}' takes no records of your own; {able} does.")
+    elif size is not None and BENCHES[name].run_sized is None:
+        able = ", ".join(b.name for b in BENCHES.values() if b.run_sized is not None)
+        given.add(f"--size: the benchmark '{name}' has a fixed size; {able} has not.")
     given.outputs({"--figure": figure, "--json": json_file}, [])
     given.check()
     with working(f"benchmark {name}", quiet) as progress:
-        own = BENCHES[name].run_on
-        outcome = own(progress, folder) if own and folder else BENCHES[name].run(progress, quick)
+        own, sized = BENCHES[name].run_on, BENCHES[name].run_sized
+        if own and folder:
+            outcome = own(progress, folder)
+        elif sized and size:
+            outcome = sized(progress, size)
+        else:
+            outcome = BENCHES[name].run(progress, quick)
     for titled in outcome.tables:
         show(f"\n{titled.title}\n", quiet)
         show_table(titled.table, quiet)

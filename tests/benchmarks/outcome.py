@@ -39,13 +39,15 @@ class Bench:
     """A benchmark by name: what it shows, how long it takes, and the function that runs it.
 
     `run(progress, quick)` measures everything again; `quick` does the same on fewer or smaller
-    cases. `run_on(progress, folder)`, where there is one, measures the records of a folder instead.
+    cases. `run_on(progress, folder)`, where there is one, measures the records of a folder instead,
+    `run_sized(progress, count)` so many cases.
     """
 
     name: str
     description: str
     run: Callable[[Progress, bool], Outcome]
     run_on: Callable[[Progress, Path], Outcome] | None = None
+    run_sized: Callable[[Progress, int], Outcome] | None = None
 
 
 def share(count: int, of: int) -> str:

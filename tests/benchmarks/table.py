@@ -6,7 +6,9 @@ from pathlib import Path
 from tests.benchmarks.outcome import Bench, Outcome, Progress
 
 
-def _later(module: str, name: str, description: str, *, on_folder: bool = False) -> Bench:
+def _later(
+    module: str, name: str, description: str, *, on_folder: bool = False, sized: bool = False
+) -> Bench:
     def run(progress: Progress, quick: bool) -> Outcome:
         found: Outcome = import_module(f"tests.benchmarks.{module}").run(progress, quick)
         return found
@@ -15,7 +17,13 @@ def _later(module: str, name: str, description: str, *, on_folder: bool = False)
         found: Outcome = import_module(f"tests.benchmarks.{module}").run_on(progress, folder)
         return found
 
-    return Bench(name, description, run, run_on if on_folder else None)
+    def run_sized(progress: Progress, count: int) -> Outcome:
+        found: Outcome = import_module(f"tests.benchmarks.{module}").run_sized(progress, count)
+        return found
+
+    return Bench(
+        name, description, run, run_on if on_folder else None, run_sized if sized else None
+    )
 
 
 BENCHES: dict[str, Bench] = {
@@ -30,6 +38,12 @@ BENCHES: dict[str, Bench] = {
             "fits",
             "fits",
             "exact steps against the stepper: error against time, lanes, effects, whole diagnoses",
+        ),
+        _later(
+            "batch",
+            "batch",
+            "many devices with hidden defects: what the population tells, cost, resumed runs (--size)",
+            sized=True,
         ),
         _later(
             "web",

@@ -1,6 +1,7 @@
 """The schemas that the package ships (`psa_casadi/data/schemas`), made of the files' records."""
 
 from psa_casadi.report.documents.check_file import CheckFile
+from psa_casadi.report.documents.device_file import DeviceFile
 from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
 from psa_casadi.report.documents.identification_file import IdentificationFile
 from psa_casadi.report.documents.model_file import ModelFile
@@ -13,6 +14,7 @@ FILES: dict[str, type] = {
     "diagnosis": DiagnosisFile,
     "identification": IdentificationFile,
     "check": CheckFile,
+    "device": DeviceFile,
 }
 
 

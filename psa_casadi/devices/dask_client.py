@@ -1,0 +1,51 @@
+"""A client of Dask as an executor, loaded where it is asked for."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+from psa_casadi.errors import InputError, MachineError
+
+#: The address that starts a cluster on this machine.
+LOCAL = "local"
+#: Time [s] that a scheduler may take to answer.
+_PATIENCE = 20
+
+
+@contextmanager
+def dask_client(address: str, workers: int | None = None) -> Iterator[Any]:
+    """Yield a client of the scheduler at `address` (tcp://HOST:8786), or of a cluster made here.
+
+    `local` starts a cluster of `workers` processes on this machine, with one thread each.
+
+    Raises:
+        InputError: Dask is not installed.
+        MachineError: the scheduler does not answer.
+    """
+    try:
+        distributed = import_module("distributed")
+    except ImportError as error:
+        raise InputError(
+            "--dask needs Dask, which is not installed; run `pip install 'psa-casadi[dask]'`, or"
+            " leave --dask out: one machine needs no cluster."
+        ) from error
+    try:
+        if address == LOCAL:
+            where: Any = distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
+            )
+        else:
+            where = address
+        client = distributed.Client(where, timeout=_PATIENCE, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise MachineError(
+            f"The scheduler at {address} cannot be reached ({type(error).__name__}: {error}); see"
+            " that `dask scheduler` runs there, and give its address, such as tcp://HOST:8786."
+        ) from error
+    with client:
+        try:
+            yield client
+        finally:
+            if address == LOCAL:
+                where.close()

@@ -1,0 +1,134 @@
+"""The work on one device, in whatever process or thread it runs: on one thread, its error told."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from psa_casadi.component import Component
+from psa_casadi.devices.task import DeviceOutcome, DeviceTask
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.identify import identify
+from psa_casadi.interruption import Work, interruptible_work
+from psa_casadi.model.compose import Model
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.model.own_effects import known_effects, own_effects
+from psa_casadi.records import Record, read_records
+from psa_casadi.report.documents.device_file import Status
+from psa_casadi.report.documents.identification_file import identification_file
+from psa_casadi.simulation.side_by_side import one_thread
+from psa_casadi.strict_json import json_text
+
+IDENTIFICATION, DIAGNOSIS, MODEL = "identification.json", "diagnosis.json", "model.json"
+#: Works of this process by the run that they belong to, and runs that were stopped.
+_RUNNING: dict[str, set[Work]] = {}
+_STOPPED: set[str] = set()
+_LOCK = threading.Lock()
+
+
+def work_on(task: DeviceTask) -> DeviceOutcome:
+    """Identify or diagnose a device; what goes wrong is its result.
+
+    Raises KeyboardInterrupt where the run was stopped.
+    """
+    began = time.monotonic()
+    with _part_of(task.run), one_thread():
+        try:
+            return _worked(task, began)
+        except InputError as error:
+            return _ended(task, "refused", error.problems, began)
+        except PsaError as error:
+            return _ended(task, "refused", (str(error),), began)
+        except Exception as error:  # noqa: BLE001 - no device may stop the others
+            return _ended(task, "failed", (f"{type(error).__name__}: {error}",), began)
+
+
+def stop(run: str) -> None:
+    """End the works of a run in this process."""
+    with _LOCK:
+        _STOPPED.add(run)
+        for work in _RUNNING.get(run, ()):
+            work.stop()
+
+
+def _ended(
+    task: DeviceTask, status: Status, problems: tuple[str, ...], began: float
+) -> DeviceOutcome:
+    return DeviceOutcome(task.job.device, status, time.monotonic() - began, problems=problems)
+
+
+@contextmanager
+def _part_of(run: str) -> Iterator[None]:
+    with interruptible_work() as work:
+        with _LOCK:
+            if run in _STOPPED:
+                raise KeyboardInterrupt
+            _RUNNING.setdefault(run, set()).add(work)
+        try:
+            yield
+        finally:
+            with _LOCK:
+                _RUNNING[run].discard(work)
+
+
+def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
+
+    o = task.options
+    effects = [c for module in o.modules for c in own_effects(module).values()]
+    start = None if o.model is None else loads(o.model, effects=effects)
+    records = read_records(
+        task.job.files, need_excitation=True, columns=o.columns, sample_time=o.sample_time
+    )
+    _refuse_twins(records)
+    does: Callable[..., tuple[str, str, Model]] = _identified
+    if o.work == "diagnose":
+        does = _diagnosed
+    name, text, model = does(task, records, start, effects)
+    return DeviceOutcome(
+        task.job.device,
+        "done",
+        time.monotonic() - began,
+        files=((name, text), (MODEL, dumps(model))),
+        records=tuple((r.name, r.sha256) for r in records),
+    )
+
+
+def _refuse_twins(records: tuple[Record, ...]) -> None:
+    seen: dict[str, str] = {}
+    for r in records:
+        if r.sha256 in seen:
+            raise InputError(
+                f"{r.source}: holds the same data as {seen[r.sha256]}; a record counts once: remove"
+                " one of the two."
+            )
+        seen[r.sha256] = r.source
+
+
+def _identified(
+    task: DeviceTask,
+    records: tuple[Record, ...],
+    start: Model | None,
+    effects: list[Component],
+) -> tuple[str, str, Model]:
+
+    o = task.options
+    found = identify(records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis)
+    if found.interrupted:
+        raise KeyboardInterrupt
+    return IDENTIFICATION, json_text(identification_file(found)), found.model
+
+
+def _diagnosed(
+    task: DeviceTask,
+    records: tuple[Record, ...],
+    start: Model | None,
+    effects: list[Component],
+) -> tuple[str, str, Model]:
+
+    o = task.options
+    table = tuple(known_effects(effects).values())
+    found = diagnose(
+        records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis, effects=table
+    )
+    return DIAGNOSIS, found.to_json(), found.model

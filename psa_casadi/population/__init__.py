@@ -1,0 +1,1 @@
+"""Many devices: what is common to them, what differs beyond noise, and which do not belong."""

@@ -1,0 +1,91 @@
+"""What is known of one device: its parameters with intervals, verdict, causes and errors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import date
+from typing import Literal
+
+#: Half the width of a 95 % interval over the standard error.
+NORMAL_95 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Found:
+    """A parameter of one device in its SI unit: value, 95 % interval, and whether it is told.
+
+    `told` is False where the records do not determine the parameter or it sits on a bound.
+    """
+
+    value: float
+    unit: str
+    interval: tuple[float, float] | None
+    told: bool = True
+    meaning: str = ""
+
+
+@dataclass(frozen=True)
+class NamedCause:
+    """A cause with its confidence, the share of the error that it explains, and its rivals."""
+
+    effect: str
+    confidence: float
+    share: float
+    or_else: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class BudgetShare:
+    """A share of the base model's held-out error above the noise, with its 95 % interval."""
+
+    what: str
+    share: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Held-out rms [m] of base and extended model, of the noise, and the base's in % of range."""
+
+    base: float
+    extended: float
+    noise: float
+    base_percent: float
+    extended_percent: float
+
+
+@dataclass(frozen=True)
+class Trace:
+    """The first part of a record beside its model: (n,) in SI units, nan where not measured."""
+
+    record: str
+    time: tuple[float, ...]
+    voltage: tuple[float, ...]
+    measured: tuple[float, ...]
+    model: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found of one device.
+
+    `kind` is what found it. `rms_m` and `rms_percent` are the fit's error over its samples, [m] and
+    in % of the range, where an identification told them. `records` are the names and SHA-256 of the
+    files. What a file does not hold is empty or None.
+    """
+
+    device: str
+    kind: Literal["identification", "diagnosis", "model"]
+    parameters: Mapping[str, Found] = field(default_factory=dict)
+    records: tuple[tuple[str, str], ...] = ()
+    batch: str = ""
+    day: date | None = None
+    verdict: str = ""
+    doubt: str = ""
+    causes: tuple[NamedCause, ...] = ()
+    errors: HeldOutErrors | None = None
+    budget: tuple[BudgetShare, ...] = ()
+    rms_m: float | None = None
+    rms_percent: float | None = None
+    force_scale: str = ""
+    trace: Trace | None = None
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,255 @@
+"""Files of diagnoses, identifications and models read as findings, those of one device joined."""
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from psa_casadi.component import Component
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.model.compose import Model
+from psa_casadi.model.model_file import loads
+from psa_casadi.model.model_file_checks import FORMAT as MODEL
+from psa_casadi.population.finding import (
+    BudgetShare,
+    Finding,
+    Found,
+    HeldOutErrors,
+    NamedCause,
+)
+from psa_casadi.population.replay import replayed
+from psa_casadi.report.documents.device_file import FORMAT as DEVICE
+from psa_casadi.report.documents.device_file import DeviceFile
+from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
+from psa_casadi.report.documents.identification_file import FORMAT as IDENTIFICATION
+from psa_casadi.report.documents.identification_file import IdentificationFile
+from psa_casadi.report.documents.read_document import read_document
+from psa_casadi.strict_json import parse_json, read_json_text
+
+#: The file in a device's folder that says how its work ended.
+DEVICE_FILE = "device.json"
+_ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
+_DIAGNOSIS = "psa_casadi.diagnosis/1"
+#: Names of files that say what is in them, not of which device.
+_PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A finding from one file, and the file."""
+
+    path: Path
+    finding: Finding
+
+
+def read_findings(
+    paths: Iterable[str | os.PathLike[str]],
+    effects: Sequence[Component] = (),
+    *,
+    traces: bool = True,
+) -> tuple[Finding, ...]:
+    """Return the findings in files, in their order.
+
+    A path is a DIAGNOSIS.json, what `psa identify --json` wrote, a MODEL.json, or a device's folder
+    of `psa batch`. A model of the same records as a diagnosis or identification is part of it.
+    `traces` says whether models play the records that their files carry. `effects` are own ones.
+
+    Raises:
+        InputError: what cannot be read, all of it.
+    """
+    found: list[_Read] = []
+    problems: list[str] = []
+    for path in map(Path, paths):
+        try:
+            found += _read(path, effects, traces)
+        except InputError as error:
+            problems.extend(error.problems)
+    if problems:
+        raise InputError(problems)
+    return _named(_joined(found))
+
+
+def device_finding(
+    folder: Path, told: DeviceFile, effects: Sequence[Component] = (), *, traces: bool = False
+) -> Finding:
+    """Return the finding in a device's folder of `psa batch`."""
+    (found,) = _joined([r for name in told.files for r in _read(folder / name, effects, traces)])
+    day = date.fromisoformat(told.date) if told.date else None
+    return replace(found.finding, device=told.device, batch=told.batch, day=day)
+
+
+def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]:
+    path = path / DEVICE_FILE if path.is_dir() else path
+    source = str(path)
+    try:
+        content = parse_json(text := read_json_text(path), source, _ADVICE)
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: cannot be read ({error}); {_ADVICE}") from error
+    kind = content.get("format") if isinstance(content, dict) else None
+    if kind == DEVICE:
+        return _of_device(path, read_document(DeviceFile, content, source), effects, traces)
+    if kind == _DIAGNOSIS:
+        return [_Read(path, _diagnosis(read_document(DiagnosisFile, content, source)))]
+    if kind == IDENTIFICATION:
+        return [_Read(path, _identification(read_document(IdentificationFile, content, source)))]
+    if kind == MODEL:
+        return [_Read(path, _model(loads(text, source, effects), traces))]
+    raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
+
+
+def _of_device(
+    path: Path, told: DeviceFile, effects: Sequence[Component], traces: bool
+) -> list[_Read]:
+    if told.status != "done":
+        why = " ".join(told.problems)
+        raise InputError(f"{path}: the work on this device was {told.status}: {why}")
+    return [_Read(path, device_finding(path.parent, told, effects, traces=traces))]
+
+
+def _diagnosis(d: DiagnosisFile) -> Finding:
+    b = d.budget
+    shares = [] if b is None else [*b.causes, *([b.unnamed] if b.unnamed else [])]
+    return Finding(
+        device="",
+        kind="diagnosis",
+        parameters={
+            n: Found(p.value, p.unit, p.interval) for c in d.causes for n, p in c.parameters.items()
+        },
+        records=tuple((r.name, r.sha256) for r in d.records),
+        verdict=d.verdict,
+        doubt=d.doubt,
+        causes=tuple(
+            NamedCause(c.effect, c.confidence, c.explained_share, c.cannot_be_told_from)
+            for c in d.causes
+        ),
+        errors=HeldOutErrors(
+            d.errors.base.holdout_rms_m,
+            d.errors.extended.holdout_rms_m,
+            d.errors.noise_floor_rms_m,
+            d.errors.base.holdout_nrmse_percent,
+            d.errors.extended.holdout_nrmse_percent,
+        ),
+        budget=tuple(BudgetShare(s.what, s.share, s.interval) for s in shares),
+        notes=d.notes,
+    )
+
+
+def _identification(i: IdentificationFile) -> Finding:
+    return Finding(
+        device="",
+        kind="identification",
+        parameters={
+            n: Found(p.value, p.unit, p.interval, p.determined in ("determined", "weak"), p.meaning)
+            for n, p in i.parameters.items()
+        },
+        records=tuple((r.name, r.sha256) for r in i.records),
+        rms_m=i.rms_m,
+        rms_percent=max((r.rms_percent_of_range for r in i.records), default=None),
+        notes=(*i.warnings, *i.notes),
+    )
+
+
+def _model(model: Model, traces: bool) -> Finding:
+    origin = model.provenance
+    trace = None
+    if traces:
+        try:
+            trace = replayed(model)
+        except PsaError:  # a page without this curve says more than no page
+            trace = None
+    return Finding(
+        device="",
+        kind="model",
+        parameters={
+            p.name: Found(
+                model.values[p.name],
+                p.unit,
+                (i.low, i.high) if (i := origin.intervals.get(p.name)) else None,
+                p.name in origin.free,
+                p.description,
+            )
+            for p in model.structure.parameters
+        },
+        records=origin.identified_from,
+        force_scale=origin.force_scale,
+        trace=trace,
+    )
+
+
+def _joined(found: Sequence[_Read]) -> list[_Read]:
+    """Join every model to the first finding of the same records that has none yet."""
+    rows: list[_Read | None] = list(found)
+    full: set[int] = set()
+    for k, own in enumerate(found):
+        if own.finding.kind != "model" or not own.finding.records:
+            continue
+        for j, other in enumerate(found):
+            same = _hashes(other.finding) == _hashes(own.finding)
+            if other.finding.kind != "model" and same and j not in full:
+                full.add(j)
+                rows[j] = replace(other, finding=_with(other.finding, own.finding))
+                rows[k] = None
+                break
+    return [r for r in rows if r is not None]
+
+
+def _with(finding: Finding, model: Finding) -> Finding:
+    """Add to a finding what its model holds: all parameters, and the record that it carries."""
+    parameters = {**model.parameters}
+    for name, p in finding.parameters.items():
+        meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
+        parameters[name] = replace(p, meaning=meaning)
+    return replace(finding, parameters=parameters, trace=model.trace, force_scale=model.force_scale)
+
+
+def _hashes(finding: Finding) -> frozenset[str]:
+    return frozenset(sha for _, sha in finding.records)
+
+
+def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
+    """Name findings by their device, else by the shortest end of their path that is their own."""
+    names = [r.finding.device or _name(r.path) for r in found]
+    depth = 1
+    while len(set(names)) < len(names) and depth < max(len(r.path.parts) for r in found):
+        depth += 1
+        names = [
+            name if names.count(name) == 1 else "/".join(r.path.with_suffix("").parts[-depth:])
+            for name, r in zip(names, found, strict=True)
+        ]
+    counted: dict[str, int] = {}
+    out: list[Finding] = []
+    for name, r in zip(names, found, strict=True):
+        counted[name] = counted.get(name, 0) + 1
+        own = name if counted[name] == 1 else f"{name} ({counted[name]})"
+        out.append(replace(r.finding, device=own))
+    return tuple(out)
+
+
+def _name(path: Path) -> str:
+    """Return a file's name; that of its folder where the file's says only what it is."""
+    folder = path.resolve().parent.name
+    return folder if path.stem in _PLAIN_NAMES and folder else path.stem
+
+
+def finding_content(found: Finding) -> dict[str, Any]:
+    """Return a finding's main figures as one row of a table of devices."""
+    row: dict[str, Any] = {"verdict": found.verdict, "cause": _causes(found)}
+    row["confidence"] = found.causes[0].confidence if found.causes else None
+    e = found.errors
+    row["base_rms [m]"] = e.base if e else None
+    row["extended_rms [m]"] = e.extended if e else None
+    row["noise_rms [m]"] = e.noise if e else None
+    row["rms [m]"], row["rms [% of range]"] = found.rms_m, found.rms_percent
+    for name, p in found.parameters.items():
+        if p.told and p.interval is not None:
+            row[f"{name} [{p.unit}]"] = p.value
+            row[f"{name} low"], row[f"{name} high"] = p.interval
+    return row
+
+
+def _causes(found: Finding) -> str:
+    return "; ".join(" or ".join((c.effect, *c.or_else)) for c in found.causes)
