@@ -65,6 +65,7 @@ if TYPE_CHECKING:
         record_from,
         write_record,
     )
+    from psa_casadi.records.signals import Signals
     from psa_casadi.report.page.diagnosis import write_report
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.report.plots.figure import save_figure
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
 
 #: Where each public name lives.
 _HOMES = {
+    "psa_casadi.records.signals": ("Signals",),
     "psa_casadi.records": (
         "Record",
         "read_record",
@@ -187,6 +189,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Record",
+    "Signals",
     "read_record",
     "read_records",
     "record_from",
@@ -266,6 +269,7 @@ __all__ = [
 #: `online` and `system`, and the types of results, answer to their names here as well.
 _FIRST = (
     "Record",
+    "Signals",
     "read_record",
     "read_records",
     "record_from",
