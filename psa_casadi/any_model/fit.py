@@ -179,9 +179,7 @@ class _Problem:
     @cached_property
     def tasks(self) -> list[tuple[int, int]]:
         """Which output of which run, in the order of the stacked residuals."""
-        return [
-            (j, k) for j in self.places for k, r in enumerate(self.runs) if r.fitted(j).any()
-        ]
+        return [(j, k) for j in self.places for k, r in enumerate(self.runs) if r.fitted(j).any()]
 
     def parts(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Return residuals (predicted - measured) and Jacobian of every task. Raises PsaError."""

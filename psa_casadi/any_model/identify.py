@@ -255,7 +255,9 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
             " not be the best there is."
         )
     said += [f"'{n}' is not determined by these records." for n in sure.undetermined]
-    said += [f"'{n}' sits on a bound of its range; its interval means nothing." for n in sure.on_bound]
+    said += [
+        f"'{n}' sits on a bound of its range; its interval means nothing." for n in sure.on_bound
+    ]
     said += [
         f"'{n}' is missed by {rms[n] / noise[n]:.2g} times its noise: the model lacks something;"
         " psa.diagnose looks for the cause."

@@ -28,6 +28,7 @@ from psa_casadi.diagnosis.screening.screen import Score
 from psa_casadi.diagnosis.screening.sets import Together, best_sets
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
+from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError
 
 Names = frozenset[str]
@@ -38,6 +39,8 @@ _QUICK, _FINALISTS, _PAIRS, _END = 12, 3, 3, 60
 #: Children whose evidence is this far below the best one's are not fitted to their end [nats].
 _BEHIND = 30.0
 _VISITS = 8
+#: Ordinary sizes at which a memory that acts in full is looked for.
+_FULL = 2.0
 
 
 @dataclass(eq=False)
@@ -197,12 +200,18 @@ def _finish_leaders(known: Known, h: OdeHypothesis) -> None:
 
 
 def with_cause(known: Known, h: OdeHypothesis, scores: Sequence[Score]) -> OdeHypothesis | None:
-    """Fit quickly with one more cause from its best directions; None if every fit fails."""
+    """Fit quickly with one more cause from its best directions; None if every fit fails.
+
+    The linear estimate of a memory's gain tells little of one that acts in full: such an effect
+    starts from an ordinary size of either sign at every trial value, too.
+    """
     effect = scores[0].direction.effect
     known.progress(f"fitting {effect.name} beside {_named(h)}")
-    fits = [
-        _quick(known, h, [(effect, s.direction.values, s.start)], h.fit) for s in scores
-    ]
+    starts = [(s.direction.values, s.start) for s in scores]
+    if any(q.memory for q in effect.states):
+        trials = [d for d in known.views[NONE].trials if d.effect is effect]
+        starts += [(d.values, side * _FULL * d.unit_gain) for d in trials for side in (1, -1)]
+    fits = side_by_side(lambda s: _quick(known, h, [(effect, *s)], h.fit), starts)
     good = [f for f in fits if f is not None]
     best = min(good, key=lambda f: f.cost, default=None)
     return hypothesis_of((*h.causes, effect), best, known.runs)

@@ -37,9 +37,7 @@ def sizes_of(
 ) -> Sizes:
     """Return the sizes of a model's signals in experiments. Raises PsaError."""
     given = starts or [{} for _ in runs]
-    tables = [
-        states_of(model, r, s, _LOOK_RTOL) for r, s in zip(runs, given, strict=True)
-    ]
+    tables = [states_of(model, r, s, _LOOK_RTOL) for r, s in zip(runs, given, strict=True)]
     f, p = _rates(model.structure), model.parameter_vector()
     rates, outputs = [], []
     for run, x in zip(runs, tables, strict=True):

@@ -54,7 +54,9 @@ class Signals:
     def _check(self) -> None:
         problems, where = Problems(), f"signals '{self.name}'"
         if self.time.ndim != 1 or self.time.size < 8 or not np.isfinite(self.time).all():
-            problems.add(f"{where}: the time has shape {self.time.shape}; give eight or more times.")
+            problems.add(
+                f"{where}: the time has shape {self.time.shape}; give eight or more times."
+            )
         elif not np.all(np.diff(self.time) > 0):
             problems.add(f"{where}: the time does not strictly increase; sort it.")
         if self.hold not in ("linear", "zero"):

@@ -131,10 +131,9 @@ def _balances(port: Port) -> list[Balance]:
 
 def _opened(component: Component, ports: list[Port]) -> Callable[[Symbols], Equations]:
     """Return the component's equations with the ports' sums in the places of what they stand for."""
+
     def equations(s: Symbols) -> Equations:
-        replaced = {
-            p.variable: getattr(s, p.balance) for p in ports if p.kind == "input"
-        }
+        replaced = {p.variable: getattr(s, p.balance) for p in ports if p.kind == "input"}
         plain = component.equations(_Replaced(s, replaced))
         add: dict[str, Expression] = dict(plain.add)
         der, out = dict(plain.der), dict(plain.out)
