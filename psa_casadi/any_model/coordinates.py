@@ -32,7 +32,8 @@ def coordinates_of(
     """Set up the coordinates around a model's values.
 
     Parameters on the scale that they declare; per experiment the initial states as deviations from
-    the declared starts (unless these are known), over their usual size, and the zeros of sensors over the output's range.
+    the declared starts (unless these are known) over their usual size, and the zeros of sensors
+    over the output's range.
     Weak priors: `LOG_PRIOR` and `LINEAR_PRIOR` for parameters, `LINEAR_PRIOR` usual sizes for
     states and zeros, `MEMORY_PRIOR` for memories of effects. The coordinate that a stack's fit has
     for its sensor's offset stays at 0.

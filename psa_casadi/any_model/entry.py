@@ -45,9 +45,10 @@ def identify(
 ) -> OdeIdentification: ...
 @wraps(stack.identify)
 def identify(*given: Any, **words: Any) -> Any:
+    """Identify a stack from its records, or a model of one's own, given first, from its."""
     model, records = _models_first(given, words)
     if model is None or _is_stack(model):
-        return stack.identify(records, **words, **({} if model is None else {"model": model}))
+        return stack.identify(records, model=model, **words)
     return _own(identify_ode, model, records, words)
 
 
@@ -78,9 +79,10 @@ def diagnose(
 ) -> OdeDiagnosis: ...
 @wraps(stacks.diagnose)
 def diagnose(*given: Any, **words: Any) -> Any:
+    """Diagnose a stack's records, or a model of one's own, given first, on its records."""
     model, records = _models_first(given, words)
     if model is None or _is_stack(model):
-        return stacks.diagnose(records, **words, **({} if model is None else {"model": model}))
+        return stacks.diagnose(records, model=model, **words)
     return _own(diagnose_ode, model, records, words)
 
 

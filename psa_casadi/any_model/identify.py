@@ -18,7 +18,7 @@ from psa_casadi.any_model.fit import (
 )
 from psa_casadi.any_model.runs import Run, runs_of
 from psa_casadi.any_model.sizes import sized
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import first_order_noise
 from psa_casadi.records.signals import signals_given
@@ -205,10 +205,11 @@ def seen_starts(model: Model, runs: Sequence[Run]) -> list[dict[str, float]]:
 def _starts(model: Model, free: Sequence[str], count: int) -> list[dict[str, float]]:
     """Return the declared values and random ones about them, within the bounds."""
     rng = np.random.default_rng(_SEED)
-    found = [{n: model.values[n] for n in free}]
-    for _ in range(count - 1):
-        found.append({n: _drawn(model.parameter(n), model.values, rng) for n in free})
-    return found
+    declared = {n: model.values[n] for n in free}
+    drawn = (
+        {n: _drawn(model.parameter(n), model.values, rng) for n in free} for _ in range(count - 1)
+    )
+    return [declared, *drawn]
 
 
 def _drawn(p: Parameter, values: Mapping[str, float], rng: np.random.Generator) -> float:
@@ -275,11 +276,3 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         agreed=agreed,
         warnings=tuple(said),
     )
-
-
-def runs_and_fit(fit: OdeFit, runs: Sequence[Run]) -> OdeFit:
-    """Return a fit gone on with, or the same where that fails."""
-    try:
-        return refitted(fit, runs)
-    except PsaError:
-        return fit

@@ -1,4 +1,4 @@
-"""From what a search found in any model to a verdict: the rules are those of a stack's diagnosis."""
+"""From what a search found in any model to a verdict, by the rules of a stack's diagnosis."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,8 +21,8 @@ _FEW = (
     "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
 )
 _BEATEN = (
-    "{} would remove {:.0%} of the held-out error above the noise; not named, because a free function"
-    " of {} in {} explains more ({:.0%})."
+    "{} would remove {:.0%} of the held-out error above the noise; not named, because a free"
+    " function of {} in {} explains more ({:.0%})."
 )
 _LITTLE = (
     "{} would remove {:.0%} of the held-out error above the noise; not named, because that is less"
@@ -30,8 +30,8 @@ _LITTLE = (
 )
 _UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
 _SMALL = (
-    "{} is in the extended model and removes {:.0%} of the held-out error above the noise. It is not"
-    " named: structure remains, and so little may only correct the form of what is named."
+    "{} is in the extended model and removes {:.0%} of the held-out error above the noise. It is"
+    " not named: structure remains, and so little may only correct the form of what is named."
 )
 
 
@@ -222,7 +222,7 @@ def _candidates(
     told: Mapping[str, Mapping[str, float]],
     named: OdeHypothesis,
 ) -> tuple[Candidate, ...]:
-    """Return every effect alone beside the base: its evidence, estimated where it was not fitted."""
+    """Return every effect alone beside the base; its evidence is estimated where not fitted."""
     root = known.found[frozenset()]
     rows = []
     first = next(iter(told.values()), {}) if named.causes else {}

@@ -80,7 +80,7 @@ def shown_by(
     rtol: float,
     zeros: tuple[str, ...] = (),
 ) -> FloatArray:
-    """Return all outputs (stop, ny) of one experiment, with the zeros of sensors. Raises PsaError."""
+    """Return all outputs (stop, ny) of one experiment, with sensors' zeros. Raises PsaError."""
     begun = start_of(model, run.inputs[0], dict(start))
     steps = simulate(
         model, run.time[:stop], run.inputs[:stop], begun.x, rtol=rtol, hold=run.signals.hold,

@@ -134,7 +134,7 @@ def _moves(column: FloatArray) -> float:
 
 
 def measured_spans(runs: Sequence[Run]) -> FloatArray:
-    """Return the range of every output over all experiments (ny,). Raises InputError if it rests."""
+    """Return the range of every output over all experiments (ny,). Raises InputError at rest."""
     every = np.vstack([r.outputs[r.used] for r in runs])
     there = np.isfinite(every)
     low = np.min(np.where(there, every, np.inf), axis=0)

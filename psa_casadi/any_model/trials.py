@@ -44,7 +44,7 @@ def trial_directions(
     fit: OdeFit, runs: Sequence[Run], table: Table, effects: Sequence[Component]
 ) -> list[Direction]:
     """Return the directions of effects over their trial values, beside those that a fit has."""
-    there = [c for c in fit.model.effects]
+    there = fit.model.effects
     models = {e.name: table.with_effects(fit, [*there, e]) for e in effects}
     side_by_side(_compiled, list(models.values()))
     tasks = [(e, values) for e in effects for values in _values(e)]

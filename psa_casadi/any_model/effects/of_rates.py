@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, gain_of, scale_of
-from psa_casadi.any_model.effects.of_signals import angle_of, bent
+from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond
 from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.effects.bend import ANGLES
@@ -16,6 +16,8 @@ from psa_casadi.variables import Parameter, State
 
 #: A rate below this share of its size has no direction.
 _STILL = 1e-3
+#: Stiffest stop, over the largest rate at one range beyond it; and width of its rounded corner.
+_STIFF, _CORNER = 1e4, 0.005
 _Own = Callable[[str], Expression]
 _Law = Callable[[Symbols, _Own], tuple[dict[str, Expression], Expression]]
 
@@ -24,7 +26,7 @@ def rate_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]
     """Return the effects in the rate of one state of a model."""
     seen = _seen_by(model, port.variable)
     found = [_constant(port, sizes), _loss(port, sizes), _friction(port, sizes), _drag(port, sizes)]
-    found += [_curve(port, sizes, n) for n in seen]
+    found += [make(port, sizes, n) for n in seen for make in (_curve, _stop)]
     ways = _ways(model, port.variable, seen)
     return (*found, *(_hysteresis(model, port, sizes, n) for n in ways))
 
@@ -196,6 +198,41 @@ def _curve(port: Port, sizes: Sizes, x: str) -> Attached:
         ),
         probe={"angle": ANGLES},
     )  # fmt: skip
+
+
+def _stop(port: Port, sizes: Sizes, x: str) -> Attached:
+    name = f"stop_of_{x}_in_{port.variable}"
+    size = sizes.rates[port.variable]
+
+    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+        part = getattr(s, x) / own("range")
+        return {}, -own("size") * beyond(part, own("level"), _CORNER)
+
+    return _made(
+        port,
+        name,
+        law,
+        gain="size",
+        words=(
+            f"a stop or an overflow holds {x} at a level",
+            "contact with an elastic stop; softplus: Dugas et al., NIPS 13 (2000)",
+            f"Q loses size (excess of r over +-level),  r = {x}/range",
+            "flat tops at one level, and shocks or a lag where it is left",
+        ),
+        parameters=(
+            Parameter(
+                f"{name}_size",
+                0.0,
+                port.unit,
+                (0.0, _STIFF * size),
+                "force of the stop, as a rate, at one range beyond it",
+                scale=size,
+            ),
+            Parameter(f"{name}_level", 0.8, "1", (0.02, 2.0), "level over the range", scale=0.05),
+            scale_of(f"{name}_range", sizes.states[x], "1", x),
+        ),
+        probe={"level": (0.5, 0.7, 0.85, 0.95)},
+    )
 
 
 def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:

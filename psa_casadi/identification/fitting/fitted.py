@@ -16,13 +16,21 @@ class Searched(Protocol):
     """
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
     @property
-    def started(self) -> tuple[tuple[str, ...], ...]: ...
+    def started(self) -> tuple[tuple[str, ...], ...]:
+        """Names of what every record has of its own."""
+
     @property
-    def prior(self) -> FloatArray: ...
+    def prior(self) -> FloatArray:
+        """Standard deviations of the weak priors (size,)."""
+
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """Number of coordinates."""
+
     def first(self, record: int) -> int:
         """Return the index of the first coordinate of one record."""
 
@@ -35,27 +43,45 @@ class FittedColumn(Protocol):
     """
 
     @property
-    def column(self) -> str: ...
+    def column(self) -> str:
+        """Name of the column."""
+
     @property
-    def residuals(self) -> FloatArray: ...
+    def residuals(self) -> FloatArray:
+        """Measured minus predicted (n,)."""
+
     @property
-    def jacobian(self) -> FloatArray: ...
+    def jacobian(self) -> FloatArray:
+        """Derivatives of the prediction by theta (n, size)."""
+
     @property
-    def basis(self) -> FloatArray: ...
+    def basis(self) -> FloatArray:
+        """What is projected out (n, k), orthonormal."""
+
     @property
-    def lengths(self) -> tuple[int, ...]: ...
+    def lengths(self) -> tuple[int, ...]:
+        """Numbers of samples of the records."""
+
     @property
-    def straight(self) -> float: ...
+    def straight(self) -> float:
+        """Rms below which nothing is known of the column."""
 
 
 class Fitted(Protocol):
     """A fit: residuals and derivatives of the first column, and the columns beside it."""
 
     @property
-    def residuals(self) -> FloatArray: ...
+    def residuals(self) -> FloatArray:
+        """Measured minus predicted (n,)."""
+
     @property
-    def jacobian(self) -> FloatArray: ...
+    def jacobian(self) -> FloatArray:
+        """Derivatives of the prediction by theta (n, size)."""
+
     @property
-    def unknowns(self) -> Searched: ...
+    def unknowns(self) -> Searched:
+        """The coordinates of the fit."""
+
     @property
-    def further(self) -> Sequence[FittedColumn]: ...
+    def further(self) -> Sequence[FittedColumn]:
+        """The columns beside the first."""

@@ -130,7 +130,7 @@ def _balances(port: Port) -> list[Balance]:
 
 
 def _opened(component: Component, ports: list[Port]) -> Callable[[Symbols], Equations]:
-    """Return the component's equations with the ports' sums in the places of what they stand for."""
+    """Return the component's equations with sums in the places of what the ports stand for."""
 
     def equations(s: Symbols) -> Equations:
         replaced = {p.variable: getattr(s, p.balance) for p in ports if p.kind == "input"}
