@@ -25,6 +25,9 @@ from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
     from psa_casadi import datasets, design, online, system
+    from psa_casadi.any_model.entry import diagnose, identify
+    from psa_casadi.any_model.identify import OdeIdentification
+    from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.component import Component, Equations, Symbols
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
     from psa_casadi.design.mechanism.mechanism import (
@@ -38,7 +41,6 @@ if TYPE_CHECKING:
         OnlineIdentification,
         identifier_for,
     )
-    from psa_casadi.diagnosis.diagnose import diagnose
     from psa_casadi.diagnosis.result import Diagnosis
     from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
-    from psa_casadi.identification.identify import Identification, identify
+    from psa_casadi.identification.identify import Identification
     from psa_casadi.model.compose import Model, compose
     from psa_casadi.model.from_casadi.ode_model import ode_model
     from psa_casadi.model.model_file import load_model, save_model
@@ -65,6 +67,7 @@ if TYPE_CHECKING:
         record_from,
         write_record,
     )
+    from psa_casadi.records.signals import Signals
     from psa_casadi.report.page.diagnosis import write_report
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.report.plots.figure import save_figure
@@ -78,6 +81,7 @@ if TYPE_CHECKING:
 
 #: Where each public name lives.
 _HOMES = {
+    "psa_casadi.records.signals": ("Signals",),
     "psa_casadi.records": (
         "Record",
         "read_record",
@@ -158,11 +162,10 @@ _HOMES = {
         "simulate",
         "simulate_record",
     ),
-    "psa_casadi.identification.identify": (
-        "Identification",
-        "identify",
-    ),
-    "psa_casadi.diagnosis.diagnose": ("diagnose",),
+    "psa_casadi.any_model.entry": ("identify", "diagnose"),
+    "psa_casadi.any_model.identify": ("OdeIdentification",),
+    "psa_casadi.any_model.result": ("OdeDiagnosis",),
+    "psa_casadi.identification.identify": ("Identification",),
     "psa_casadi.diagnosis.verdict": ("patched_model",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),
     "psa_casadi.report.words.text": ("story",),
@@ -187,6 +190,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Record",
+    "Signals",
     "read_record",
     "read_records",
     "record_from",
@@ -228,9 +232,11 @@ __all__ = [
     "settled_at",
     "run",
     "Identification",
+    "OdeIdentification",
     "identify",
     "diagnose",
     "Diagnosis",
+    "OdeDiagnosis",
     "timed",
     "Timings",
     "story",
@@ -266,6 +272,7 @@ __all__ = [
 #: `online` and `system`, and the types of results, answer to their names here as well.
 _FIRST = (
     "Record",
+    "Signals",
     "read_record",
     "read_records",
     "record_from",

@@ -113,7 +113,8 @@ class Component:
     `Equations.next` and keeps it up to the next instant. All components of a model share one
     period.
 
-    `home` is the module of a component that is not of this package (`own_effects`).
+    `home` is the module of a component that is not of this package (`own_effects`). `balances` are
+    sums of its own that others may add to, beside those of every model.
     """
 
     name: str
@@ -141,6 +142,7 @@ class Component:
     sampled: tuple[State, ...] = ()
     sample_period: str | None = None
     home: str = ""
+    balances: tuple[Balance, ...] = ()
 
     @property
     def from_residual(self) -> bool:

@@ -31,6 +31,25 @@ def smooth_magnitude(value: Expression, width: Expression) -> Expression:
     return value**2 / ca.sqrt(value**2 + width**2)
 
 
+def softplus(z: Expression) -> Expression:
+    """Return ln(1 + exp(z)) without overflow, with its slope at 0 right: |z| has slope 0 there."""
+    size = ca.fabs(z)
+    return 0.5 * (z + size) + ca.log(1 + ca.exp(-size))
+
+
+def pade_section(
+    delay: Expression, floor: Expression, y: Expression, a: Expression, b: Expression
+) -> tuple[Expression, ...]:
+    """Return (a', b', output) of a second-order Pade section of a delay T, the identity at T = 0.
+
+    a is y behind 1/(1 + s T/2 + s^2 T^2/12) and b = T a', so that the output y - b is y behind
+    (1 - s T/2 + s^2 T^2/12)/(1 + s T/2 + s^2 T^2/12). A small `floor` [s] is added to T in the
+    filter.
+    """
+    time = delay + floor
+    return b / time, 12 / time * (y - a - b / 2), y - delay / time * b
+
+
 def magnitude_power(value: Expression, exponent: Expression) -> Expression:
     """Return `|value|^exponent`, as `(value^2 + 1e-24)^(exponent/2)`.
 

@@ -1,29 +1,18 @@
 """Sensor delay: the measured displacement arrives late by a fixed time."""
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.scales import stroke_scale
+from psa_casadi.smooth import pade_section
 from psa_casadi.variables import Parameter, State
 
 #: Smallest time constant of a section [s]; keeps it defined at zero delay.
 _FLOOR = 1e-6
 
 
-def _section(
-    delay: Expression, y: Expression, a: Expression, b: Expression
-) -> tuple[Expression, ...]:
-    """Return (a', b', output) of one second-order Pade section, the identity at zero delay.
-
-    a is y behind 1/(1 + s T/2 + s^2 T^2/12) and b = T a', so that the output y - b is y behind
-    (1 - s T/2 + s^2 T^2/12)/(1 + s T/2 + s^2 T^2/12).
-    """
-    time = delay + _FLOOR
-    return b / time, 12 / time * (y - a - b / 2), y - delay / time * b
-
-
 def _equations(s: Symbols) -> Equations:
     half = s.sensor_delay / 2
-    a1, b1, first = _section(half, s.displacement, s.z_d1, s.r_d1)
-    a2, b2, second = _section(half, first, s.z_d2, s.r_d2)
+    a1, b1, first = pade_section(half, _FLOOR, s.displacement, s.z_d1, s.r_d1)
+    a2, b2, second = pade_section(half, _FLOOR, first, s.z_d2, s.r_d2)
     return Equations(
         der={"z_d1": a1, "r_d1": b1, "z_d2": a2, "r_d2": b2},
         add={"measured_displacement": second - s.displacement},

@@ -5,24 +5,17 @@ off: d below the level it vanishes (exactly so from 37 widths w on), above it is
 is rounded over the width. Only the upper end clips: a stack is driven from zero upward.
 """
 
-import casadi as ca
-
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.smooth import softplus
 from psa_casadi.variables import Parameter
 
 #: Width w of the rounded corner over rated voltage.
 _WIDTH = 0.005
 
 
-def _softplus(z: Expression) -> Expression:
-    """Return ln(1 + exp(z)) without overflow, with its slope at 0 right: |z| has slope 0 there."""
-    size = ca.fabs(z)
-    return 0.5 * (z + size) + ca.log(1 + ca.exp(-size))
-
-
 def _equations(s: Symbols) -> Equations:
     width = _WIDTH * s.u_rated
-    excess = width * _softplus((s.G * s.voltage - s.clip_level * s.u_rated) / width)
+    excess = width * softplus((s.G * s.voltage - s.clip_level * s.u_rated) / width)
     return Equations(add={"drive_voltage": -s.clip_gain * excess})
 
 

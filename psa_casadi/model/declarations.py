@@ -19,7 +19,10 @@ def refuse_duplicates(components: tuple[Component, ...]) -> None:
     for names in (symbols, outputs):
         for name in sorted({n for n in names if names.count(n) > 1}):
             problems.add(f"Two components declare '{name}'; rename one or leave one out.")
-    for name in sorted({*BALANCES, "time"}.intersection(symbols)):
+    own = [b.name for c in components for b in c.balances]
+    for name in sorted({n for n in own if n in BALANCES or own.count(n) > 1}):
+        problems.add(f"The balance '{name}' is declared more than once; rename one.")
+    for name in sorted({*BALANCES, *own, "time"}.intersection(symbols)):
         problems.add(f"A component declares '{name}', the name of a balance or of time; rename it.")
     problems.raise_if_any()
 

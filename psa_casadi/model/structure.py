@@ -6,7 +6,7 @@ from functools import cache, cached_property
 
 import casadi as ca
 
-from psa_casadi.component import BALANCES, Component, Equations, Expression, Symbols
+from psa_casadi.component import BALANCES, Balance, Component, Equations, Expression, Symbols
 from psa_casadi.errors import InputError
 from psa_casadi.model.declarations import (
     check_declarations,
@@ -58,6 +58,11 @@ class Structure:
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of their vector: asked for in every run."""
         return tuple(p.name for p in self.parameters)
+
+    @cached_property
+    def balance_table(self) -> dict[str, Balance]:
+        """The sums that components may add to, by name: those of every model, then its own."""
+        return balances_of(self.components)
 
     @property
     def arguments(self) -> list[Expression]:
@@ -115,9 +120,10 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     period = sample_period(components)
     names = [n for c in components for n in symbol_names(c)]
     table = {n: ca.SX.sym(n) for n in (*names, "time")}
-    sums = {name: ca.SX.sym(name) for name in BALANCES}
+    known = balances_of(components)
+    sums = {name: ca.SX.sym(name) for name in known}
     parts = [_equations_of(c, Symbols({**table, **sums})) for c in components]
-    balances = _sum_terms(parts, components)
+    balances = _sum_terms(parts, components, known)
     der = {k: v for e in parts for k, v in e.der.items()}
     out = {k: v for e in parts for k, v in e.out.items()}
     switches = {k: v for e in parts for k, v in e.switches.items()}
@@ -159,6 +165,11 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     )
 
 
+def balances_of(components: Iterable[Component]) -> dict[str, Balance]:
+    """Return the balances of every model, then those that components declare, by name."""
+    return {**BALANCES, **{b.name: b for c in components for b in c.balances}}
+
+
 def _column(parts: Iterable[Expression]) -> Expression:
     return ca.vertcat(ca.SX(0, 1), *parts)
 
@@ -175,15 +186,17 @@ def _equations_of(component: Component, symbols: Symbols) -> Equations:
     return equations
 
 
-def _sum_terms(parts: list[Equations], components: tuple[Component, ...]) -> dict[str, Expression]:
+def _sum_terms(
+    parts: list[Equations], components: tuple[Component, ...], known: Mapping[str, Balance]
+) -> dict[str, Expression]:
     balances: dict[str, Expression] = {}
     for component, part in zip(components, parts, strict=True):
         for name, term in part.add.items():
-            if name not in BALANCES:
+            if name not in known:
                 raise InputError(
                     [
                         f"Component '{component.name}' adds to '{name}', which is no balance; "
-                        f"the balances are {sorted(BALANCES)}."
+                        f"the balances are {sorted(known)}."
                     ]
                 )
             balances[name] = balances[name] + term if name in balances else ca.SX(term)

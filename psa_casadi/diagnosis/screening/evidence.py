@@ -17,13 +17,13 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.screen import Score, Screening, whitened_residuals
 from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.fitted import Fitted
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 
 FloatArray = npt.NDArray[np.float64]
 
 
-def evidence(before: Fit, after: Fit, colour: Colour) -> float:
+def evidence(before: Fitted, after: Fitted, colour: Colour) -> float:
     """Return ln B of a fit with one more effect over the fit without it.
 
     The log-likelihoods of displacement and further columns add up, each with its own noise level.
@@ -46,7 +46,7 @@ def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     return gained - 0.5 * float(penalty)
 
 
-def further_gains(before: Fit, after: Fit, colour: Colour) -> dict[str, float]:
+def further_gains(before: Fitted, after: Fitted, colour: Colour) -> dict[str, float]:
     """Return what every further column adds to the log-likelihood of a fit over another one."""
     rows = zip(colour.further, before.further, after.further, strict=True)
     return {
@@ -66,7 +66,7 @@ def _level(residual: FloatArray, colour: Colour, straight: float) -> float:
     return float(np.hypot(np.sqrt(np.mean(colour.whiten(residual) ** 2)), straight))
 
 
-def estimated(before: Fit, screening: Screening) -> dict[str, float]:
+def estimated(before: Fitted, screening: Screening) -> dict[str, float]:
     """Return every effect's ln B as its trial directions tell it, without a full fit.
 
     Linear in the gain g with prior N(0, s^2), s = `LINEAR_PRIOR` ordinary sizes, and estimated to
@@ -136,7 +136,7 @@ def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, .
     return tuple(chosen)
 
 
-def _freedom(fit: Fit) -> int:
+def _freedom(fit: Fitted) -> int:
     """Return the number of residuals less that of the unknowns: what is left to tell the noise."""
     return max(len(fit.residuals) - fit.unknowns.size, 0)
 
@@ -148,7 +148,7 @@ def _linear(score: Score, gained: float) -> float:
     return gained * width**2 / (1.0 + width**2) - 0.5 * float(np.log1p(width**2))
 
 
-def _added(before: Fit, after: Fit) -> list[int]:
+def _added(before: Fitted, after: Fitted) -> list[int]:
     """Return the coordinates of `after` that `before` has not."""
     known, names = before.unknowns, after.unknowns
     added = [k for k, n in enumerate(names.names) if n not in known.names]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.noise.colour import Colour, colour_of
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.fitted import Fitted
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Screening:
 
 
 def screen(
-    fit: Fit,
+    fit: Fitted,
     trials: Sequence[Direction],
     lengths: Sequence[int],
     known: Sequence[FloatArray | None] | None = None,
@@ -105,17 +105,17 @@ def screen(
     return Screening(tuple(scores), _threshold(unit), colour)
 
 
-def whitened_residuals(fit: Fit, colour: Colour) -> FloatArray:
+def whitened_residuals(fit: Fitted, colour: Colour) -> FloatArray:
     """Return the whitened residuals (samples,), those of the further columns below."""
     return colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])
 
 
-def whitened_jacobian(fit: Fit, colour: Colour) -> FloatArray:
+def whitened_jacobian(fit: Fitted, colour: Colour) -> FloatArray:
     """Return the whitened derivatives by theta (samples, size), the further columns' below."""
     return colour.whiten_all(fit.jacobian, [f.jacobian for f in fit.further])
 
 
-def further_columns(fit: Fit, trials: Sequence[Direction]) -> list[FloatArray]:
+def further_columns(fit: Fitted, trials: Sequence[Direction]) -> list[FloatArray]:
     """Return for every further column what the directions change in it (samples, directions)."""
     return [
         np.hstack([np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)])
@@ -123,7 +123,7 @@ def further_columns(fit: Fit, trials: Sequence[Direction]) -> list[FloatArray]:
     ]
 
 
-def _further_colours(fit: Fit, columns: Sequence[FloatArray]) -> tuple[Colour, ...]:
+def _further_colours(fit: Fitted, columns: Sequence[FloatArray]) -> tuple[Colour, ...]:
     """Return the colour of what neither the fit nor a direction explains of the further columns."""
     found = []
     for f, own in zip(fit.further, columns, strict=True):
@@ -147,7 +147,7 @@ class Copy:
 
 
 def copies(
-    fit: Fit, added: FloatArray, trials: Sequence[Direction], colour: Colour
+    fit: Fitted, added: FloatArray, trials: Sequence[Direction], colour: Colour
 ) -> tuple[float, dict[str, Copy]]:
     """Return the power of a contribution over the noise's, and how each effect can copy it.
 

@@ -21,7 +21,7 @@ from psa_casadi.diagnosis.screening.screen import (
     whitened_residuals,
     without,
 )
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.fitted import Fitted
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Together:
 
 
 def best_sets(
-    fit: Fit,
+    fit: Fitted,
     trials: Sequence[Direction],
     colour: Colour,
     size: int,

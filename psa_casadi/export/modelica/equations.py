@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from psa_casadi.component import BALANCES, Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.export.modelica.expression import Graph
 from psa_casadi.export.modelica.parts import Part, known_parts
 from psa_casadi.export.modelica.printer import Printer
@@ -77,13 +77,14 @@ def model_equations(model: Model, taken: tuple[str, ...] = ()) -> ModelEquations
     names |= {before(s.name): before(names[s.name]) for s in structure.sampled}
     printer = Printer(graph, names, parts.named)
     texts = [printer.definition(n) for n in numbers]
+    table = structure.balance_table
     counts = (len(it) for it in (sums, structure.states, outputs))
     first, second, third = itertools.accumulate(counts)
     terms = [_terms(graph, printer, structure, *it) for it in zip(sums, numbers, strict=False)]
     return ModelEquations(
         names=names,
         balances=tuple(
-            Variable(names[n], BALANCES[n].unit, BALANCES[n].description, text, added)
+            Variable(names[n], table[n].unit, table[n].description, text, added)
             for n, text, added in zip(sums, texts[:first], terms, strict=True)
         ),
         parts=parts.variables(printer, sampled=False),
@@ -161,7 +162,7 @@ def variable_names(structure: Structure, identifiers: Identifiers) -> dict[str, 
     wanted = [i.name for i in structure.inputs]
     wanted += [p.name for p in structure.parameters]
     wanted += [s.name for s in (*structure.states, *structure.sampled)]
-    wanted += [name for name in BALANCES if name in _used(structure)]
+    wanted += [name for name in structure.balance_table if name in _used(structure)]
     wanted += [o.name for o in structure.outputs if o.name not in wanted]
     return {"time": "time"} | {name: identifiers.new(name) for name in wanted}
 
@@ -171,13 +172,13 @@ def _used(structure: Structure) -> set[str]:
     sides = (structure.balances, structure.der, structure.next)
     every = ca.vertcat(*(e for side in sides for e in side.values()))
     read = {s.name() for s in ca.symvar(ca.vertcat(every, *structure.out.values()))}
-    return {name for name in BALANCES if name in structure.balances or name in read}
+    return {n for n in structure.balance_table if n in structure.balances or n in read}
 
 
 def _balances(structure: Structure) -> dict[str, Expression]:
     """Return the balances in the order of their table; one that is read but empty is 0."""
     used = _used(structure)
-    return {n: structure.balances.get(n, ca.SX(0)) for n in BALANCES if n in used}
+    return {n: structure.balances.get(n, ca.SX(0)) for n in structure.balance_table if n in used}
 
 
 def _outputs(structure: Structure) -> dict[str, Expression]:

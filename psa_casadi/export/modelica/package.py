@@ -4,7 +4,6 @@ import os
 from pathlib import Path
 
 from psa_casadi.characters import check_text
-from psa_casadi.component import BALANCES
 from psa_casadi.errors import Problems
 from psa_casadi.export.common.icon import drawing_of
 from psa_casadi.export.modelica.acausal import acausal_lines, has_ports
@@ -122,7 +121,9 @@ def _refuse(model: Model) -> None:
             f"Two variables of '{model.name}' are named '{name}', which Modelica does not allow;"
             " rename one."
         )
-    for name in sorted(BALANCES.keys() & model.structure.out.keys() & {*model.output_names}):
+    for name in sorted(
+        model.structure.balance_table.keys() & model.structure.out.keys() & {*model.output_names}
+    ):
         if not is_symbol(model.structure.out[name], name):
             problems.add(
                 f"The output '{name}' of '{model.name}' differs from the balance of that name;"

@@ -1,0 +1,1 @@
+"""Identification and diagnosis of any model: own equations, several inputs and outputs."""

@@ -1,0 +1,67 @@
+"""An effect with the ports that it needs, and the parameters that most effects have alike."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from psa_casadi.component import Component
+from psa_casadi.model.compose import Model
+from psa_casadi.model.from_casadi.ports import Port, with_ports
+from psa_casadi.variables import Parameter
+
+#: An ordinary size of an effect over what it acts on, and the largest that a fit may reach.
+ORDINARY, LARGEST = 0.03, 10.0
+
+
+@dataclass(frozen=True)
+class Attached:
+    """An effect, the port that it is at, and further ports whose sums it reads."""
+
+    component: Component
+    port: Port
+    reads: tuple[Port, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.component.name
+
+    @property
+    def ports(self) -> frozenset[Port]:
+        """Every port that the model must have for it."""
+        return frozenset((self.port, *self.reads))
+
+
+def extended(base: Model, effects: Iterable[Attached]) -> Model:
+    """Return a model with effects, their gains 0, and sums at the ports that they need."""
+    chosen = list(effects)
+    ports = frozenset(p for e in chosen for p in e.ports)
+    opened = with_ports(base, ports) if ports else base
+    return opened.with_components((*opened.components, *(e.component for e in chosen)))
+
+
+def scale_of(name: str, value: float, unit: str, what: str) -> Parameter:
+    """Return the parameter of a size that is not fitted: the equations divide by it."""
+    rounded = float(f"{value:.2g}")
+    words = f"largest {what} in the records, a scale only"
+    return Parameter(name, rounded, unit, (0.0, float("inf")), words, fitted=False)
+
+
+def gain_of(name: str, unit: str, size: float, what: str, *, positive: bool = False) -> Parameter:
+    """Return the parameter that removes an effect at 0, in the unit of what it adds to."""
+    most = LARGEST * size
+    low = 0.0 if positive else -most
+    return Parameter(name, 0.0, unit, (low, most), what, scale=ORDINARY * size)
+
+
+def plain_gain(name: str, what: str) -> Parameter:
+    """Return a gain from 0 (absent) to 1 (in full)."""
+    return Parameter(name, 0.0, "1", (0.0, 1.0), what, scale=0.1)
+
+
+def time_of(name: str, sample: float, duration: float, what: str) -> Parameter:
+    """Return a time that removes an effect at 0 [s]; an ordinary one is a sampling interval."""
+    return Parameter(name, 0.0, "s", (0.0, 0.1 * duration), what, scale=sample)
+
+
+#: Steps of a time, in sampling intervals, at which lags and delays are looked for.
+TIME_STEPS = (0.0, 5.0, 20.0, 60.0)

@@ -1,0 +1,299 @@
+"""What may be missing in the rate of a state: friction, losses, curves, hysteresis, a constant."""
+
+from collections.abc import Callable, Sequence
+
+import casadi as ca
+
+from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, gain_of, scale_of
+from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond
+from psa_casadi.any_model.sizes import Sizes
+from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.effects.bend import ANGLES
+from psa_casadi.model.compose import Model
+from psa_casadi.model.from_casadi.ports import Port, ports_of
+from psa_casadi.smooth import magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.variables import Parameter, State
+
+#: A rate below this share of its size has no direction.
+_STILL = 1e-3
+#: Stiffest stop, over the largest rate at one range beyond it; and width of its rounded corner.
+_STIFF, _CORNER = 1e4, 0.005
+_Own = Callable[[str], Expression]
+_Law = Callable[[Symbols, _Own], tuple[dict[str, Expression], Expression]]
+
+
+def rate_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
+    """Return the effects in the rate of one state of a model."""
+    seen = _seen_by(model, port.variable)
+    found = [_constant(port, sizes), _loss(port, sizes), _friction(port, sizes), _drag(port, sizes)]
+    found += [make(port, sizes, n) for n in seen for make in (_curve, _stop)]
+    ways = _ways(model, port.variable, seen)
+    return (*found, *(_hysteresis(model, port, sizes, n) for n in ways))
+
+
+def _seen_by(model: Model, state: str) -> list[str]:
+    """Return the states that a state's rate depends on, and itself."""
+    rate = model.structure.xdot[model.state_names.index(state)]
+    found = {q.name() for q in ca.symvar(rate)}
+    base = [q.name for c in model.components if c.gain is None for q in c.states]
+    return [n for n in base if n in found or n == state]
+
+
+def _ways(model: Model, state: str, seen: Sequence[str]) -> list[str]:
+    """Return the states along which a hysteresis may work: positions, else all that is seen."""
+    positions = [n for n in seen if n != state and _speed(model, n) is not None]
+    return positions or list(seen)
+
+
+def _speed(model: Model, state: str) -> str | None:
+    """Return the state that is the rate of another one by definition, None if there is none."""
+    rate = ca.SX(model.structure.der[state])
+    return str(rate.name()) if rate.is_symbolic() and rate.name() in model.state_names else None
+
+
+def _made(
+    port: Port,
+    name: str,
+    law: _Law,
+    *,
+    gain: str,
+    words: tuple[str, str, str, str],
+    parameters: tuple[Parameter, ...],
+    states: tuple[State, ...] = (),
+    probe: dict[str, tuple[float, ...]] | None = None,
+    reads: tuple[Port, ...] = (),
+) -> Attached:
+    def equations(s: Symbols) -> Equations:
+        der, term = law(s, lambda short: getattr(s, f"{name}_{short}"))
+        return Equations(
+            der={f"{name}_{short}": rate for short, rate in der.items()},
+            add={port.balance: term},
+        )
+
+    description, source, text, looks = words
+    component = Component(
+        name=name,
+        description=f"{port.words}: {description}",
+        source=source,
+        equations=equations,
+        parameters=parameters,
+        states=states,
+        gain=f"{name}_{gain}",
+        probe={f"{name}_{short}": grid for short, grid in (probe or {}).items()},
+        equation_text=text.replace("Q", port.balance),
+        looks_like=looks,
+    )
+    return Attached(component, port, reads)
+
+
+def _constant(port: Port, sizes: Sizes) -> Attached:
+    name = f"constant_in_{port.variable}"
+    size = sizes.rates[port.variable]
+    return _made(
+        port, name, lambda s, own: ({}, own("size")),
+        gain="size",
+        words=(
+            "a constant is missing",
+            "weight, leak, offset of an input",
+            "Q gains size",
+            "a residual of the form of a step answer in every record",
+        ),
+        parameters=(gain_of(f"{name}_size", port.unit, size, "constant part of the rate"),),
+    )  # fmt: skip
+
+
+def _loss(port: Port, sizes: Sizes) -> Attached:
+    name, v = f"loss_in_{port.variable}", port.variable
+    return _made(
+        port, name, lambda s, own: ({}, -own("size") * getattr(s, v) / own("range")),
+        gain="size",
+        words=(
+            "it loses in proportion to its state",
+            "viscous damping, leak, cooling",
+            f"Q loses size {v}/range",
+            "resonances are lower, and decays faster, at every level alike",
+        ),
+        parameters=(
+            gain_of(f"{name}_size", port.unit, sizes.rates[v], "loss at the largest state"),
+            _range(name, port, sizes),
+        ),
+    )  # fmt: skip
+
+
+def _friction(port: Port, sizes: Sizes) -> Attached:
+    name, v = f"friction_in_{port.variable}", port.variable
+
+    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+        part = getattr(s, v) / own("range")
+        return {}, -own("size") * part / ca.sqrt(part**2 + own("width") ** 2)
+
+    return _made(
+        port, name, law,
+        gain="size",
+        words=(
+            "dry friction holds against the motion",
+            "Coulomb's friction, smooth about rest",
+            f"Q loses size r/sqrt(r^2 + width^2),  r = {v}/range",
+            "what stands still needs a push to move; small motions are missed most",
+        ),
+        parameters=(
+            gain_of(
+                f"{name}_size", port.unit, sizes.rates[v], "friction, as a rate", positive=True
+            ),
+            Parameter(
+                f"{name}_width", 0.02, "1", (5e-4, 0.7), "speed, over the range, below which it"
+                " fades", log=True
+            ),
+            _range(name, port, sizes),
+        ),
+        probe={"width": (0.01, 0.05)},
+    )  # fmt: skip
+
+
+def _drag(port: Port, sizes: Sizes) -> Attached:
+    name, v = f"drag_in_{port.variable}", port.variable
+
+    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+        part = getattr(s, v) / own("range")
+        return {}, -own("size") * part * smooth_magnitude(part, _STILL)
+
+    return _made(
+        port, name, law,
+        gain="size",
+        words=(
+            "it loses with the square of its state",
+            "drag of a turbulent flow",
+            f"Q loses size r |r|,  r = {v}/range",
+            "damping that grows with the level",
+        ),
+        parameters=(
+            gain_of(f"{name}_size", port.unit, sizes.rates[v], "loss at the largest state"),
+            _range(name, port, sizes),
+        ),
+    )  # fmt: skip
+
+
+def _curve(port: Port, sizes: Sizes, x: str) -> Attached:
+    name = f"curve_of_{x}_in_{port.variable}"
+
+    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+        return {}, own("size") * bent(getattr(s, x) / own("range"), own("angle"))
+
+    return _made(
+        port, name, law,
+        gain="size",
+        words=(
+            f"it depends on {x} along a curve",
+            "hardening or softening spring; first two terms beyond the straight line",
+            f"Q gains size (cos(angle) r^2 + sin(angle) r^3),  r = {x}/range",
+            "resonances move with the level; harmonics",
+        ),
+        parameters=(
+            gain_of(
+                f"{name}_size", port.unit, sizes.rates[port.variable],
+                "deviation from the line at the range's end"
+            ),
+            angle_of(f"{name}_angle"),
+            scale_of(f"{name}_range", sizes.states[x], "1", x),
+        ),
+        probe={"angle": ANGLES},
+    )  # fmt: skip
+
+
+def _stop(port: Port, sizes: Sizes, x: str) -> Attached:
+    name = f"stop_of_{x}_in_{port.variable}"
+    size = sizes.rates[port.variable]
+
+    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+        part = getattr(s, x) / own("range")
+        return {}, -own("size") * beyond(part, own("level"), _CORNER)
+
+    return _made(
+        port,
+        name,
+        law,
+        gain="size",
+        words=(
+            f"a stop or an overflow holds {x} at a level",
+            "contact with an elastic stop; softplus: Dugas et al., NIPS 13 (2000)",
+            f"Q loses size (excess of r over +-level),  r = {x}/range",
+            "flat tops at one level, and shocks or a lag where it is left",
+        ),
+        parameters=(
+            Parameter(
+                f"{name}_size",
+                0.0,
+                port.unit,
+                (0.0, _STIFF * size),
+                "force of the stop, as a rate, at one range beyond it",
+                scale=size,
+            ),
+            Parameter(f"{name}_level", 0.8, "1", (0.02, 2.0), "level over the range", scale=0.05),
+            scale_of(f"{name}_range", sizes.states[x], "1", x),
+        ),
+        probe={"level": (0.5, 0.7, 0.85, 0.95)},
+    )
+
+
+def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
+    """Bouc and Wen's element along a state: z' = w (1 - bend |r|^n) - loss |w| sgn(r) |r|^n.
+
+    w = x'/range and r = z, so that the loop's own way is one range where loss and bend are 1.
+    """
+    name, speed = f"hysteresis_of_{x}_in_{port.variable}", _speed(model, x)
+    reads = () if speed else tuple(p for p in ports_of(model) if _is_rate(p, x))
+    fastest = sizes.rates[x]
+
+    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+        rate = getattr(s, speed) if speed else getattr(s, reads[0].balance)
+        w, z = rate / own("range"), own("state")
+        size = smooth_magnitude(w, _STILL * own("rate") / own("range"))
+        power, signed = magnitude_power(z, own("n")), signed_power(z, own("n"))
+        der = w * (1 - own("bend") * power) - own("loss") * size * signed
+        return {"state": der}, -own("size") * z
+
+    return _made(
+        port, name, law,
+        gain="size",
+        words=(
+            f"it depends on the way that {x} came",
+            "Bouc and Wen's model of hysteresis (Wen, J. Eng. Mech. 102 (1976), 249)",
+            f"Q loses size z,  z' = w (1 - bend |z|^n) - loss |w| sgn(z) |z|^n,  w = {x}'/range",
+            "loops that stay open however slow the motion, and rest where it rests",
+        ),
+        parameters=(
+            _force(f"{name}_size", port, sizes),
+            Parameter(
+                f"{name}_loss", 1.0, "1", (1e-3, 1e3), "how fast the loop turns", log=True
+            ),
+            Parameter(
+                f"{name}_bend", 0.0, "1", (-500.0, 500.0), "how the loop bends", scale=0.3
+            ),
+            Parameter(
+                f"{name}_n", 1.0, "1", (0.2, 8.0), "sharpness of the loop's turns", log=True
+            ),
+            scale_of(f"{name}_range", sizes.states[x], "1", x),
+            scale_of(f"{name}_rate", fastest, "1/s", f"rate of {x}"),
+        ),
+        states=(
+            State(f"{name}_state", "1", "memory of the way", 0.5, memory=True, settles=False),
+        ),
+        probe={"loss": (0.3, 1.0, 4.0, 16.0)},
+        reads=reads,
+    )  # fmt: skip
+
+
+def _force(name: str, port: Port, sizes: Sizes) -> Parameter:
+    size = sizes.rates[port.variable]
+    return Parameter(
+        name, 0.0, port.unit, (-LARGEST * size, LARGEST * size), "slope of the loop's part, as a"
+        " rate", scale=3 * ORDINARY * size,
+    )  # fmt: skip
+
+
+def _is_rate(port: Port, state: str) -> bool:
+    return port.kind == "rate" and port.variable == state
+
+
+def _range(name: str, port: Port, sizes: Sizes) -> Parameter:
+    return scale_of(f"{name}_range", sizes.states[port.variable], "1", port.variable)

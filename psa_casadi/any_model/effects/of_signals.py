@@ -1,0 +1,290 @@
+"""What may be missing between a signal and the model: at an input (drive) or an output (sensor).
+
+Every effect adds to the port's sum what makes the signal q another one; q is the input as given, or
+the output before its sensor.
+"""
+
+from collections.abc import Callable
+
+import casadi as ca
+
+from psa_casadi.any_model.effects.attached import (
+    TIME_STEPS,
+    Attached,
+    gain_of,
+    plain_gain,
+    scale_of,
+    time_of,
+)
+from psa_casadi.any_model.sizes import Sizes
+from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.effects.bend import ANGLES
+from psa_casadi.model.from_casadi.ports import Port, true_output
+from psa_casadi.smooth import pade_section, softplus
+from psa_casadi.variables import Parameter, State
+
+#: Width of the rounded corner of a saturation or a dead zone, over the signal's size.
+_CORNER = 0.01
+#: Smallest time of a filter over the sampling interval: keeps it defined at a time of 0.
+_FLOOR = 0.02
+
+#: The equations of an effect: (symbols, signal, parameter by its short name) -> derivatives, term.
+_Law = Callable[
+    [Symbols, Expression, Callable[[str], Expression]], tuple[dict[str, Expression], Expression]
+]
+
+
+def signal_effects(port: Port, sizes: Sizes) -> tuple[Attached, ...]:
+    """Return the effects of an input or an output."""
+    makers = [_lag, _delay, _bend, _saturation]
+    makers += [_dead_zone] if port.kind == "input" else [_zero, _drift]
+    return tuple(make(port, sizes) for make in makers)
+
+
+def _size(port: Port, sizes: Sizes) -> float:
+    return (sizes.inputs if port.kind == "input" else sizes.outputs)[port.variable]
+
+
+def _made(
+    port: Port,
+    kind: str,
+    law: _Law,
+    *,
+    gain: str,
+    words: tuple[str, str, str, str],
+    parameters: tuple[Parameter, ...],
+    states: tuple[State, ...] = (),
+    probe: dict[str, tuple[float, ...]] | None = None,
+    finite_step: tuple[float, ...] = (),
+) -> Attached:
+    """Return an effect; its parameters and states begin with its name.
+
+    `words` are description, source, equation and what it looks like.
+    """
+    name = f"{kind}_of_{port.variable}"
+    signal = port.variable if port.kind == "input" else true_output(port.variable)
+
+    def equations(s: Symbols) -> Equations:
+        der, term = law(s, getattr(s, signal), lambda short: getattr(s, f"{name}_{short}"))
+        return Equations(
+            der={f"{name}_{short}": rate for short, rate in der.items()},
+            add={port.balance: term},
+        )
+
+    description, source, text, looks = words
+    component = Component(
+        name=name,
+        description=f"{port.words}: {description}",
+        source=source,
+        equations=equations,
+        parameters=parameters,
+        states=states,
+        gain=f"{name}_{gain}",
+        probe={f"{name}_{short}": grid for short, grid in (probe or {}).items()},
+        finite_step=finite_step,
+        equation_text=text.replace("Q", port.balance).replace("q", signal),
+        looks_like=looks,
+        belongs_to="drive" if port.kind == "input" else "sensor",
+    )
+    return Attached(component, port)
+
+
+def _lag(port: Port, sizes: Sizes) -> Attached:
+    name, floor = f"lag_of_{port.variable}", _FLOOR * sizes.sample
+
+    def law(
+        s: Symbols, q: Expression, own: Callable[[str], Expression]
+    ) -> tuple[dict[str, Expression], Expression]:
+        time, behind = own("time") + own("floor"), own("state") - q
+        return {"state": -behind / time}, own("time") / time * behind
+
+    return _made(
+        port, "lag", law,
+        gain="time",
+        words=(
+            "it follows through a lag of first order",
+            "amplifier, valve or filter with one pole",
+            "T Q' + Q = q",
+            "the residual follows the signal's rate; the roll-off grows with frequency",
+        ),
+        parameters=(
+            time_of(f"{name}_time", sizes.sample, sizes.duration, "time constant"),
+            _floor(f"{name}_floor", floor),
+        ),
+        states=(State(f"{name}_state", port.unit, "behind the lag", _size(port, sizes)),),
+        finite_step=TIME_STEPS,
+    )  # fmt: skip
+
+
+def _delay(port: Port, sizes: Sizes) -> Attached:
+    name, size = f"delay_of_{port.variable}", _size(port, sizes)
+
+    def law(
+        s: Symbols, q: Expression, own: Callable[[str], Expression]
+    ) -> tuple[dict[str, Expression], Expression]:
+        half, floor = own("time") / 2, own("floor")
+        a1, b1, first = pade_section(half, floor, q, own("a1"), own("b1"))
+        a2, b2, second = pade_section(half, floor, first, own("a2"), own("b2"))
+        return {"a1": a1, "b1": b1, "a2": a2, "b2": b2}, second - q
+
+    return _made(
+        port, "delay", law,
+        gain="time",
+        words=(
+            "it arrives late by a fixed time",
+            "Pade approximation of exp(-s T), two second-order sections in series",
+            "Q(t) = q(t - T)",
+            "phase linear in frequency at unchanged size",
+        ),
+        parameters=(
+            time_of(f"{name}_time", sizes.sample, sizes.duration, "delay"),
+            _floor(f"{name}_floor", _FLOOR * sizes.sample),
+        ),
+        states=tuple(
+            State(f"{name}_{short}", port.unit, f"filter of section {short[1]}", size)
+            for short in ("a1", "b1", "a2", "b2")
+        ),
+        finite_step=TIME_STEPS,
+    )  # fmt: skip
+
+
+def _bend(port: Port, sizes: Sizes) -> Attached:
+    name, size = f"bend_of_{port.variable}", _size(port, sizes)
+
+    def law(
+        s: Symbols, q: Expression, own: Callable[[str], Expression]
+    ) -> tuple[dict[str, Expression], Expression]:
+        part = q / own("range")
+        return {}, own("size") * bent(part, own("angle"))
+
+    return _made(
+        port, "bend", law,
+        gain="size",
+        words=(
+            "its gain depends on its level",
+            "first two terms of a static curve beyond the straight line",
+            "Q = q + size (cos(angle) r^2 + sin(angle) r^3),  r = q/range",
+            "harmonics that grow with the level, at every frequency alike",
+        ),
+        parameters=(
+            gain_of(f"{name}_size", port.unit, size, "deviation from the line at the range's end"),
+            angle_of(f"{name}_angle"),
+            scale_of(f"{name}_range", size, port.unit, port.variable),
+        ),
+        probe={"angle": ANGLES},
+    )  # fmt: skip
+
+
+def _saturation(port: Port, sizes: Sizes) -> Attached:
+    name, size = f"saturation_of_{port.variable}", _size(port, sizes)
+
+    def law(
+        s: Symbols, q: Expression, own: Callable[[str], Expression]
+    ) -> tuple[dict[str, Expression], Expression]:
+        level, width = own("level") * own("range"), _CORNER * own("range")
+        return {}, -own("gain") * beyond(q, level, width)
+
+    return _made(
+        port, "saturation", law,
+        gain="gain",
+        words=(
+            "it goes no further than a level, to either side",
+            "end stops, limited supply; softplus: Dugas et al., NIPS 13 (2000)",
+            "Q = q - gain (excess of q over +-level range);  gain = 1 is a hard stop",
+            "flat tops at one level",
+        ),
+        parameters=(
+            plain_gain(f"{name}_gain", "share of the excess that is lost"),
+            _level(f"{name}_level", 0.7, (0.05, 1.2)),
+            scale_of(f"{name}_range", size, port.unit, port.variable),
+        ),
+        probe={"level": (0.4, 0.6, 0.75, 0.9)},
+    )  # fmt: skip
+
+
+def _dead_zone(port: Port, sizes: Sizes) -> Attached:
+    name, size = f"dead_zone_of_{port.variable}", _size(port, sizes)
+
+    def law(
+        s: Symbols, q: Expression, own: Callable[[str], Expression]
+    ) -> tuple[dict[str, Expression], Expression]:
+        level, width = own("level") * own("range"), _CORNER * own("range")
+        return {}, -own("gain") * (q - beyond(q, level, width))
+
+    return _made(
+        port, "dead_zone", law,
+        gain="gain",
+        words=(
+            "small values of it do nothing",
+            "overlap of a valve, stiction of an actuator",
+            "Q = q - gain (q within +-level range);  gain = 1 is a true dead zone",
+            "nothing moves about zero, and all else is offset by the zone's width",
+        ),
+        parameters=(
+            plain_gain(f"{name}_gain", "share of the small values that is lost"),
+            _level(f"{name}_level", 0.1, (2e-3, 0.9)),
+            scale_of(f"{name}_range", size, port.unit, port.variable),
+        ),
+        probe={"level": (0.04, 0.1, 0.25)},
+    )  # fmt: skip
+
+
+def _zero(port: Port, sizes: Sizes) -> Attached:
+    name = f"zero_of_{port.variable}"
+    return _made(
+        port, "zero", lambda s, q, own: ({}, own("shift")),
+        gain="shift",
+        words=(
+            "its zero is shifted",
+            "sensor with an offset",
+            "Q = q + shift",
+            "a constant residual in all records",
+        ),
+        parameters=(gain_of(f"{name}_shift", port.unit, _size(port, sizes), "shift of the zero"),),
+    )  # fmt: skip
+
+
+def _drift(port: Port, sizes: Sizes) -> Attached:
+    name = f"drift_of_{port.variable}"
+    return _made(
+        port, "drift", lambda s, q, own: ({}, own("size") * s.time / own("duration")),
+        gain="size",
+        words=(
+            "its zero drifts with time",
+            "sensor that warms up",
+            "Q = q + size t/duration",
+            "a residual that grows with time whatever the inputs do",
+        ),
+        parameters=(
+            gain_of(f"{name}_size", port.unit, _size(port, sizes), "drift over the duration"),
+            scale_of(f"{name}_duration", sizes.duration, "s", "time"),
+        ),
+    )  # fmt: skip
+
+
+def bent(part: Expression, angle: Expression) -> Expression:
+    """Return cos(angle) part^2 + sin(angle) part^3: a bow at 0, an S at pi/2, and any mix."""
+    return ca.cos(angle) * part**2 + ca.sin(angle) * part**3
+
+
+def angle_of(name: str) -> Parameter:
+    """Return the parameter of the curve's form."""
+    most = 2.0 * ca.pi
+    words = "form of the curve: 0 quadratic, pi/2 cubic"
+    return Parameter(name, 0.0, "rad", (-most, most), words, scale=0.3)
+
+
+def beyond(q: Expression, level: Expression, width: Expression) -> Expression:
+    """Return by how much q is above +level or below -level, with corners rounded over a width."""
+    above, below = (width * softplus((side * q - level) / width) for side in (1, -1))
+    return above - below
+
+
+def _level(name: str, value: float, bounds: tuple[float, float]) -> Parameter:
+    return Parameter(name, value, "1", bounds, "level over the range", scale=0.05)
+
+
+def _floor(name: str, value: float) -> Parameter:
+    words = "smallest time of the filter, a scale only"
+    rounded = float(f"{value:.2g}")
+    return Parameter(name, rounded, "s", (0.0, float("inf")), words, fitted=False)

@@ -1,0 +1,106 @@
+"""`psa.identify` and `psa.diagnose`: of a stack's records, or of any model and its records."""
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, overload
+
+from psa_casadi.any_model.diagnose import diagnose_ode
+from psa_casadi.any_model.identify import OdeIdentification, identify_ode
+from psa_casadi.any_model.result import OdeDiagnosis
+from psa_casadi.component import Component
+from psa_casadi.diagnosis import diagnose as stacks
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.task import Method
+from psa_casadi.errors import InputError
+from psa_casadi.identification import identify as stack
+from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.start.form import Hysteresis
+from psa_casadi.interruption import interruptible_work
+from psa_casadi.model.compose import Model
+from psa_casadi.records.read.reading import Records
+from psa_casadi.simulation.one_thread import one_thread_of_algebra
+from psa_casadi.simulation.ways import output_of
+
+Progress = Callable[[str], None]
+
+
+@overload
+def identify(
+    records: Records,
+    *,
+    model: Model | None = None,
+    stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
+    progress: Progress = ...,
+) -> Identification: ...
+@overload
+def identify(
+    model: Model,
+    records: Any,
+    *,
+    free: Sequence[str] | None = None,
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+) -> OdeIdentification: ...
+@wraps(stack.identify)
+def identify(*given: Any, **words: Any) -> Any:
+    """Identify a stack from its records, or a model of one's own, given first, from its."""
+    model, records = _models_first(given, words)
+    if model is None or _is_stack(model):
+        return stack.identify(records, model=model, **words)
+    return _own(identify_ode, model, records, words)
+
+
+@overload
+def diagnose(
+    records: Records,
+    *,
+    holdout: Records = (),
+    model: Model | None = None,
+    stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
+    effects: Sequence[Component] | None = None,
+    method: Method | None = None,
+    progress: Progress = ...,
+) -> Diagnosis: ...
+@overload
+def diagnose(
+    model: Model,
+    records: Any,
+    *,
+    holdout: Any = (),
+    free: Sequence[str] | None = None,
+    leave_out: Sequence[str] = (),
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+    progress: Progress = ...,
+) -> OdeDiagnosis: ...
+@wraps(stacks.diagnose)
+def diagnose(*given: Any, **words: Any) -> Any:
+    """Diagnose a stack's records, or a model of one's own, given first, on its records."""
+    model, records = _models_first(given, words)
+    if model is None or _is_stack(model):
+        return stacks.diagnose(records, model=model, **words)
+    return _own(diagnose_ode, model, records, words)
+
+
+@interruptible_work()
+@one_thread_of_algebra()
+def _own(work: Callable[..., Any], model: Model, records: Any, words: dict[str, Any]) -> Any:
+    return work(model, records, **words)
+
+
+def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model | None, Any]:
+    """Return the model, if there is one, and the records; `words` lose both."""
+    left = list(given)
+    model = left.pop(0) if left and isinstance(left[0], Model) else words.pop("model", None)
+    records = left.pop(0) if left else words.pop("records", None)
+    if records is None or left:
+        raise InputError("Give records, or a model of your own and its records, and words beside.")
+    return model, records
+
+
+def _is_stack(model: Model) -> bool:
+    return "voltage" in model.input_names and output_of(model) is not None

@@ -1,0 +1,299 @@
+"""Prediction-error fit of any model: all outputs of all experiments, with exact sensitivities."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.any_model.coordinates import coordinates_of
+from psa_casadi.any_model.predict import STEP_RTOL, output_of, shown_by
+from psa_casadi.any_model.runs import Run, measured_spans
+from psa_casadi.errors import Problems, PsaError
+from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum, minimise
+from psa_casadi.identification.fitting.unknowns import Unknowns
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.stepper import SimulationError
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Share of an output's range below which no difference between a device and a model is told.
+STRAIGHT = 2e-5
+
+
+@dataclass(frozen=True, eq=False)
+class FittedOutput:
+    """The fit of one output: the used samples of all experiments that measured it, stacked.
+
+    `residuals` (n,) are measured minus predicted, `jacobian` (n, size) d prediction / d theta;
+    `level` weighted them, `straight` is the rms below which they tell nothing, all in the output's
+    unit. `lengths` are the samples of each of the `runs` that have some; `basis` has no columns.
+    """
+
+    column: str
+    index: int
+    level: float
+    straight: float
+    residuals: FloatArray
+    jacobian: FloatArray
+    lengths: tuple[int, ...]
+    runs: tuple[int, ...]
+
+    @property
+    def basis(self) -> FloatArray:
+        """What is projected out beside theta: nothing (n, 0)."""
+        return np.zeros((len(self.residuals), 0))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OdeFit:
+    """The result of a fit; `outputs` are those that were measured, the first one foremost.
+
+    `model` carries the estimates, `theta` are the coordinates of `unknowns` (parameters, then per
+    experiment the initial states), `cost` is the weighted sum of squares with the priors.
+    """
+
+    model: Model
+    unknowns: Unknowns
+    theta: FloatArray
+    outputs: tuple[FittedOutput, ...]
+    cost: float
+    converged: bool
+    interrupted: bool
+    evaluations: int
+    rtol: float
+    zeros: tuple[str, ...] = ()
+    known_start: bool = False
+
+    def __repr__(self) -> str:
+        """Return what was fitted and what it leaves, in one line."""
+        left = ", ".join(f"{o.column} {o.rms:.3g}" for o in self.outputs)
+        return f"<Fit of {', '.join(self.unknowns.names)}: residual rms {left}>"
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Residuals of the first output."""
+        return self.outputs[0].residuals
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Derivatives of the first output by theta."""
+        return self.outputs[0].jacobian
+
+    @property
+    def further(self) -> tuple[FittedOutput, ...]:
+        """The outputs beside the first."""
+        return self.outputs[1:]
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """The noise level that weighted every output."""
+        return tuple(o.level for o in self.outputs)
+
+    def starts(self) -> list[dict[str, float]]:
+        """Deviations of every experiment's initial state from the declared starts."""
+        return [self.unknowns.start(self.theta, r) for r in range(self.unknowns.records)]
+
+    @cached_property
+    def places(self) -> tuple[int, ...]:
+        """The measured outputs' places among the model's."""
+        return tuple(o.index for o in self.outputs)
+
+    def predicted(self, runs: Sequence[Run]) -> list[FloatArray]:
+        """Predict whole experiments (n, ny), held-out samples included. Raises PsaError."""
+        return side_by_side(
+            lambda k: shown_by(
+                self.model, runs[k], self.starts()[k], runs[k].signals.n, self.rtol, self.zeros
+            ),
+            range(len(runs)),
+        )
+
+
+def fit_ode(
+    model: Model,
+    runs: Sequence[Run],
+    free: Sequence[str],
+    *,
+    levels: Sequence[float],
+    starts: Sequence[Mapping[str, float]] | None = None,
+    evaluations: int = 60,
+    tolerance: float = 1e-6,
+    rtol: float = STEP_RTOL,
+    goal: float = np.inf,
+    zeros: tuple[str, ...] = (),
+    known_start: bool = False,
+) -> OdeFit:
+    """Fit the free parameters and every experiment's initial state to the used samples.
+
+    Minimises sum(((measured - predicted)/level)^2) + sum((theta/prior)^2) over all measured outputs
+    by Levenberg and Marquardt's method within the parameters' bounds. `starts` are deviations of
+    the initial states to begin from; with `known_start` they stay at the declared ones. `zeros` are
+    outputs whose zero is unknown in each experiment. Raises SimulationError where the start cannot
+    be simulated.
+    """
+    unknowns = coordinates_of(model, free, runs, zeros, known_start=known_start)
+    theta = np.zeros(unknowns.size)
+    for r, given in enumerate(starts or ()):
+        unknowns.place(theta, r, given, 0.0)
+    problem = _Problem(model, tuple(runs), unknowns, tuple(levels), measured_outputs(runs), rtol)
+    found = minimise(
+        problem.evaluate,
+        theta,
+        unknowns.bounds(),
+        tolerance=tolerance,
+        evaluations=evaluations,
+        goal=goal,
+        radius=FIRST_RADIUS,
+    )
+    if found is None:
+        raise SimulationError(
+            f"The model '{model.name}' cannot be simulated at the start of the fit; start from"
+            " other values, or check the units of inputs and states."
+        )
+    return problem.fit(found, zeros, known_start)
+
+
+def measured_outputs(runs: Sequence[Run]) -> tuple[int, ...]:
+    """Return the outputs that move in what was measured, by their place in the model."""
+    return tuple(int(k) for k in np.flatnonzero(measured_spans(runs) > 0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The objective of one fit."""
+
+    model: Model
+    runs: tuple[Run, ...]
+    unknowns: Unknowns
+    levels: tuple[float, ...]
+    places: tuple[int, ...]
+    rtol: float
+
+    @cached_property
+    def tasks(self) -> list[tuple[int, int]]:
+        """Which output of which run, in the order of the stacked residuals."""
+        return [(j, k) for j in self.places for k, r in enumerate(self.runs) if r.fitted(j).any()]
+
+    def parts(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        """Return residuals (predicted - measured) and Jacobian of every task. Raises PsaError."""
+
+        def one(task: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+            j, k = task
+            run = self.runs[k]
+            used = run.fitted(j)
+            shown, slopes = output_of(self.model, run, self.unknowns, theta, k, j, self.rtol)
+            own = used[: run.stop]
+            return shown[own] - run.outputs[used, j], slopes[own]
+
+        return side_by_side(one, self.tasks)
+
+    def evaluate(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        try:
+            parts = self.parts(theta)
+        except PsaError:
+            return None
+        weight = {j: 1.0 / level for j, level in zip(self.places, self.levels, strict=True)}
+        rows = [r * weight[j] for (j, _), (r, _) in zip(self.tasks, parts, strict=True)]
+        slopes = [d * weight[j] for (j, _), (_, d) in zip(self.tasks, parts, strict=True)]
+        prior = 1.0 / self.unknowns.prior
+        residual = np.concatenate([*rows, theta * prior])
+        jacobian = np.vstack([*slopes, np.diag(prior)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
+        return (residual, jacobian) if finite else None
+
+    def fit(self, found: Minimum, zeros: tuple[str, ...], known_start: bool) -> OdeFit:
+        spans, outputs, first = measured_spans(self.runs), [], 0
+        for j, level in zip(self.places, self.levels, strict=True):
+            runs = tuple(k for i, k in self.tasks if i == j)
+            lengths = tuple(int(self.runs[k].fitted(j).sum()) for k in runs)
+            rows = slice(first, first + sum(lengths))
+            first = rows.stop
+            outputs.append(
+                FittedOutput(
+                    column=self.model.output_names[j],
+                    index=j,
+                    level=level,
+                    straight=STRAIGHT * float(spans[j]),
+                    residuals=-found.residual[rows] * level,
+                    jacobian=found.jacobian[rows] * level,
+                    lengths=lengths,
+                    runs=runs,
+                )
+            )
+        return OdeFit(
+            model=self.model.with_values(self.unknowns.values(found.theta)),
+            unknowns=self.unknowns,
+            theta=found.theta,
+            outputs=tuple(outputs),
+            cost=found.cost,
+            converged=found.converged,
+            interrupted=found.interrupted,
+            evaluations=found.evaluations,
+            rtol=self.rtol,
+            zeros=zeros,
+            known_start=known_start,
+        )
+
+
+def first_levels(runs: Sequence[Run]) -> tuple[float, ...]:
+    """Return levels to begin with: a tenth of every measured output's standard deviation."""
+    places = measured_outputs(runs)
+    every = np.vstack([np.where(r.used[:, None], r.outputs, np.nan) for r in runs])
+    return tuple(0.1 * float(np.nanstd(every[:, j])) for j in places)
+
+
+def refitted(
+    before: OdeFit,
+    runs: Sequence[Run],
+    *,
+    model: Model | None = None,
+    levels: Sequence[float] | None = None,
+    evaluations: int = 60,
+    tolerance: float = 1e-6,
+    goal: float = np.inf,
+) -> OdeFit:
+    """Go on with a fit from where it stopped, or with another model from its values.
+
+    What another model has of the parameters is free, and its effects' fitted parameters too.
+    """
+    other = model or before.model
+    own = [n for n in before.unknowns.names if n in other.values]
+    own += [n for c in other.effects for n in c.fitted if n not in own]
+    return fit_ode(
+        other, runs, own,
+        levels=before.levels if levels is None else levels,
+        starts=before.starts(), evaluations=evaluations, tolerance=tolerance, rtol=before.rtol,
+        goal=goal, zeros=before.zeros, known_start=before.known_start,
+    )  # fmt: skip
+
+
+def relevelled(fit: OdeFit, runs: Sequence[Run], rounds: int = 4) -> OdeFit:
+    """Fit again with every output's residual as its noise level, until that stays the same."""
+    for _ in range(rounds if len(fit.outputs) > 1 else 1):
+        levels = tuple(max(o.rms, o.straight, 1e-300) for o in fit.outputs)
+        change = np.max(np.abs(np.log(np.array(levels) / np.array(fit.levels))))
+        if change < 0.02 or fit.interrupted:
+            break
+        fit = refitted(fit, runs, levels=levels)
+    return fit
+
+
+def refuse_unfit(model: Model) -> None:
+    """Refuse a model without an output, and one with sampled states. Raises InputError."""
+    problems = Problems()
+    if not model.output_names:
+        problems.add(f"The model '{model.name}' has no output; a fit compares with one.")
+    if model.structure.sampled:
+        problems.add(
+            f"The model '{model.name}' has sampled states, whose sensitivities are not computed;"
+            " leave the sampled component out."
+        )
+    problems.raise_if_any()

@@ -1,0 +1,221 @@
+"""A model with some causes, fitted; what its residual still shows; and whether it is worth having.
+
+The score is that of a stack's diagnosis: ln of the Bayes factor over the base, less a price for
+every cause (`psa_casadi.diagnosis.search.hypothesis`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.any_model.fit import FittedOutput, OdeFit
+from psa_casadi.any_model.runs import Run
+from psa_casadi.any_model.trials import Table, trial_directions
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.noise.colour import Colour, noise_rms
+from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
+from psa_casadi.diagnosis.screening.evidence import estimated
+from psa_casadi.diagnosis.screening.probes import Direction
+from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
+from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.errors import PsaError
+
+FloatArray = npt.NDArray[np.float64]
+
+#: As in a stack's diagnosis: effects worth a fit, by their share of the best decrease, how many of
+#: them, and how many starts each gets.
+_WORTH, _LEADING, _MOST, _AS_NEAR, _STARTS = 0.1, 4, 7, 0.4, 2
+
+
+@dataclass(frozen=True, eq=False)
+class OdeHypothesis:
+    """A model with causes, fitted; `predicted` (n, ny) are whole experiments.
+
+    `held` and `train` are the rms errors of every measured output in held-out and in used samples,
+    `final` says that the fit went on to its end.
+    """
+
+    causes: tuple[Component, ...]
+    fit: OdeFit
+    predicted: tuple[FloatArray, ...]
+    held: tuple[float, ...]
+    train: tuple[float, ...]
+    final: bool = False
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the causes."""
+        return frozenset(c.name for c in self.causes)
+
+
+def hypothesis_of(
+    causes: Sequence[Component], fit: OdeFit | None, runs: Sequence[Run], *, final: bool = False
+) -> OdeHypothesis | None:
+    """Return a fit as a hypothesis; None without a fit, or where it cannot predict the records."""
+    if fit is None:
+        return None
+    try:
+        predicted = tuple(fit.predicted(runs))
+    except PsaError:
+        return None
+    held = tuple(rms_of(runs, predicted, o.index, Run.judged) for o in fit.outputs)
+    train = tuple(rms_of(runs, predicted, o.index, Run.fitted) for o in fit.outputs)
+    return OdeHypothesis(tuple(causes), fit, predicted, held, train, final)
+
+
+def errors_at(
+    runs: Sequence[Run],
+    predicted: Sequence[FloatArray],
+    output: int,
+    which: Callable[[Run, int], npt.NDArray[np.bool_]],
+) -> FloatArray:
+    """Return measured minus predicted of an output, at the chosen samples of all experiments."""
+    parts = [
+        (r.outputs[:, output] - y[:, output])[which(r, output)]
+        for r, y in zip(runs, predicted, strict=True)
+    ]
+    return np.concatenate(parts)
+
+
+def rms_of(
+    runs: Sequence[Run],
+    predicted: Sequence[FloatArray],
+    output: int,
+    which: Callable[[Run, int], npt.NDArray[np.bool_]],
+) -> float:
+    """Return the root mean square of `errors_at`, 0 without a sample."""
+    errors = errors_at(runs, predicted, output, which)
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class OdeView:
+    """What the residual of a hypothesis shows: screening of further effects, and its test."""
+
+    of: OdeHypothesis
+    trials: tuple[Direction, ...]
+    screening: Screening
+    test: Omnibus
+
+    @property
+    def shows(self) -> bool:
+        """Whether a further effect is above the screening's threshold and could be told.
+
+        Beside a cause the test must alarm too, as in a stack's diagnosis.
+        """
+        best = max((s.decrease for s in self.screening.scores), default=0.0)
+        seen = best >= self.screening.threshold
+        return seen and (self.test.alarm or not self.of.causes)
+
+    def estimated(self) -> dict[str, float]:
+        """Evidence of every further effect over this hypothesis, without a fit."""
+        return estimated(self.of.fit, self.screening)
+
+    def leading(self) -> list[list[Score]]:
+        """Return the best starts of the effects worth a fit, the best effect first."""
+        best = self.screening.best_by_effect()
+        if not best:
+            return []
+        top = next(iter(best.values())).decrease
+        limit = max(self.screening.threshold, _WORTH * top)
+        near = [s for s in best.values() if s.decrease >= max(limit, _AS_NEAR * top)]
+        count = max(_LEADING, min(len(near), _MOST))
+        names = [n for n, s in best.items() if s.decrease >= limit][:count]
+        return [self.starts_of(n) for n in names]
+
+    def starts_of(self, name: str) -> list[Score]:
+        """Return the best directions of one effect, from which its fits start."""
+        own = [s for s in self.screening.scores if s.direction.effect.name == name]
+        return [s for s in own if s.decrease >= 0.3 * own[0].decrease][:_STARTS]
+
+
+def look(
+    of: OdeHypothesis, runs: Sequence[Run], table: Table, known: Sequence[Direction] = ()
+) -> OdeView:
+    """Screen the effects that a hypothesis does not hold, and test its residual.
+
+    Directions that are `known` from the base are used again.
+    """
+    left = [e.component for e in table.effects if e.name not in of.names]
+    names = {e.name for e in left}
+    kept = [d for d in known if d.effect.name in names]
+    trials = kept if known else trial_directions(of.fit, runs, table, left)
+    screening = screen(of.fit, trials, of.fit.outputs[0].lengths)
+    return OdeView(of, tuple(trials), screening, tested(of, runs, screening.colour))
+
+
+def tested(of: OdeHypothesis, runs: Sequence[Run], colour: Colour) -> Omnibus:
+    """Test the residual of every output along every input; the most telling one counts.
+
+    With Bonferroni's correction for their number.
+    """
+    colours, rows = (colour, *colour.further), []
+    for output, own in zip(of.fit.outputs, colours, strict=True):
+        for along in _along(runs, output):
+            time = np.concatenate([runs[k].time[runs[k].fitted(output.index)] for k in output.runs])
+            found = omnibus(
+                output.residuals, along, time, own, noise_rms(output.residuals, own),
+                knowable=output.straight, even=bool(of.causes),
+            )  # fmt: skip
+            several = len(of.fit.outputs) > 1
+            where = f"Of {output.column}: {_lower(found.where)}" if several else found.where
+            rows.append(replace(found, where=where))
+    p = min(1.0, len(rows) * min(r.p_value for r in rows))
+    worst = min(rows, key=lambda r: (not r.alarm, r.p_value))
+    told = worst.p_value * len(rows)
+    return replace(worst, p_value=min(1.0, told if worst.alarm else p))
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]
+
+
+def _along(runs: Sequence[Run], output: FittedOutput) -> list[FloatArray]:
+    """Return the inputs that move, at an output's fitted samples; time where none does."""
+    parts = [runs[k].inputs[runs[k].fitted(output.index)] for k in output.runs]
+    whole = np.vstack(parts)
+    moving = [whole[:, j] for j in range(whole.shape[1]) if np.ptp(whole[:, j]) > 0]
+    return moving or [np.zeros(len(whole))]
+
+
+def in_character(fit: OdeFit, cause: Component) -> bool:
+    """Whether no parameter of a cause but its gain was pushed to the end of its range."""
+    for p in cause.parameters:
+        if not p.fitted or p.name == cause.gain:
+            continue
+        low, high = p.bounds
+        value = fit.model.values[p.name]
+        margin = 0.0 if p.log else 1e-3 * (high - low)
+        if p.log and (value < 1.01 * low or value > high / 1.01):
+            return False
+        if not p.log and (value <= low + margin or value >= high - margin):
+            return False
+    return True
+
+
+def held_out_confirms(
+    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, *, alarm: bool
+) -> bool:
+    """Whether held-out samples do not speak against what a hypothesis adds to another one.
+
+    The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.worth.confirmed`), the gains in
+    log-likelihood and what is promised summed over the outputs.
+    """
+    gained = promise = 0.0
+    for k, (o, own) in enumerate(zip(of.fit.outputs, (colour, *colour.further), strict=True)):
+        old = errors_at(runs, before.predicted, o.index, Run.judged)
+        new = errors_at(runs, of.predicted, o.index, Run.judged)
+        if not old.size:
+            continue
+        samples = old.size / own.inflation
+        after = max(float(np.hypot(of.held[k], o.straight)), 1e-300)
+        gained += samples * float(np.log(np.hypot(before.held[k], o.straight) / after))
+        promise += 0.5 * samples * float(np.mean((new - old) ** 2)) / after**2
+    if promise == 0.0 and gained == 0.0:
+        return True
+    least = thresholds().held_out
+    if alarm:
+        least = min(least, promise - 2.0 * float(np.sqrt(2.0 * promise)))
+    return bool(gained > least)

@@ -1,0 +1,249 @@
+"""From what a search found in any model to a verdict, by the rules of a stack's diagnosis."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from psa_casadi.any_model.certainty import certainty
+from psa_casadi.any_model.free_functions import Free, free_functions
+from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView
+from psa_casadi.any_model.identify import with_told
+from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
+from psa_casadi.any_model.search import Known, with_cause, without
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.noise.colour import noise_rms
+from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
+from psa_casadi.diagnosis.screening.evidence import credible_set, probabilities, temperature
+from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.records.checks import FEWEST_SAMPLES
+
+_FEW = (
+    "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
+)
+_BEATEN = (
+    "{} would remove {:.0%} of the held-out error above the noise; not named, because a free"
+    " function of {} in {} explains more ({:.0%})."
+)
+_LITTLE = (
+    "{} would remove {:.0%} of the held-out error above the noise; not named, because that is less"
+    " than {:.0%} and much remains."
+)
+_UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
+_SMALL = (
+    "{} is in the extended model and removes {:.0%} of the held-out error above the noise. It is"
+    " not named: structure remains, and so little may only correct the form of what is named."
+)
+
+
+def judged(known: Known) -> OdeDiagnosis:
+    """Return the diagnosis of what a search found."""
+    root, best = known.found[frozenset()], known.best()
+    first, last = known.view(root), known.view(best)
+    floors = [
+        noise_rms(o.residuals, c)
+        for o, c in zip(
+            best.fit.outputs, (last.screening.colour, *last.screening.colour.further), strict=True
+        )
+    ]
+    share = removed(root, root, best, floors)
+    held = sum(int(r.held_out.sum()) for r in known.runs)
+    few = held < FEWEST_SAMPLES
+    free = free_functions(known, first) if first.test.alarm or best.causes else ()
+    beaten = _beaten_by(known, best, share, free) if best.causes else None
+    told = _steps(known, best)
+    verdict = _verdict(first, last, share, told, withdrawn=bool(beaten) or few)
+    named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
+    notes = [_FEW.format(held, FEWEST_SAMPLES)] if few else []
+    names = " and ".join(c.name for c in best.causes)
+    if verdict == "unexplained" and best.causes and not few:
+        notes.append(
+            _BEATEN.format(names, share, beaten.of, beaten.port.words, beaten.share)
+            if beaten
+            else _LITTLE.format(names, share, thresholds().partly)
+        )
+    return _diagnosis(known, verdict, named, floors, told, notes, free)
+
+
+def removed(
+    root: OdeHypothesis, before: OdeHypothesis, after: OdeHypothesis, floors: Sequence[float]
+) -> float:
+    """Return the share of the root's held-out error above the noise that one removes of another's.
+
+    Powers of the outputs are taken over that of their noise and added.
+    """
+    noise = [max(f, 1e-300) for f in floors]
+    base, old, new = (
+        sum((e / n) ** 2 for e, n in zip(_errors(h), noise, strict=True))
+        for h in (root, before, after)
+    )
+    above = base - len(noise)
+    return float((old - new) / above) if above > 0 else 0.0
+
+
+def _errors(h: OdeHypothesis) -> tuple[float, ...]:
+    """Return the held-out rms of every output, that of used samples where none is held out."""
+    return tuple(held or train for held, train in zip(h.held, h.train, strict=True))
+
+
+def _verdict(
+    first: OdeView,
+    last: OdeView,
+    share: float,
+    told: Mapping[str, Mapping[str, float]],
+    *,
+    withdrawn: bool,
+) -> Verdict:
+    causes = last.of.causes
+    if not (first.test.alarm or causes):
+        return "adequate"
+    partly = last.test.alarm
+    if not causes or withdrawn or (partly and share < thresholds().partly):
+        return "unexplained"
+    if any(len(_rivals(told[c.name], c.name)) > 0 for c in causes[:1]):
+        return "ambiguous"
+    return "partly_explained" if partly else "cause_named"
+
+
+def _beaten_by(
+    known: Known, best: OdeHypothesis, share: float, free: Sequence[Free]
+) -> Free | None:
+    """Return the free function that takes the names away: clearly likelier, and removing more."""
+    own = known.evidence(best)
+    for f in free:
+        clearly = thresholds().clearly * temperature(max(own, f.evidence))
+        likelier = f.evidence - thresholds().price > known.score(best) + clearly
+        if likelier and share < f.share - thresholds().form:
+            return f
+    return None
+
+
+def _steps(known: Known, best: OdeHypothesis) -> dict[str, dict[str, float]]:
+    """Return for every cause the probabilities of the effects that may be in its place."""
+    return {c.name: _chances(known, best, c) for c in best.causes}
+
+
+def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, float]:
+    less = known.found.get(best.names - {cause.name}) or without(known, best, cause)
+    if less is None:
+        return {cause.name: 1.0}
+    view, own = known.view(less), known.evidence(less)
+    evidences = dict(view.estimated())
+    fitted = {c for h in known.children(less) for c in h.names - less.names}
+    top = known.evidence(best) - own
+    near = top - thresholds().clearly * temperature(top)
+    for name in [n for n, e in evidences.items() if e > near and n not in fitted]:
+        known.note(with_cause(known, less, view.starts_of(name)))
+    known.finish(
+        [h for h in known.children(less) if not h.final and known.evidence(h) - own > near]
+    )
+    for child in known.children(less):
+        (name,) = child.names - less.names
+        allowed = child.names == best.names or known.worth(child)
+        evidences[name] = known.evidence(child) - own if allowed else -np.inf
+    evidences[cause.name] = top
+    return probabilities({n: e for n, e in evidences.items() if np.isfinite(e)})
+
+
+def _rivals(chances: Mapping[str, float], cause: str) -> tuple[str, ...]:
+    return tuple(n for n in credible_set(chances, thresholds().credible) if n != cause)
+
+
+def _diagnosis(
+    known: Known,
+    verdict: Verdict,
+    named: OdeHypothesis,
+    floors: Sequence[float],
+    told: Mapping[str, Mapping[str, float]],
+    notes: list[str],
+    free: Sequence[Free],
+) -> OdeDiagnosis:
+    root = known.found[frozenset()]
+    sure = certainty(named.fit)
+    partly = known.view(named).test.alarm
+    shares = {c.name: _own_share(known, named, c, floors) for c in named.causes}
+    largest = max(shares.values(), default=0.0)
+    small = [n for n, s in shares.items() if partly and s < min(thresholds().form, largest)]
+    causes = tuple(
+        PortCause(
+            effect=c.name,
+            port=known.table.attached(c).port.words,
+            belongs_to=c.belongs_to,
+            description=c.description,
+            confidence=float(min(0.99, told[c.name].get(c.name, 1.0))),
+            parameters={
+                p.name: Estimate(
+                    named.fit.model.values[p.name], p.unit,
+                    (sure.intervals[p.name].low, sure.intervals[p.name].high),
+                )
+                for p in c.parameters
+                if p.name in sure.intervals
+            },
+            cannot_be_told_from=_rivals(told[c.name], c.name),
+            explained_share=float(np.clip(shares[c.name], 0.0, 1.0)),
+        )
+        for c in named.causes
+        if c.name not in small
+    )  # fmt: skip
+    unnamed = free if verdict == "unexplained" else ()
+    best_free = max(unnamed, key=lambda f: f.share, default=None)
+    return OdeDiagnosis(
+        verdict=verdict,
+        causes=causes,
+        candidates=_candidates(known, floors, told, named),
+        errors=tuple(
+            OutputError(
+                o.column, known.base.model.structure.outputs[o.index].unit, floor,
+                _errors(root)[k], _errors(named)[k],
+            )
+            for k, (o, floor) in enumerate(zip(named.fit.outputs, floors, strict=True))
+        ),
+        remaining=_remaining(known.view(named)),
+        notes=(*notes, *(_SMALL.format(n, max(shares[n], 0.0)) for n in small)),
+        model=with_told(named.fit.model, known.runs, sure),
+        base_fit=root.fit,
+        extended_fit=named.fit,
+        runs=known.runs,
+        base=root.predicted,
+        extended=named.predicted,
+        unnamed=_UNNAMED.format(best_free.of, best_free.port.words, best_free.share)
+        if best_free is not None and best_free.share > thresholds().partly
+        else "",
+    )  # fmt: skip
+
+
+def _own_share(known: Known, h: OdeHypothesis, cause: Component, floors: Sequence[float]) -> float:
+    less = known.found.get(h.names - {cause.name})
+    return 0.0 if less is None else removed(known.found[frozenset()], less, h, floors)
+
+
+def _candidates(
+    known: Known,
+    floors: Sequence[float],
+    told: Mapping[str, Mapping[str, float]],
+    named: OdeHypothesis,
+) -> tuple[Candidate, ...]:
+    """Return every effect alone beside the base; its evidence is estimated where not fitted."""
+    root = known.found[frozenset()]
+    rows = []
+    first = next(iter(told.values()), {}) if named.causes else {}
+    for name, evidence in known.view(root).estimated().items():
+        own = known.found.get(frozenset({name}))
+        rows.append(
+            Candidate(
+                effect=name,
+                explained_share=0.0
+                if own is None
+                else float(np.clip(removed(root, root, own, floors), 0.0, 1.0)),
+                evidence=evidence if own is None else known.evidence(own),
+                fitted=own is not None,
+                probability=first.get(name, 0.0),
+            )
+        )
+    return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
+
+
+def _remaining(view: OdeView) -> Remaining:
+    where = "What remains cannot be distinguished from noise."
+    if view.test.alarm:
+        where = f"{view.test.where} {100 * view.test.excess:.0f} % of its power is above the noise."
+    return Remaining(not view.test.alarm, view.test.p_value, where)

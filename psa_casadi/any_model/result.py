@@ -1,0 +1,138 @@
+"""What a diagnosis of any model says, as frozen records."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.any_model.fit import OdeFit
+from psa_casadi.any_model.runs import Run
+from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
+from psa_casadi.model.compose import Model
+from psa_casadi.shown import frame
+
+FloatArray = npt.NDArray[np.float64]
+FORMAT = "psa_casadi.own_model_diagnosis/1"
+
+_SAID: dict[Verdict, str] = {
+    "adequate": "what the model leaves cannot be distinguished from noise",
+    "cause_named": "a cause is named, and nothing else is left",
+    "partly_explained": "a cause is named, and more is left",
+    "ambiguous": "a cause is found that these records cannot tell from others",
+    "unexplained": "something is missing that no effect of the table explains",
+}
+
+
+@dataclass(frozen=True)
+class PortCause:
+    """A named cause: the effect, the port where it sits, how sure, how large, what else it may be.
+
+    `explained_share` is what it removes of the held-out error above the noise, beside the others.
+    """
+
+    effect: str
+    port: str
+    belongs_to: str
+    description: str
+    confidence: float
+    parameters: Mapping[str, Estimate]
+    cannot_be_told_from: tuple[str, ...]
+    explained_share: float
+
+
+@dataclass(frozen=True)
+class OutputError:
+    """The errors of one output in its unit: noise, and rms in held-out samples.
+
+    Of the base and of the extended model; of the used samples where none is held out.
+    """
+
+    output: str
+    unit: str
+    noise: float
+    base: float
+    extended: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OdeDiagnosis:
+    """A diagnosis of any model: verdict, causes, the extended model, errors, and what remains.
+
+    The words of the verdict are those of a stack's diagnosis. `base` and `extended` (n, ny) are the
+    predictions of every experiment in full, in the order of `runs`. `candidates` are all effects
+    tried. `unnamed` says where a free function would remove most of what is left, "" if nothing is.
+    """
+
+    verdict: Verdict
+    causes: tuple[PortCause, ...]
+    candidates: tuple[Candidate, ...]
+    errors: tuple[OutputError, ...]
+    remaining: Remaining
+    notes: tuple[str, ...]
+    model: Model
+    base_fit: OdeFit
+    extended_fit: OdeFit
+    runs: tuple[Run, ...]
+    base: tuple[FloatArray, ...]
+    extended: tuple[FloatArray, ...]
+    unnamed: str = ""
+
+    def __repr__(self) -> str:
+        """Return the verdict, the causes with their sizes, the errors and what remains."""
+        lines = [f"{self.verdict}: {_SAID[self.verdict]}"]
+        for c in self.causes:
+            lines.append(
+                f"  {c.effect} ({c.confidence:.0%} sure), {c.description}; it removes"
+                f" {c.explained_share:.0%} of the held-out error above the noise"
+            )
+            lines += [
+                f"    {n} = {e.value:.4g} ({e.interval[0]:.4g} to {e.interval[1]:.4g}) {e.unit}"
+                for n, e in c.parameters.items()
+            ]
+            if c.cannot_be_told_from:
+                lines.append(f"    may as well be {', '.join(c.cannot_be_told_from)}")
+        for o in self.errors:
+            lines.append(
+                f"  {o.output}: held-out rms {o.base:.3g} {o.unit} of the base,"
+                f" {o.extended:.3g} {o.unit} of the extended model, noise {o.noise:.3g} {o.unit}"
+            )
+        lines += [
+            f"  {self.remaining.where}",
+            *(f"  {n}" for n in (*self.notes, self.unnamed) if n),
+        ]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the diagnosis as plain lists and mappings."""
+        return {
+            "format": FORMAT,
+            "verdict": self.verdict,
+            "causes": [asdict(c) for c in self.causes],
+            "candidates": [asdict(c) for c in self.candidates],
+            "errors": [asdict(e) for e in self.errors],
+            "remaining": asdict(self.remaining),
+            "unnamed": self.unnamed,
+            "notes": list(self.notes),
+            "values": dict(self.model.values),
+            "records": [{"name": r.name, "sha256": r.signals.sha256} for r in self.runs],
+        }
+
+    def to_json(self) -> str:
+        """Return `to_dict` as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def to_frame(self) -> Any:
+        """Return the samples as a pandas DataFrame: measured, base and extended by output."""
+        columns: dict[str, Any] = {
+            "record": np.repeat([r.name for r in self.runs], [len(r.time) for r in self.runs]),
+            "time": np.concatenate([r.signals.time for r in self.runs]),
+            "held_out": np.concatenate([r.held_out for r in self.runs]),
+        }
+        for k, name in enumerate(self.model.output_names):
+            columns[name] = np.concatenate([r.outputs[:, k] for r in self.runs])
+            columns[f"{name}_base"] = np.concatenate([y[:, k] for y in self.base])
+            columns[f"{name}_extended"] = np.concatenate([y[:, k] for y in self.extended])
+        return frame(columns)

@@ -1,0 +1,128 @@
+"""Trial directions of a model's effects: what each would add to every output."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.any_model.effects.attached import Attached, extended
+from psa_casadi.any_model.fit import OdeFit
+from psa_casadi.any_model.predict import traced
+from psa_casadi.any_model.runs import Run
+from psa_casadi.any_model.start import start_of
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.screening.probes import Direction
+from psa_casadi.errors import MachineError, PsaError
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.stepper import make_ready
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Table:
+    """The effects of a search, and the base model that they are attached to."""
+
+    base: Model
+    effects: tuple[Attached, ...]
+
+    def attached(self, component: Component) -> Attached:
+        """Return an effect with its ports."""
+        return next(e for e in self.effects if e.name == component.name)
+
+    def with_effects(self, fit: OdeFit, effects: Sequence[Component]) -> Model:
+        """Return the base with effects, with the values that a fit has of them."""
+        model = extended(self.base, [self.attached(e) for e in effects])
+        known = {n: v for n, v in fit.model.values.items() if n in model.values}
+        return model.with_values(known)
+
+
+def trial_directions(
+    fit: OdeFit, runs: Sequence[Run], table: Table, effects: Sequence[Component]
+) -> list[Direction]:
+    """Return the directions of effects over their trial values, beside those that a fit has."""
+    there = fit.model.effects
+    models = {e.name: table.with_effects(fit, [*there, e]) for e in effects}
+    side_by_side(_compiled, list(models.values()))
+    tasks = [(e, values) for e in effects for values in _values(e)]
+
+    def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
+        effect, values = task
+        return list(_at(fit, runs, effect, models[effect.name].with_values(values), values))
+
+    return [d for found in side_by_side(one, tasks) for d in found]
+
+
+def _compiled(model: Model) -> None:
+    try:
+        make_ready(model)
+    except (PsaError, MachineError):
+        return
+
+
+def _values(effect: Component) -> Iterator[dict[str, float]]:
+    grids = [g for g in effect.probe.values() if not isinstance(g, str)]
+    for point in product(*grids):
+        yield dict(zip(effect.probe, point, strict=True))
+
+
+def _at(
+    fit: OdeFit, runs: Sequence[Run], effect: Component, model: Model, values: dict[str, float]
+) -> Iterator[Direction]:
+    gain = effect.gain or ""
+    parameter = model.parameter(gain)
+    scale, one_sided = parameter.typical(model.values), parameter.bounds[0] >= 0
+    memory = tuple(fit.starts())
+    for step in [s * scale for s in effect.finite_step] or [0.0]:
+        try:
+            columns = _moved(fit, runs, model, gain, step, scale)
+        except PsaError:
+            continue
+        every = np.concatenate(columns)
+        if np.all(np.isfinite(every)) and np.any(every):
+            yield Direction(
+                effect, values, memory, step or scale, columns[0], one_sided, bool(step),
+                tuple(columns[1:]),
+            )  # fmt: skip
+
+
+def _moved(
+    fit: OdeFit, runs: Sequence[Run], model: Model, gain: str, step: float, scale: float
+) -> list[FloatArray]:
+    """Return what a gain changes in the fitted samples of every output: its derivative or a step.
+
+    At the initial states of the fit.
+    """
+    starts, found = fit.starts(), []
+    current = model.with_values({gain: step}) if step else model
+    column = model.parameter_names.index(gain)
+    for o in fit.outputs:
+        parts = []
+        for k in o.runs:
+            run = runs[k]
+            begun = start_of(current, run.inputs[0], starts[k])
+            wanted: list[str | int] = [] if step else [gain]
+            s0 = begun.by_parameter[:, [column]][:, : len(wanted)]
+            shown, slopes = traced(current, run, begun.x, wanted, s0, o.column, fit.rtol)
+            moved = shown if step else slopes[:, 0] * scale
+            parts.append(moved[run.fitted(o.index)[: run.stop]])
+        whole = np.concatenate(parts)
+        if step:
+            whole = whole - _shown(fit, o.index, runs)
+        found.append(whole)
+    return found
+
+
+def _shown(fit: OdeFit, index: int, runs: Sequence[Run]) -> FloatArray:
+    """Return the fit's own predictions of an output's used samples, without unknown zeros."""
+    output = next(o for o in fit.outputs if o.index == index)
+    zero = f"zero of {output.column}"
+    starts = fit.starts()
+    measured = [
+        runs[k].outputs[runs[k].fitted(index), index] - starts[k].get(zero, 0.0)
+        for k in output.runs
+    ]
+    return np.concatenate(measured) - output.residuals

@@ -1,0 +1,166 @@
+"""The samples of one experiment on any model: a time and columns by name."""
+
+import csv
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import InputError, Problems
+
+FloatArray = npt.NDArray[np.float64]
+#: What stands for the samples of one experiment: `Signals`, a table with a column `time`, a CSV.
+OneSignals = "Signals | Mapping[str, Any] | str | os.PathLike[str] | Any"
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Signals:
+    """Samples of one experiment in the units of a model; the arrays have shape (n,).
+
+        Signals(name="sweep", time=t, columns={"voltage": u, "speed": w})
+
+    `time` [s] increases strictly and need not be uniform. `columns` are inputs and outputs by the
+    names that the model gives them; nan marks a missing sample of an output. Between samples the
+    inputs are linear (`hold="linear"`) or constant (`hold="zero"`). `sha256` is that of the arrays.
+
+    Raises:
+        InputError: fewer than eight samples; a time that stands still or goes back; a column of
+            another length, or one that holds infinite numbers.
+    """
+
+    name: str
+    time: FloatArray
+    columns: Mapping[str, FloatArray]
+    hold: Literal["linear", "zero"] = "linear"
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        time = _frozen(self.time)
+        columns = {str(n): _frozen(v) for n, v in self.columns.items()}
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "columns", columns)
+        self._check()
+        if not self.sha256:
+            digest = hashlib.sha256(time.tobytes())
+            for name, values in sorted(columns.items()):
+                digest.update(name.encode() + values.tobytes())
+            object.__setattr__(self, "sha256", digest.hexdigest())
+
+    def _check(self) -> None:
+        problems, where = Problems(), f"signals '{self.name}'"
+        if self.time.ndim != 1 or self.time.size < 8 or not np.isfinite(self.time).all():
+            problems.add(
+                f"{where}: the time has shape {self.time.shape}; give eight or more times."
+            )
+        elif not np.all(np.diff(self.time) > 0):
+            problems.add(f"{where}: the time does not strictly increase; sort it.")
+        if self.hold not in ("linear", "zero"):
+            problems.add(f"{where}: the hold '{self.hold}' does not exist; use 'linear' or 'zero'.")
+        for name, values in self.columns.items():
+            if values.shape != self.time.shape:
+                problems.add(
+                    f"{where}: '{name}' has shape {values.shape}, but time has {self.time.size}"
+                    " samples; give one value for each instant."
+                )
+            elif np.isinf(values).any():
+                problems.add(f"{where}: '{name}' holds infinite numbers; mark missing ones as nan.")
+        problems.raise_if_any()
+
+    def __repr__(self) -> str:
+        """Return name, size and columns in one line."""
+        names = ", ".join(self.columns)
+        return f"<Signals '{self.name}': {self.n} samples in {self.duration:.4g} s of {names}>"
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.time.size
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+
+def signals_given(given: Any) -> list[Signals]:
+    """Return the experiments that a user gave: one or several of `Signals`, tables, CSV files.
+
+    A table (a mapping of arrays, a data frame) has a column `time`, and so has a CSV file with its
+    names in the first line; all in the units of the model. Raises InputError.
+    """
+    if _is_one(given):
+        given = [given]
+    if not isinstance(given, Iterable):
+        raise InputError(
+            f"A {type(given).__name__} is no record; give Signals, a mapping with 'time', a data"
+            " frame, the path of a CSV file, or several of these."
+        )
+    found = [_one(g, k + 1) for k, g in enumerate(given)]
+    if not found:
+        raise InputError("There are no records; give one or more.")
+    return found
+
+
+def _is_one(given: Any) -> bool:
+    table = hasattr(given, "columns") and hasattr(given, "__getitem__")
+    return table or isinstance(given, Signals | Mapping | str | os.PathLike)
+
+
+def _one(given: Any, number: int) -> Signals:
+    if isinstance(given, Signals):
+        return given
+    if isinstance(given, str | os.PathLike):
+        return _read(Path(given))
+    if not _is_one(given):
+        raise InputError(
+            f"Record {number} is a {type(given).__name__}; give Signals, a mapping with 'time', a"
+            " data frame or the path of a CSV file."
+        )
+    names = list(given) if isinstance(given, Mapping) else [str(n) for n in given.columns]
+    return _of_table({n: given[n] for n in names}, f"record_{number}")
+
+
+def _of_table(table: Mapping[str, Any], name: str) -> Signals:
+    if "time" not in table:
+        raise InputError(
+            f"{name} has the columns {sorted(table)} and none named 'time'; name the times [s] so."
+        )
+    return Signals(
+        name=name, time=table["time"], columns={n: v for n, v in table.items() if n != "time"}
+    )
+
+
+def _read(path: Path) -> Signals:
+    """Read a CSV file with names in its first line; an empty field is a missing sample."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}); give a CSV file.") from error
+    if len(rows) < 2:
+        raise InputError(f"{path} holds no samples; give names in the first line, then numbers.")
+    names = [n.strip() for n in rows[0]]
+    problems = Problems()
+    values = np.full((len(rows) - 1, len(names)), np.nan)
+    for k, row in enumerate(rows[1:]):
+        if len(row) != len(names):
+            problems.add(f"{path}: row {k + 2} has {len(row)} fields for {len(names)} names.")
+            continue
+        for j, field in enumerate(row):
+            try:
+                values[k, j] = float(field) if field.strip() else np.nan
+            except ValueError:
+                problems.add(f"{path}: row {k + 2}: '{field}' is no number; write it as 1.5e-3.")
+    problems.raise_if_any()
+    return _of_table(dict(zip(names, values.T, strict=True)), path.stem)
+
+
+def _frozen(values: npt.ArrayLike) -> FloatArray:
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
