@@ -69,7 +69,8 @@ def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
 @slow
 def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
     make_record(None, 3, tmp_path / "record.csv")
-    found = psa.identify(tmp_path / "record.csv", hysteresis="best")
+    record = psa.read_record(tmp_path / "record.csv").slice(0, 3000)
+    found = psa.identify(record, hysteresis="best")
     assert "bouc_wen" in [c.name for c in found.model.components]
     assert any(s.startswith("hysteresis: Bouc-Wen") for s in found.sentences)
 
