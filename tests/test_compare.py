@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,11 +29,11 @@ from tests.tiers import slow
 HOSTILE = "<img src=x onerror=alert(1)>&<b>bold</b>"
 
 
-def finding(name: str, k_l: float, **more: object) -> Finding:
+def finding(name: str, k_l: float, **more: Any) -> Finding:
     own = {"k_L": Found(k_l, "N/V", (0.99 * k_l, 1.01 * k_l), meaning="linear force per volt")}
     return Finding(
         name, "identification", own, (("r", name),), rms_m=2e-9, rms_percent=0.02, **more
-    )  # type: ignore[arg-type]
+    )
 
 
 @pytest.fixture(scope="module")
