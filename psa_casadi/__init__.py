@@ -41,6 +41,9 @@ if TYPE_CHECKING:
         OnlineIdentification,
         identifier_for,
     )
+    from psa_casadi.devices.batch import BatchRun, batch
+    from psa_casadi.devices.jobs import Job
+    from psa_casadi.devices.task import Options
     from psa_casadi.diagnosis.result import Diagnosis
     from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
@@ -68,8 +71,11 @@ if TYPE_CHECKING:
         write_record,
     )
     from psa_casadi.records.signals import Signals
+    from psa_casadi.report.documents.findings import read_findings
+    from psa_casadi.report.page.comparison_page import write_comparison
     from psa_casadi.report.page.diagnosis import write_report
     from psa_casadi.report.page.fit_page import write_fit_report
+    from psa_casadi.report.page.population_page import write_population
     from psa_casadi.report.plots.figure import save_figure
     from psa_casadi.report.words.text import story
     from psa_casadi.simulation.history import memory_after, settled_at
@@ -171,6 +177,12 @@ _HOMES = {
     "psa_casadi.report.words.text": ("story",),
     "psa_casadi.report.plots.figure": ("save_figure",),
     "psa_casadi.report.page.diagnosis": ("write_report",),
+    "psa_casadi.devices.batch": ("BatchRun", "batch"),
+    "psa_casadi.devices.jobs": ("Job",),
+    "psa_casadi.devices.task": ("Options",),
+    "psa_casadi.report.documents.findings": ("read_findings",),
+    "psa_casadi.report.page.comparison_page": ("write_comparison",),
+    "psa_casadi.report.page.population_page": ("write_population",),
     "psa_casadi.report.page.fit_page": ("write_fit_report",),
     "psa_casadi.export.fixed_step.export": ("CodeExport", "export_c"),
     "psa_casadi.export.fmu.archive": ("export_fmu",),
@@ -243,6 +255,13 @@ __all__ = [
     "save_figure",
     "write_report",
     "write_fit_report",
+    "batch",
+    "BatchRun",
+    "Job",
+    "Options",
+    "read_findings",
+    "write_comparison",
+    "write_population",
     "HysteresisObserver",
     "FeedForward",
     "stack_values",
@@ -291,6 +310,7 @@ _FIRST = (
     "simulate_record",
     "identify",
     "diagnose",
+    "batch",
     "story",
     "export_fmu",
     "export_modelica",

@@ -1,5 +1,7 @@
 """The statistics of a population against published figures, plain formulas and simulation."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -147,13 +149,13 @@ def test_errors_that_are_none_are_refused(errors: tuple[float, ...]) -> None:
         mixed_regression([1.0], [1.0])
 
 
-def finding(name: str, k_l: float, half: float, **more: object) -> Finding:
+def finding(name: str, k_l: float, half: float, **more: Any) -> Finding:
     """Return a device with one parameter that is told and one that is not."""
     own = {
         "k_L": Found(k_l, "N/V", (k_l * np.exp(-half), k_l * np.exp(half))),
         "tau": Found(1e-3, "s", (1e-9, 1.0), told=False),
     }
-    return Finding(name, "identification", own, **more)  # type: ignore[arg-type]
+    return Finding(name, "identification", own, **more)
 
 
 def test_a_population_tells_outliers_and_causes() -> None:

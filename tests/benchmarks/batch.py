@@ -125,9 +125,9 @@ def _roc(devices: Sequence[Device], found: Population) -> TitledTable:
         )
     false = sum(n in told for n in sound)
     note = (
-        f"False alarms: {share(false, len(sound))} of the sound devices. Told: p below 0.05, adjusted"
-        " by Benjamini and Hochberg over all devices and parameters. The area under the ROC curve is"
-        " of the smallest p of a device (interval: Hanley and McNeil 1982)."
+        f"False alarms: {share(false, len(sound))} of the sound devices. Told: p below"
+        " 0.05, adjusted by Benjamini and Hochberg over all devices and parameters. The area under"
+        " the ROC curve is of the smallest p of a device (interval: Hanley and McNeil 1982)."
     )
     head = ("defect", "told", "area under the ROC curve")
     return TitledTable(f"Defects among {len(devices)} devices", Table(head, tuple(rows)), note)

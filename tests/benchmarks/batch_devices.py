@@ -37,7 +37,7 @@ def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> tup
     """Write a record for each device, and a table of jobs; the same seed gives the same bytes."""
     rng = np.random.default_rng(seed)
     usual = draw_stack(np.random.default_rng(7))
-    times = STEP * np.arange(SAMPLES)
+    times: FloatArray = STEP * np.arange(SAMPLES, dtype=np.float64)
     bad = set(rng.choice(count, defects, replace=False).tolist())
     kinds = list(DEFECTS)
     found, rows = [], ["device,batch,date,files"]

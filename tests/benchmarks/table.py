@@ -42,7 +42,7 @@ BENCHES: dict[str, Bench] = {
         _later(
             "batch",
             "batch",
-            "many devices with hidden defects: what the population tells, cost, resumed runs (--size)",
+            "many devices with hidden defects: which are told, cost, a run again (--size)",
             sized=True,
         ),
         _later(
