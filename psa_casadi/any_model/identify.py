@@ -177,6 +177,8 @@ def search_starts(
     if found[-1].interrupted or found[0].interrupted:
         return replace(found[0], interrupted=True, converged=False), tuple(costs)
     ended = [refitted(f, runs, evaluations=100) for f in found[:_FOLLOWED]]
+    for quick, end in zip(found, ended, strict=False):
+        costs[costs.index(quick.cost)] = end.cost
     best = min(ended, key=lambda f: f.cost)
     return relevelled(best, runs), tuple(costs)
 

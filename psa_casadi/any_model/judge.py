@@ -17,6 +17,9 @@ from psa_casadi.diagnosis.screening.evidence import credible_set, probabilities,
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.records.checks import FEWEST_SAMPLES
 
+#: Where structure remains, causes are named that remove this share of the held-out error above the
+#: noise: what changes with time, or has another memory, is no free function that could beat them.
+_ENOUGH = 0.8
 _FEW = (
     "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
 )
@@ -59,7 +62,7 @@ def judged(known: Known) -> OdeDiagnosis:
         notes.append(
             _BEATEN.format(names, share, beaten.of, beaten.port.words, beaten.share)
             if beaten
-            else _LITTLE.format(names, share, thresholds().partly)
+            else _LITTLE.format(names, share, _ENOUGH)
         )
     return _diagnosis(known, verdict, named, floors, told, notes, free)
 
@@ -97,7 +100,7 @@ def _verdict(
     if not (first.test.alarm or causes):
         return "adequate"
     partly = last.test.alarm
-    if not causes or withdrawn or (partly and share < thresholds().partly):
+    if not causes or withdrawn or (partly and share < _ENOUGH):
         return "unexplained"
     if any(len(_rivals(told[c.name], c.name)) > 0 for c in causes[:1]):
         return "ambiguous"

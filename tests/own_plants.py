@@ -1,0 +1,114 @@
+"""Plants that are no stacks, in plain NumPy and SciPy, in which tests hide a cause.
+
+None shares code or form with the effects of the package: friction is a hyperbolic tangent, the
+hysteresis has the published benchmark's form and units, an overflow is a branch.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.integrate import solve_ivp
+
+from psa_casadi.records.signals import Signals
+
+FloatArray = npt.NDArray[np.float64]
+Rates = Callable[[float, Any], list[float]]
+
+
+def _solved(rates: Rates, t: FloatArray, start: list[float], most: float) -> FloatArray:
+    """Return the states (nx, n) at the times."""
+    found = solve_ivp(
+        rates, (0.0, t[-1]), start, t_eval=t, rtol=1e-8, atol=1e-10, max_step=most, method="LSODA"
+    )
+    assert found.success
+    return np.asarray(found.y)
+
+
+def multisine(t: FloatArray, frequencies: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return a sum of cosines of random phases (n,), of standard deviation 1."""
+    phases = rng.uniform(0.0, 2.0 * np.pi, len(frequencies))
+    total = np.cos(2.0 * np.pi * np.outer(t, frequencies) + phases).sum(axis=1)
+    return np.asarray(total / total.std())
+
+
+def bouc_wen(seed: int, noise: float = 8e-6) -> Signals:
+    """The Bouc-Wen benchmark (Noel and Schoukens 2016): 2 kg, 5e4 N/m, and its hysteretic force.
+
+    z' = alpha v - beta (gamma |v| z + delta v |z|); force [N], position [m], 750 Hz.
+    """
+    rng, t = np.random.default_rng(seed), np.arange(3000, dtype=np.float64) / 750.0
+    u = (
+        50.0
+        * multisine(t, np.arange(5.0, 150.0, 0.5, dtype=np.float64), rng)
+        * np.minimum(1.0, t / 0.2)
+    )
+
+    def rates(s: float, q: Any) -> list[float]:
+        y, v, z = q
+        force = np.interp(s, t, u)
+        loop = 5e4 * v - 1e3 * (0.8 * abs(v) * z - 1.1 * v * abs(z))
+        return [v, (force - 5e4 * y - 10.0 * v - z) / 2.0, loop]
+
+    y = _solved(rates, t, [0.0, 0.0, 0.0], 1.0 / 750.0)[0]
+    measured = y + noise * rng.standard_normal(len(t))
+    return Signals(name="multisine", time=t, columns={"force": u, "position": measured})
+
+
+def motor(seed: int, friction: float = 0.012) -> Signals:
+    """A DC motor with dry friction [N.m] at its shaft: voltage, speed [rad/s] and current [A]."""
+    rng, t = np.random.default_rng(seed), np.arange(3000, dtype=np.float64) * 1e-3
+    tones = ((6.0, 1.1, 0.0), (4.0, 3.7, 1.0), (2.0, 0.4, 0.0))
+    u = sum(a * np.sin(2.0 * np.pi * f * t + p) for a, f, p in tones)
+
+    def rates(s: float, q: Any) -> list[float]:
+        i, w = q
+        torque = 0.05 * i - 2e-5 * w - friction * np.tanh(w / 0.2)
+        return [(np.interp(s, t, u) - 1.2 * i - 0.05 * w) / 2e-3, torque / 3e-5]
+
+    i, w = _solved(rates, t, [0.0, 0.0], 1e-3)
+    columns = {
+        "voltage": u,
+        "w": w + 0.3 * rng.standard_normal(len(t)),
+        "i": i + 0.005 * rng.standard_normal(len(t)),
+    }
+    return Signals(name="drive", time=t, columns=columns)
+
+
+def tanks(seed: int, hidden: str) -> Signals:
+    """Two tanks in cascade: `hidden` is an "overflow" of the upper one, or a bent "sensor"."""
+    rng, t = np.random.default_rng(seed), np.arange(2000, dtype=np.float64)
+    u = np.clip(3.0 + 1.2 * multisine(t, np.linspace(5e-4, 0.01, 14), rng), 0.3, None)
+
+    def rates(s: float, q: Any) -> list[float]:
+        upper, lower = np.maximum(q, 0.0)
+        through, inflow = 0.03 * np.sqrt(upper), 0.0065 * np.interp(s, t, u)
+        full = hidden == "overflow" and upper > 0.62 and inflow > through
+        return [0.0 if full else inflow - through, through - 0.028 * np.sqrt(lower)]
+
+    level = _solved(rates, t, [0.3, 0.4], 0.5)[1]
+    shown = level + 0.12 * level**2 if hidden == "sensor" else level
+    shown = shown + 0.002 * rng.standard_normal(len(t))
+    return Signals(name=hidden, time=t, columns={"pump": u, "level": shown})
+
+
+def pair(seed: int, hidden: str = "") -> Signals:
+    """Two coupled oscillators, two forces, two positions; a stiffness that breathes is `hidden`."""
+    rng, t = np.random.default_rng(seed), np.arange(3000, dtype=np.float64) * 0.02
+    tones = np.linspace(0.2, 4.0, 15)
+    f1, f2 = (11.0 * multisine(t, tones, rng) for _ in range(2))
+    swing = 25.0 if hidden == "breathing" else 0.0
+
+    def rates(s: float, q: Any) -> list[float]:
+        x, v, z, w = q
+        own = 100.0 + swing * np.sin(2.0 * np.pi * 0.13 * s)
+        return [
+            v, np.interp(s, t, f1) - own * x - 25.0 * (x - z) - 0.8 * v,
+            w, np.interp(s, t, f2) - 100.0 * z - 25.0 * (z - x) - 0.8 * w,
+        ]  # fmt: skip
+
+    q = _solved(rates, t, [0.0] * 4, 0.02)
+    e = 0.004 * rng.standard_normal((2, len(t)))
+    columns = {"f1": f1, "f2": f2, "y1": q[0] + e[0], "y2": q[2] + e[1]}
+    return Signals(name="pair", time=t, columns=columns)
