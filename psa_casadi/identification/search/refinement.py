@@ -17,6 +17,7 @@ from psa_casadi.identification.search.refitting import (
     equal,
     quick_from,
     refit_or_keep,
+    settled,
 )
 from psa_casadi.records.split import Experiment
 
@@ -99,7 +100,7 @@ def _from(
     if quick is None or quick.interrupted or quick.cost > _HOPEFUL * best.cost:
         return None
     try:
-        return fit(
+        ended = fit(
             quick.model,
             experiments,
             free,
@@ -107,6 +108,7 @@ def _from(
             start_states=quick.starts(),
             evaluations=_LAST,
         )
+        return settled(ended, experiments)
     except PsaError:
         return None
 
