@@ -10,12 +10,8 @@
 
 #include "exact_tables.h"
 
-/* What runs once for a run or a level: compiled once, and by gcc in half the time (a sixth of a model's), with
-   the same bits; not `cold`, which slows its callers */
-#if defined(__GNUC__) && !defined(__clang__)
-#define APART __attribute__((noinline, optimize("Og", "fp-contract=off", "no-math-errno")))
-#elif defined(__GNUC__)
-#define APART __attribute__((noinline))
+#if defined(__GNUC__)
+#define APART __attribute__((noinline)) /* runs once: compiled once; not `cold`, which slows its callers */
 #else
 #define APART
 #endif
