@@ -7,6 +7,7 @@ import base64
 import json
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from tests.browser import Browser
+
+#: Starts a program with two descriptors as its third and fourth, where the browser looks for them.
+_AS_3_AND_4 = (
+    "import fcntl, os, sys; a, b = (fcntl.fcntl(int(n), fcntl.F_DUPFD, 20) for n in sys.argv[1:3]);"
+    " os.dup2(a, 3); os.dup2(b, 4); os.execv(sys.argv[3], sys.argv[3:])"
+)
 
 
 class Steered:
@@ -94,7 +101,7 @@ def steered(browser: Browser) -> Iterator[Steered]:
     ours_in, theirs_out = os.pipe()
     theirs_in, ours_out = os.pipe()
     command = [
-        "sh", "-c", f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}', "sh", browser.path,
+        sys.executable, "-c", _AS_3_AND_4, str(theirs_in), str(theirs_out), browser.path,
         "--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe",
         "--no-first-run", f"--user-data-dir={browser.folder / 'steered'}",
     ]  # fmt: skip

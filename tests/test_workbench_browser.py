@@ -88,7 +88,7 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
             for e in tab.heard
             if e.get("method") == "Network.requestWillBeSent"
         ]
-        own = address.split("?")[0]
+        own = address.split("?", maxsplit=1)[0]
         assert asked
         assert [u for u in asked if not u.startswith((own, "data:", "blob:"))] == []
         words = [e["params"] for e in tab.heard if e.get("method") == "Log.entryAdded"]
