@@ -7,13 +7,24 @@ import base64
 import json
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from tests.browser import Browser
+
+#: Starts a program with two descriptors as its third and fourth, where the browser looks for them.
+_AS_3_AND_4 = (
+    "import fcntl, os, sys; a, b = (fcntl.fcntl(int(n), fcntl.F_DUPFD, 20) for n in sys.argv[1:3]);"
+    " os.dup2(a, 3); os.dup2(b, 4); os.execv(sys.argv[3], sys.argv[3:])"
+)
+
+
+class RefusedError(Exception):
+    """The browser does not do what it is asked for, as where a page has just gone."""
 
 
 class Steered:
@@ -36,7 +47,8 @@ class Steered:
         while True:
             told = self._next()
             if told.get("id") == self._count:
-                assert "error" not in told, told["error"]
+                if "error" in told:
+                    raise RefusedError(told["error"])
                 found: dict[str, Any] = told["result"]
                 return found
             self.heard.append(told)
@@ -56,13 +68,15 @@ class Steered:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def until(self, script: str, limit: float = 20.0) -> Any:
-        """Wait until an expression is true in the page; return it."""
-        end = time.monotonic() + limit
-        while not (found := self.run(script)):
-            assert time.monotonic() < end, (script, self.run("document.body.innerText"))
-            time.sleep(0.1)
-        return found
+    def until(self, script: str, limit: float = 20.0) -> None:
+        """Wait until an expression is true in the page."""
+        end, found = time.monotonic() + limit, False
+        while not found:
+            with suppress(RefusedError):
+                found = self.run(f"Boolean({script})")
+            if not found:
+                assert time.monotonic() < end, (script, self.run("document.body.innerText"))
+                time.sleep(0.1)
 
     def choose(self, selector: str, *paths: Path) -> None:
         """Choose files in an input of the page."""
@@ -94,7 +108,7 @@ def steered(browser: Browser) -> Iterator[Steered]:
     ours_in, theirs_out = os.pipe()
     theirs_in, ours_out = os.pipe()
     command = [
-        "sh", "-c", f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}', "sh", browser.path,
+        sys.executable, "-c", _AS_3_AND_4, str(theirs_in), str(theirs_out), browser.path,
         "--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe",
         "--no-first-run", f"--user-data-dir={browser.folder / 'steered'}",
     ]  # fmt: skip

@@ -42,6 +42,17 @@ def picture(tab: Steered, name: str, width: int = 1100, height: int = 1500, **ho
         tab.look(Path(PICTURES) / f"{name}.png", width, height, **how)
 
 
+def nothing_outside_nor_wrong(tab: Steered, address: str) -> None:
+    """Every request went to the server itself, and the console has no error."""
+    told = [(e.get("method"), e.get("params", {})) for e in tab.heard]
+    asked = [p["request"]["url"] for m, p in told if m == "Network.requestWillBeSent"]
+    own = (address.partition("?")[0], "data:", "blob:")
+    assert asked
+    assert [u for u in asked if not u.startswith(own)] == []
+    words = [p["entry"] for m, p in told if m == "Log.entryAdded"]
+    assert [w for w in words if w["level"] == "error"] == []
+
+
 @slow
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes with numbers of POSIX")
 def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) -> None:
@@ -61,7 +72,6 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         line = "time=time:s,voltage=voltage:V,displacement=CH2:um"
         assert tab.run("document.querySelector('#set-columns').value") == line
         picture(tab, "files")
-        tab.run("document.querySelector('#stop').disabled = false")
         tab.run("document.querySelector('#start').focus()")
         tab.press("Enter", 13, "\r")
         tab.until("document.querySelectorAll('#tree li').length > 2", 120)
@@ -93,3 +103,4 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         assert [u for u in asked if not u.startswith((own, "data:", "blob:"))] == []
         words = [e["params"] for e in tab.heard if e.get("method") == "Log.entryAdded"]
         assert [w for w in words if w["entry"]["level"] == "error"] == []
+        nothing_outside_nor_wrong(tab, address)
