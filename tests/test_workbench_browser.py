@@ -93,14 +93,4 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844,
                  deviceScaleFactor=1, mobile=True)  # fmt: skip
         assert tab.run("document.documentElement.scrollWidth") <= 390
-        asked = [
-            e["params"]["request"]["url"]
-            for e in tab.heard
-            if e.get("method") == "Network.requestWillBeSent"
-        ]
-        own = address.split("?", maxsplit=1)[0]
-        assert asked
-        assert [u for u in asked if not u.startswith((own, "data:", "blob:"))] == []
-        words = [e["params"] for e in tab.heard if e.get("method") == "Log.entryAdded"]
-        assert [w for w in words if w["entry"]["level"] == "error"] == []
         nothing_outside_nor_wrong(tab, address)
