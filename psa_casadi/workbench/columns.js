@@ -87,7 +87,7 @@ desk.columns = (function () {
       [t, loop].forEach(function (c, k) { c.setAttribute('role', 'img'); c.ariaLabel = item.name + (k ? ': displacement over voltage' : ': voltage over time'); });
       requestAnimationFrame(function () {
         psaLive.plot(t, {x: 'time [s]', y: 'voltage [V]', curves: [{x: r.t, y: r.v, colour: '--model'}]});
-        psaLive.plot(loop, {x: 'voltage [V]', y: 'displacement [' + unit + ']', curves: [{x: r.v, y: x, colour: '--measured', width: 1}]});
+        psaLive.plot(loop, {x: 'voltage [V]', y: 'displacement [' + unit + ']', curves: [{x: r.v, y: x, colour: '--measured', dots: true}]});
       });
       var more = r.others.length ? '; also ' + r.others.map(desk.words).join(', ') : '';
       return make('figure', {}, make('figcaption', {}, item.name),
