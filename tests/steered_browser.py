@@ -80,9 +80,10 @@ class Steered:
 
     def choose(self, selector: str, *paths: Path) -> None:
         """Choose files in an input of the page."""
-        root = self.call("DOM.getDocument")["root"]["nodeId"]
-        node = self.call("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
-        self.call("DOM.setFileInputFiles", nodeId=node, files=[str(p) for p in paths])
+        self.until(f"document.readyState === 'complete' && document.querySelector('{selector}')")
+        find = f"document.querySelector('{selector}')"
+        node = self.call("Runtime.evaluate", expression=find)["result"]["objectId"]
+        self.call("DOM.setFileInputFiles", objectId=node, files=[str(p) for p in paths])
 
     def press(self, key: str, code: int, text: str = "") -> None:
         """Press and release a key."""
