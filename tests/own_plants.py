@@ -5,7 +5,7 @@ hysteresis has the published benchmark's form and units, an overflow is a branch
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,11 @@ Rates = Callable[[float, Any], list[float]]
 
 
 def _solved(
-    rates: Rates, t: FloatArray, start: list[float], most: float, method: str = "LSODA"
+    rates: Rates,
+    t: FloatArray,
+    start: list[float],
+    most: float,
+    method: Literal["LSODA", "RK45"] = "LSODA",
 ) -> FloatArray:
     """Return the states (nx, n) at the times."""
     found = solve_ivp(
