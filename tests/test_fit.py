@@ -16,7 +16,6 @@ from psa_casadi.identification.fitting.prediction import Prediction, motions_of,
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.search.multistart import free_parameters
-from psa_casadi.identification.search.refitting import settled
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
@@ -268,22 +267,3 @@ def test_numbers_that_overflow_are_no_simulation(monkeypatch: pytest.MonkeyPatch
     record = record_of(model_with(), 1)
     with pytest.raises(SimulationError, match="numbers of the fit overflow"):
         fit(model_with(), [whole(record)], ["k_L"], sigma=[SIGMA])
-
-
-def test_a_lag_that_began_far_off_is_not_held_back_by_its_weak_prior() -> None:
-    """The prior of a lag is a factor of e around where a fit begins; here that is off by e^7."""
-    model = stack_model("demo")
-    time = time_grid(4e-3, 5e-6)
-    voltage = multisine(time, 0.0, 60.0, (500.0, 3e4), seed=3)
-    x = simulate(model, time, voltage, memory={"f_H": 0.0}).displacement
-    noise = 2e-9 * np.random.default_rng(3).standard_normal(time.size)
-    record = Record(name="fast", time=time, voltage=voltage, displacement=x + noise)
-    free, experiments = ["k_L", "c_B", "m_B"], [whole(record)]
-    far = {"c_B": model.values["c_B"] * np.exp(7.0)}
-    began = fit(model, experiments, free, sigma=[2e-9], start=far, evaluations=100)
-    near = settled(fit(model, experiments, free, sigma=[2e-9], evaluations=100), experiments)
-    ended = settled(began, experiments)
-    assert began.cost > near.cost + 10.0
-    assert ended.cost < near.cost + 0.1
-    for name in free:
-        assert ended.model.values[name] == pytest.approx(near.model.values[name], rel=1e-3)

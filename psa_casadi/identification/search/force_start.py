@@ -25,7 +25,6 @@ from psa_casadi.identification.search.refitting import (
     record_rms,
     refit,
     residual_noise,
-    settled,
 )
 from psa_casadi.identification.start.excerpts import Excerpt, fastest_part
 from psa_casadi.identification.start.linear import arrangements, different
@@ -106,7 +105,7 @@ def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
         for linear in _linear_fits(best, parts)[:_BEGUN]
     ]
     found = sorted((f for f in begun if f is not None), key=lambda f: f.cost)[:_ENDED]
-    ended = [settled(refit(f, experiments, names, sigma=best.sigma), experiments) for f in found]
+    ended = [refit(f, experiments, names, sigma=best.sigma) for f in found]
     if any(f.interrupted for f in (*found, *ended)):
         raise KeyboardInterrupt
     return min(ended, key=lambda f: f.cost, default=None)

@@ -21,7 +21,6 @@ from psa_casadi.identification.search.refitting import (
     refit_or_keep,
     residual_noise,
     same_place,
-    settled,
 )
 from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.starting_points import resolved, starting_points
@@ -144,7 +143,7 @@ def _search(
             continue
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit_or_keep(quick, experiments, free, sigma)
-        polished.append(settled(ended, experiments))
+        polished.append(ended)
         keep(min(polished, key=lambda f: f.cost))
     best = min(polished, key=lambda f: f.cost)
     outcomes, not_unique = _outcomes(found, polished, best, experiments)

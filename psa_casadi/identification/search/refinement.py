@@ -17,7 +17,6 @@ from psa_casadi.identification.search.refitting import (
     equal,
     quick_from,
     refit_or_keep,
-    settled,
 )
 from psa_casadi.records.split import Experiment
 
@@ -100,7 +99,7 @@ def _from(
     if quick is None or quick.interrupted or quick.cost > _HOPEFUL * best.cost:
         return None
     try:
-        ended = fit(
+        return fit(
             quick.model,
             experiments,
             free,
@@ -108,7 +107,6 @@ def _from(
             start_states=quick.starts(),
             evaluations=_LAST,
         )
-        return settled(ended, experiments)
     except PsaError:
         return None
 

@@ -24,9 +24,6 @@ _QUICK_RTOL, _OF_NOISE = 1e-4, 0.02
 #: Rounds of fits with a further column's residual as its noise level; logarithms of levels that are
 #: the same differ by less.
 _LEVEL_ROUNDS, _SAME_LEVEL = 2, 0.02
-#: Weak priors count in a fit's cost beyond this; rounds of fits that begin where one ended, and
-#: the least that one must gain.
-_PULL, _ANEW, _GAIN = 0.1, 4, 0.5
 #: Fits whose costs differ by less, in units of the log-likelihood's double, are equally good.
 _EQUAL = 3.84
 #: ... or by less than this share of what the model's own error adds to the cost.
@@ -130,31 +127,6 @@ def refit_or_keep(
         return refit(previous, experiments, free, sigma=sigma)
     except PsaError:
         return previous
-
-
-def settled(found: Fit, experiments: Sequence[Experiment]) -> Fit:
-    """Return a fit that the weak priors do not hold back, and whose cost is that of the records.
-
-    They are centred on where a fit begins. A lag that ends far from there is held short of its
-    place, and its fit costs more than one that began near it, by (ln ratio / spread)^2: 49 for a
-    lag that began a thousand times too long. So the fit begins anew where it ended until what the
-    priors add to its cost is below 0.1, or one more fit gains nothing.
-    """
-    best = found
-    for _ in range(_ANEW):
-        if best.interrupted or _prior_cost(best) < _PULL:
-            break
-        anew = refit_or_keep(best, experiments, best.unknowns.names, best.sigma)
-        gained = best.cost - anew.cost
-        best = min(best, anew, key=lambda f: f.cost)
-        if gained < _GAIN:
-            break
-    return best
-
-
-def _prior_cost(found: Fit) -> float:
-    """Return what the weak priors add to a fit's cost."""
-    return float(np.sum((found.theta / found.unknowns.prior) ** 2))
 
 
 def quick_from(
