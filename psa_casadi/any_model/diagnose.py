@@ -60,7 +60,7 @@ def diagnose_ode(
     gone = (*leave_out, *(f"zero_of_{n}" for n in shifted))
     every = effects_of(base.model, sizes)
     _refuse_unknown(leave_out, [e.name for e in every])
-    table = Table(base.model, tuple(e for e in every if not e.name.startswith(gone or ("/",))))
+    table = Table(base.model, tuple(e for e in every if not e.name.startswith(gone)))
     known = search(base, runs, table, progress)
     progress("judging")
     return judged(known)

@@ -24,9 +24,8 @@ from psa_casadi.errors import PsaError
 
 FloatArray = npt.NDArray[np.float64]
 
-#: As in a stack's diagnosis: effects worth a fit, by their share of the best decrease, how many of
-#: them, and how many starts each gets.
-_WORTH, _LEADING, _MOST, _AS_NEAR, _STARTS = 0.1, 4, 7, 0.4, 2
+#: So many starts each effect gets.
+_STARTS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +114,7 @@ class OdeView:
 
     def leading(self) -> list[list[Score]]:
         """Return the best starts of the effects worth a fit, the best effect first."""
-        best = self.screening.best_by_effect()
-        if not best:
-            return []
-        top = next(iter(best.values())).decrease
-        limit = max(self.screening.threshold, _WORTH * top)
-        near = [s for s in best.values() if s.decrease >= max(limit, _AS_NEAR * top)]
-        count = max(_LEADING, min(len(near), _MOST))
-        names = [n for n, s in best.items() if s.decrease >= limit][:count]
-        return [self.starts_of(n) for n in names]
+        return [self.starts_of(name) for name in self.screening.leading()]
 
     def starts_of(self, name: str) -> list[Score]:
         """Return the best directions of one effect, from which its fits start."""
@@ -178,21 +169,6 @@ def _along(runs: Sequence[Run], output: FittedOutput) -> list[FloatArray]:
     whole = np.vstack(parts)
     moving = [whole[:, j] for j in range(whole.shape[1]) if np.ptp(whole[:, j]) > 0]
     return moving or [np.zeros(len(whole))]
-
-
-def in_character(fit: OdeFit, cause: Component) -> bool:
-    """Whether no parameter of a cause but its gain was pushed to the end of its range."""
-    for p in cause.parameters:
-        if not p.fitted or p.name == cause.gain:
-            continue
-        low, high = p.bounds
-        value = fit.model.values[p.name]
-        margin = 0.0 if p.log else 1e-3 * (high - low)
-        if p.log and (value < 1.01 * low or value > high / 1.01):
-            return False
-        if not p.log and (value <= low + margin or value >= high - margin):
-            return False
-    return True
 
 
 def held_out_confirms(

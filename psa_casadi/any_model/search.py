@@ -16,7 +16,6 @@ from psa_casadi.any_model.hypothesis import (
     OdeView,
     held_out_confirms,
     hypothesis_of,
-    in_character,
     look,
 )
 from psa_casadi.any_model.runs import Run
@@ -26,6 +25,7 @@ from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.evidence import evidence
 from psa_casadi.diagnosis.screening.screen import Score
 from psa_casadi.diagnosis.screening.sets import Together, best_sets
+from psa_casadi.diagnosis.search.worth import inside_ranges
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -93,7 +93,7 @@ class Known:
     def worth(self, h: OdeHypothesis) -> bool:
         """Whether every cause is itself, removes what can be told, and held-out data confirm it."""
         for cause in h.causes:
-            if not in_character(h.fit, cause):
+            if not inside_ranges(h.fit.model.values, cause):
                 return False
             before = self.found.get(h.names - {cause.name})
             if before is None:

@@ -90,11 +90,11 @@ def conclude(
     balance = Balance(experiments, Scale(first.fit, colour, thresholds().price), floor)
     weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
     beaten = weighed.beaten_by()
-    vague = {} if beaten is not None else balance.vague(steps)
     gain = gain_of(experiments, first.predicted, last.predicted)
     partly = last.test.alarm and len(steps) > 1
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
     doubt = unconfirmed(experiments, gain, whole=whole, partly=partly, hidden=hidden)
+    vague = {} if beaten is not None or doubt else balance.vague(steps)
     verdict: Verdict = (
         "not_driven"
         if not driven

@@ -1,15 +1,21 @@
 """An effect with the ports that it needs, and the parameters that most effects have alike."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from psa_casadi.component import Component
+from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.from_casadi.ports import Port, with_ports
-from psa_casadi.variables import Parameter
+from psa_casadi.variables import Parameter, State
 
 #: An ordinary size of an effect over what it acts on, and the largest that a fit may reach.
 ORDINARY, LARGEST = 0.03, 10.0
+
+
+#: Returns a parameter or a state of an effect by its short name.
+Own = Callable[[str], Expression]
+#: The equations of an effect: (symbols, its own by short name) -> derivatives, term.
+Law = Callable[[Symbols, Own], tuple[dict[str, Expression], Expression]]
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,52 @@ class Attached:
     def ports(self) -> frozenset[Port]:
         """Every port that the model must have for it."""
         return frozenset((self.port, *self.reads))
+
+
+def at_port(
+    port: Port,
+    name: str,
+    law: Law,
+    *,
+    gain: str,
+    words: tuple[str, str, str, str],
+    parameters: tuple[Parameter, ...],
+    states: tuple[State, ...] = (),
+    probe: Mapping[str, tuple[float, ...]] | None = None,
+    finite_step: tuple[float, ...] = (),
+    belongs_to: str = "plant",
+    signal: str = "q",
+    reads: tuple[Port, ...] = (),
+) -> Attached:
+    """Return an effect that adds a term to a port's sum; its parameters begin with its name.
+
+    `words` are description, source, equation and what it looks like; in the equation, Q stands for
+    the port's sum and q for the `signal`.
+    """
+
+    def equations(s: Symbols) -> Equations:
+        der, term = law(s, lambda short: getattr(s, f"{name}_{short}"))
+        return Equations(
+            der={f"{name}_{short}": rate for short, rate in der.items()},
+            add={port.balance: term},
+        )
+
+    description, source, text, looks = words
+    component = Component(
+        name=name,
+        description=f"{port.words}: {description}",
+        source=source,
+        equations=equations,
+        parameters=parameters,
+        states=states,
+        gain=f"{name}_{gain}",
+        probe={f"{name}_{short}": grid for short, grid in (probe or {}).items()},
+        finite_step=finite_step,
+        equation_text=text.replace("Q", port.balance).replace("q", signal),
+        looks_like=looks,
+        belongs_to=belongs_to,
+    )
+    return Attached(component, port, reads)
 
 
 def extended(base: Model, effects: Iterable[Attached]) -> Model:

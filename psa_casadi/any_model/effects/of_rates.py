@@ -1,13 +1,21 @@
 """What may be missing in the rate of a state: friction, losses, curves, hysteresis, a constant."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import casadi as ca
 
-from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, gain_of, scale_of
+from psa_casadi.any_model.effects.attached import (
+    LARGEST,
+    ORDINARY,
+    Attached,
+    Own,
+    at_port,
+    gain_of,
+    scale_of,
+)
 from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond
 from psa_casadi.any_model.sizes import Sizes
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Expression, Symbols
 from psa_casadi.effects.bend import ANGLES
 from psa_casadi.model.compose import Model
 from psa_casadi.model.from_casadi.ports import Port, ports_of
@@ -18,8 +26,6 @@ from psa_casadi.variables import Parameter, State
 _STILL = 1e-3
 #: Stiffest stop, over the largest rate at one range beyond it; and width of its rounded corner.
 _STIFF, _CORNER = 1e4, 0.005
-_Own = Callable[[str], Expression]
-_Law = Callable[[Symbols, _Own], tuple[dict[str, Expression], Expression]]
 
 
 def rate_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
@@ -51,45 +57,10 @@ def _speed(model: Model, state: str) -> str | None:
     return str(rate.name()) if rate.is_symbolic() and rate.name() in model.state_names else None
 
 
-def _made(
-    port: Port,
-    name: str,
-    law: _Law,
-    *,
-    gain: str,
-    words: tuple[str, str, str, str],
-    parameters: tuple[Parameter, ...],
-    states: tuple[State, ...] = (),
-    probe: dict[str, tuple[float, ...]] | None = None,
-    reads: tuple[Port, ...] = (),
-) -> Attached:
-    def equations(s: Symbols) -> Equations:
-        der, term = law(s, lambda short: getattr(s, f"{name}_{short}"))
-        return Equations(
-            der={f"{name}_{short}": rate for short, rate in der.items()},
-            add={port.balance: term},
-        )
-
-    description, source, text, looks = words
-    component = Component(
-        name=name,
-        description=f"{port.words}: {description}",
-        source=source,
-        equations=equations,
-        parameters=parameters,
-        states=states,
-        gain=f"{name}_{gain}",
-        probe={f"{name}_{short}": grid for short, grid in (probe or {}).items()},
-        equation_text=text.replace("Q", port.balance),
-        looks_like=looks,
-    )
-    return Attached(component, port, reads)
-
-
 def _constant(port: Port, sizes: Sizes) -> Attached:
     name = f"constant_in_{port.variable}"
     size = sizes.rates[port.variable]
-    return _made(
+    return at_port(
         port, name, lambda s, own: ({}, own("size")),
         gain="size",
         words=(
@@ -104,7 +75,7 @@ def _constant(port: Port, sizes: Sizes) -> Attached:
 
 def _loss(port: Port, sizes: Sizes) -> Attached:
     name, v = f"loss_in_{port.variable}", port.variable
-    return _made(
+    return at_port(
         port, name, lambda s, own: ({}, -own("size") * getattr(s, v) / own("range")),
         gain="size",
         words=(
@@ -123,11 +94,11 @@ def _loss(port: Port, sizes: Sizes) -> Attached:
 def _friction(port: Port, sizes: Sizes) -> Attached:
     name, v = f"friction_in_{port.variable}", port.variable
 
-    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
         part = getattr(s, v) / own("range")
         return {}, -own("size") * part / ca.sqrt(part**2 + own("width") ** 2)
 
-    return _made(
+    return at_port(
         port, name, law,
         gain="size",
         words=(
@@ -153,11 +124,11 @@ def _friction(port: Port, sizes: Sizes) -> Attached:
 def _drag(port: Port, sizes: Sizes) -> Attached:
     name, v = f"drag_in_{port.variable}", port.variable
 
-    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
         part = getattr(s, v) / own("range")
         return {}, -own("size") * part * smooth_magnitude(part, _STILL)
 
-    return _made(
+    return at_port(
         port, name, law,
         gain="size",
         words=(
@@ -176,10 +147,10 @@ def _drag(port: Port, sizes: Sizes) -> Attached:
 def _curve(port: Port, sizes: Sizes, x: str) -> Attached:
     name = f"curve_of_{x}_in_{port.variable}"
 
-    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
         return {}, own("size") * bent(getattr(s, x) / own("range"), own("angle"))
 
-    return _made(
+    return at_port(
         port, name, law,
         gain="size",
         words=(
@@ -204,11 +175,11 @@ def _stop(port: Port, sizes: Sizes, x: str) -> Attached:
     name = f"stop_of_{x}_in_{port.variable}"
     size = sizes.rates[port.variable]
 
-    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
         part = getattr(s, x) / own("range")
         return {}, -own("size") * beyond(part, own("level"), _CORNER)
 
-    return _made(
+    return at_port(
         port,
         name,
         law,
@@ -244,7 +215,7 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
     reads = () if speed else tuple(p for p in ports_of(model) if _is_rate(p, x))
     fastest = sizes.rates[x]
 
-    def law(s: Symbols, own: _Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
         rate = getattr(s, speed) if speed else getattr(s, reads[0].balance)
         w, z = rate / own("range"), own("state")
         size = smooth_magnitude(w, _STILL * own("rate") / own("range"))
@@ -252,7 +223,7 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
         der = w * (1 - own("bend") * power) - own("loss") * size * signed
         return {"state": der}, -own("size") * z
 
-    return _made(
+    return at_port(
         port, name, law,
         gain="size",
         words=(

@@ -5,19 +5,22 @@ the output before its sensor.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import casadi as ca
 
 from psa_casadi.any_model.effects.attached import (
     TIME_STEPS,
     Attached,
+    Own,
+    at_port,
     gain_of,
     plain_gain,
     scale_of,
     time_of,
 )
 from psa_casadi.any_model.sizes import Sizes
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Expression, Symbols
 from psa_casadi.effects.bend import ANGLES
 from psa_casadi.model.from_casadi.ports import Port, true_output
 from psa_casadi.smooth import pade_section, softplus
@@ -28,10 +31,8 @@ _CORNER = 0.01
 #: Smallest time of a filter over the sampling interval: keeps it defined at a time of 0.
 _FLOOR = 0.02
 
-#: The equations of an effect: (symbols, signal, parameter by its short name) -> derivatives, term.
-_Law = Callable[
-    [Symbols, Expression, Callable[[str], Expression]], tuple[dict[str, Expression], Expression]
-]
+#: As `Law`, with the signal's value: (symbols, signal, its own by short name) -> derivatives, term.
+_Law = Callable[[Symbols, Expression, Own], tuple[dict[str, Expression], Expression]]
 
 
 def signal_effects(port: Port, sizes: Sizes) -> tuple[Attached, ...]:
@@ -45,56 +46,23 @@ def _size(port: Port, sizes: Sizes) -> float:
     return (sizes.inputs if port.kind == "input" else sizes.outputs)[port.variable]
 
 
-def _made(
-    port: Port,
-    kind: str,
-    law: _Law,
-    *,
-    gain: str,
-    words: tuple[str, str, str, str],
-    parameters: tuple[Parameter, ...],
-    states: tuple[State, ...] = (),
-    probe: dict[str, tuple[float, ...]] | None = None,
-    finite_step: tuple[float, ...] = (),
-) -> Attached:
-    """Return an effect; its parameters and states begin with its name.
-
-    `words` are description, source, equation and what it looks like.
-    """
-    name = f"{kind}_of_{port.variable}"
+def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
+    """Return an effect of a signal, which its `law` has too; see `at_port`."""
     signal = port.variable if port.kind == "input" else true_output(port.variable)
-
-    def equations(s: Symbols) -> Equations:
-        der, term = law(s, getattr(s, signal), lambda short: getattr(s, f"{name}_{short}"))
-        return Equations(
-            der={f"{name}_{short}": rate for short, rate in der.items()},
-            add={port.balance: term},
-        )
-
-    description, source, text, looks = words
-    component = Component(
-        name=name,
-        description=f"{port.words}: {description}",
-        source=source,
-        equations=equations,
-        parameters=parameters,
-        states=states,
-        gain=f"{name}_{gain}",
-        probe={f"{name}_{short}": grid for short, grid in (probe or {}).items()},
-        finite_step=finite_step,
-        equation_text=text.replace("Q", port.balance).replace("q", signal),
-        looks_like=looks,
+    return at_port(
+        port,
+        f"{kind}_of_{port.variable}",
+        lambda s, own: law(s, getattr(s, signal), own),
         belongs_to="drive" if port.kind == "input" else "sensor",
+        signal=signal,
+        **more,
     )
-    return Attached(component, port)
 
 
 def _lag(port: Port, sizes: Sizes) -> Attached:
     name, floor = f"lag_of_{port.variable}", _FLOOR * sizes.sample
 
-    def law(
-        s: Symbols, q: Expression, own: Callable[[str], Expression]
-    ) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
         time, behind = own("time") + own("floor"), own("state") - q
         return {"state": -behind / time}, own("time") / time * behind
 
@@ -119,9 +87,7 @@ def _lag(port: Port, sizes: Sizes) -> Attached:
 def _delay(port: Port, sizes: Sizes) -> Attached:
     name, size = f"delay_of_{port.variable}", _size(port, sizes)
 
-    def law(
-        s: Symbols, q: Expression, own: Callable[[str], Expression]
-    ) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
         half, floor = own("time") / 2, own("floor")
         a1, b1, first = pade_section(half, floor, q, own("a1"), own("b1"))
         a2, b2, second = pade_section(half, floor, first, own("a2"), own("b2"))
@@ -151,9 +117,7 @@ def _delay(port: Port, sizes: Sizes) -> Attached:
 def _bend(port: Port, sizes: Sizes) -> Attached:
     name, size = f"bend_of_{port.variable}", _size(port, sizes)
 
-    def law(
-        s: Symbols, q: Expression, own: Callable[[str], Expression]
-    ) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
         part = q / own("range")
         return {}, own("size") * bent(part, own("angle"))
 
@@ -178,9 +142,7 @@ def _bend(port: Port, sizes: Sizes) -> Attached:
 def _saturation(port: Port, sizes: Sizes) -> Attached:
     name, size = f"saturation_of_{port.variable}", _size(port, sizes)
 
-    def law(
-        s: Symbols, q: Expression, own: Callable[[str], Expression]
-    ) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
         level, width = own("level") * own("range"), _CORNER * own("range")
         return {}, -own("gain") * beyond(q, level, width)
 
@@ -205,9 +167,7 @@ def _saturation(port: Port, sizes: Sizes) -> Attached:
 def _dead_zone(port: Port, sizes: Sizes) -> Attached:
     name, size = f"dead_zone_of_{port.variable}", _size(port, sizes)
 
-    def law(
-        s: Symbols, q: Expression, own: Callable[[str], Expression]
-    ) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
         level, width = own("level") * own("range"), _CORNER * own("range")
         return {}, -own("gain") * (q - beyond(q, level, width))
 

@@ -20,6 +20,9 @@ FloatArray = npt.NDArray[np.float64]
 
 _DRAWS = 4000
 _SEED = 20150810  # of the threshold's simulation: the same data give the same verdict
+#: An effect whose score is below this share of the best one is not fitted; so many of the others
+#: are, more of them where their scores are this close to the best one's.
+_WORTH, _LEADING, _MOST, _AS_NEAR = 0.1, 4, 7, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,17 @@ class Screening:
         for score in self.scores:
             best.setdefault(score.direction.effect.name, score)
         return best
+
+    def leading(self) -> list[str]:
+        """Return the effects worth a fit, the best one first."""
+        best = self.best_by_effect()
+        if not best:
+            return []
+        top = next(iter(best.values())).decrease
+        limit = max(self.threshold, _WORTH * top)
+        near = [s for s in best.values() if s.decrease >= max(limit, _AS_NEAR * top)]
+        count = max(_LEADING, min(len(near), _MOST))
+        return [name for name, score in best.items() if score.decrease >= limit][:count]
 
 
 def screen(

@@ -20,10 +20,8 @@ from psa_casadi.identification.fitting.further import with_column
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
 
-#: An effect whose screening score is below this share of the best one is not fitted; so many of
-#: the others are, more of them where their scores are this close to the best one's; and so many
-#: starts each gets.
-_WORTH, _LEADING, _MOST, _AS_NEAR, _STARTS = 0.1, 4, 7, 0.4, 2
+#: So many starts each effect gets.
+_STARTS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +62,7 @@ class View:
 
     def leading(self) -> list[list[Score]]:
         """Return the best starts of the effects worth a fit, the best effect first."""
-        best = self.screening.best_by_effect()
-        if not best:
-            return []
-        top = next(iter(best.values())).decrease
-        limit = max(self.screening.threshold, _WORTH * top)
-        near = [s for s in best.values() if s.decrease >= max(limit, _AS_NEAR * top)]
-        count = max(_LEADING, min(len(near), _MOST))
-        chosen = [name for name, score in best.items() if score.decrease >= limit][:count]
-        return [self.starts_of(name) for name in chosen]
+        return [self.starts_of(name) for name in self.screening.leading()]
 
     def starts_of(self, name: str) -> list[Score]:
         """Return the best directions of one effect, from which its fits start.

@@ -1,6 +1,6 @@
 """Which hypotheses may be the answer: what a cause must remove, and what held-out data must say."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -90,6 +90,11 @@ def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) 
         tells_tone(values[tone], e.record, hum=hum) for e in experiments
     ):
         return False
+    return inside_ranges(values, cause)
+
+
+def inside_ranges(values: Mapping[str, float], cause: Component) -> bool:
+    """Whether no parameter of a cause but its gain was pushed to the end of its range."""
     for p in cause.parameters:
         if not p.fitted or p.name == cause.gain:
             continue
