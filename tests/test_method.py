@@ -9,8 +9,9 @@ import pytest
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
+from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import confirmed, in_character
+from psa_casadi.diagnosis.search.worth import held_out_confirms, in_character
 from psa_casadi.diagnosis.task import STEPS, Method, Task
 from psa_casadi.diagnosis.thresholds import Thresholds, thresholds, using
 from psa_casadi.effects import EFFECTS
@@ -95,16 +96,31 @@ def test_the_score_is_the_evidence_less_the_price_of_the_causes(creeping: Creepi
 
 
 def test_held_out_data_speak_against_what_they_do_not_show(creeping: Creeping) -> None:
-    """Where the residual's test is silent they must show a cause, else not contradict it."""
+    """They must show what they can show, and all samples together must favour a cause."""
     plain, creep, scale, experiments = creeping
-    for alarm in (True, False):
-        assert confirmed(creep, plain, experiments, scale.colour, alarm=alarm)
-        worse = replace(creep, holdout_rms=1.02 * plain.holdout_rms)
-        assert not confirmed(worse, plain, experiments, scale.colour, alarm=alarm)
+    assert held_out_confirms(creep, plain, experiments, scale)
+    worse = replace(creep, holdout_rms=1.02 * plain.holdout_rms)
+    assert not held_out_confirms(worse, plain, experiments, scale)
     faint = [p + 0.01 * (c - p) for p, c in zip(plain.predicted, creep.predicted, strict=True)]
     hardly = replace(creep, predicted=tuple(faint), holdout_rms=plain.holdout_rms)
-    assert confirmed(hardly, plain, experiments, scale.colour, alarm=True)
-    assert not confirmed(hardly, plain, experiments, scale.colour, alarm=False)
+    assert held_out_confirms(hardly, plain, experiments, scale)
+    dear = replace(scale, price=scale.evidence(creep))
+    assert held_out_confirms(creep, plain, experiments, dear)
+    assert not held_out_confirms(hardly, plain, experiments, dear)
+
+
+def test_what_held_out_data_reject_is_not_the_answer_but_may_lack_a_cause(
+    creeping: Creeping,
+) -> None:
+    plain, creep, _, experiments = creeping
+    known = Known(plain.fit, Task(experiments, (EFFECTS["slow_creep"],)))
+    assert known.rejected() == []
+    known.note(creep)
+    assert known.best().names == creep.names
+    assert known.rejected() == []
+    known.found[creep.names] = worse = replace(creep, holdout_rms=1.02 * plain.holdout_rms)
+    assert known.best().names == plain.names
+    assert known.rejected() == [worse]
 
 
 def test_a_parameter_at_its_bound_is_out_of_character(creeping: Creeping) -> None:

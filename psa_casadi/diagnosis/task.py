@@ -27,6 +27,7 @@ STEPS = {
     "several at once": "causes are found one by one only",
     "exchange": "causes are not exchanged beside the later ones",
     "all afresh": "effects far behind in the screening are never fitted",
+    "rejected": "no neighbours of what held-out data reject are fitted",
     "held out": "held-out data are not asked",
     "form": "a further cause may be smaller than the first one's form is known",
 }

@@ -102,8 +102,21 @@ class _Search:
             if "exchange" not in self.task.method.without:
                 exchange(best, self.known, self.task)
             return self.next()
-        if self.known.is_open(best) and self.otherwise():
-            return self.next()
+        if self.known.is_open(best):
+            return self.next() if self.otherwise() else self.rejected()
+        return None
+
+    def rejected(self) -> Hypothesis | None:
+        """Return the best of what held-out samples reject that may lack a cause.
+
+        Beside a large one that is missing they can hardly confirm a small one.
+        """
+        if "rejected" in self.task.method.without:
+            return None
+        for h in self.known.rejected():
+            if len(h.causes) < thresholds().most_causes and self.unseen(h):
+                self.known.finish([] if h.final else [h])
+                return self.known.get(h.names)
         return None
 
     def otherwise(self) -> bool:

@@ -13,7 +13,7 @@ from psa_casadi.diagnosis.search.fits import to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, tried
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import confirmed, in_character, shows_memory
+from psa_casadi.diagnosis.search.worth import held_out_confirms, in_character, shows_memory
 from psa_casadi.diagnosis.task import State, Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
@@ -198,6 +198,12 @@ class Known:
                 return top
             self.finish([top])
 
+    def rejected(self) -> list[Hypothesis]:
+        """Return what would be better than the answer if held-out samples confirmed it."""
+        least = self.scale.score(self.best())
+        better = [h for h in self.ranked() if self.scale.score(h) > least]
+        return [h for h in better if self.worth(h, confirmed=False)]
+
     def so_far(self) -> Hypothesis:
         """Return the best of what was fitted to its end, whether worth having or not."""
         return next(h for h in self.ranked() if h.final)
@@ -213,7 +219,7 @@ class Known:
             self.found[ended.names] = kept = ended if better else replace(old, final=True)
             self.tell(kept, "finished")
 
-    def worth(self, h: Hypothesis) -> bool:
+    def worth(self, h: Hypothesis, *, confirmed: bool = True) -> bool:
         """Whether every cause removes what can be told, and held-out data confirm it."""
         root = self.root
         knowable = self.views[root.names].test.knowable
@@ -234,11 +240,9 @@ class Known:
                 return False
             if not self.remembers(h, before, cause):
                 return False
-            if "held out" in out:
+            if "held out" in out or not confirmed:
                 continue
-            seen = self.views.get(before.names)
-            alarm = seen is None or seen.test.alarm
-            if not confirmed(h, before, experiments, self.scale.colour, alarm=alarm):
+            if not held_out_confirms(h, before, experiments, self.scale):
                 return False
         return True
 

@@ -6,9 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import DISPLACEMENT_PEAKS, Component
-from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.screen import independent, without
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.drive import tells_tone
@@ -20,24 +19,20 @@ FloatArray = npt.NDArray[np.float64]
 _CURVE = 8
 
 
-def confirmed(
-    of: Hypothesis,
-    before: Hypothesis,
-    experiments: Sequence[Experiment],
-    colour: Colour,
-    *,
-    alarm: bool,
+def held_out_confirms(
+    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     A change of prediction with the sum of squares D promises a gain of the log-likelihood of
-    p = D/2 over the noise's power, give or take sqrt(2 p). Found must be `held_out`, or, where the
-    residual's test gives an `alarm` and these samples can hardly show the cause, two such errors
-    less than what is promised.
+    p = D/2 over the noise's power, give or take sqrt(2 p). Found must be `held_out`, or, where
+    these samples can hardly show the cause, two such errors less than what is promised; and so
+    much must the fitted samples' score and what is found be together.
     """
     held = np.concatenate([e.held_out for e in experiments])
     if not np.any(held):
         return True
+    colour = scale.colour
     change = np.concatenate(
         [(new - old) for new, old in zip(of.predicted, before.predicted, strict=True)]
     )[held]
@@ -49,10 +44,10 @@ def confirmed(
         count = np.count_nonzero(held) / own.inflation
         ratio = np.hypot(old, f.straight) / max(float(np.hypot(new, f.straight)), 1e-300)
         gained += count * float(np.log(ratio))
-    if not alarm:
-        return bool(gained > thresholds().held_out)
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2
-    return bool(gained > min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise))))
+    least = min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
+    together = scale.score(of) - scale.score(before) + gained
+    return bool(gained > least and together > thresholds().held_out)
 
 
 def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
