@@ -99,18 +99,32 @@ def tanks(seed: int, hidden: str) -> Signals:
     return Signals(name=hidden, time=t, columns={"pump": u, "level": shown})
 
 
-def pair(seed: int, hidden: str = "") -> Signals:
-    """Two coupled oscillators, two forces, two positions; a stiffness that breathes is `hidden`."""
+def breathing(seed: int) -> Signals:
+    """An oscillator of 2 kg whose stiffness swings by a fifth, 3 times a second, of itself."""
+    rng, t = np.random.default_rng(seed), np.arange(1500, dtype=np.float64) / 750.0
+    tones = np.arange(5.0, 150.0, 0.5, dtype=np.float64)
+    u = 50.0 * multisine(t, tones, rng) * np.minimum(1.0, t / 0.2)
+
+    def rates(s: float, q: Any) -> list[float]:
+        y, v = q
+        stiffness = 5e4 + 1e4 * np.sin(2.0 * np.pi * 3.0 * s)
+        return [v, (np.interp(s, t, u) - stiffness * y - 10.0 * v) / 2.0]
+
+    y = _solved(rates, t, [0.0, 0.0], 1.0 / 750.0)[0]
+    measured = y + 8e-6 * rng.standard_normal(len(t))
+    return Signals(name="breathing", time=t, columns={"force": u, "position": measured})
+
+
+def pair(seed: int) -> Signals:
+    """Two coupled oscillators, two forces, two positions."""
     rng, t = np.random.default_rng(seed), np.arange(3000, dtype=np.float64) * 0.02
     tones = np.linspace(0.2, 4.0, 15)
     f1, f2 = (11.0 * multisine(t, tones, rng) for _ in range(2))
-    swing = 25.0 if hidden == "breathing" else 0.0
 
     def rates(s: float, q: Any) -> list[float]:
         x, v, z, w = q
-        own = 100.0 + swing * np.sin(2.0 * np.pi * 0.13 * s)
         return [
-            v, np.interp(s, t, f1) - own * x - 25.0 * (x - z) - 0.8 * v,
+            v, np.interp(s, t, f1) - 100.0 * x - 25.0 * (x - z) - 0.8 * v,
             w, np.interp(s, t, f2) - 100.0 * z - 25.0 * (z - x) - 0.8 * w,
         ]  # fmt: skip
 

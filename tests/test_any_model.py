@@ -175,7 +175,7 @@ def test_clean_records_of_two_inputs_and_outputs_are_adequate() -> None:
 
 @pytest.mark.slow
 def test_a_cause_that_no_effect_has_is_unexplained() -> None:
-    d = psa.diagnose(pair(), plants.pair(4, "breathing"))
+    d = psa.diagnose(oscillator(), plants.breathing(4))
     assert d.verdict == "unexplained"
     assert not d.causes
     assert d.extended_fit is d.base_fit
