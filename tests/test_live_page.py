@@ -50,7 +50,7 @@ def shown() -> Diagnosis:
 @pytest.fixture(scope="module")
 def page(shown: Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("live") / "page.html"
-    write_report(shown, path, small=True)
+    write_report(shown, path)
     return path
 
 
@@ -204,7 +204,7 @@ def test_without_compiler_a_page_says_so(
 ) -> None:
     monkeypatch.setattr("psa_casadi.export.web.module.has_zig", lambda: False)
     monkeypatch.setattr(live_part, "has_zig", lambda: False)
-    write_report(shown, tmp_path / "page.html", small=True)
+    write_report(shown, tmp_path / "page.html")
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
     assert "the model does not run. It takes a compiler" in text
 

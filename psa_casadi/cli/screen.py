@@ -55,11 +55,6 @@ ColumnsOption = Annotated[
     ),
 ]
 
-SmallOption = Annotated[
-    bool,
-    typer.Option("--small", help="Page below 1.5 MB, for mail: one picture in place of the plots."),
-]
-
 StillOption = Annotated[
     bool,
     typer.Option(

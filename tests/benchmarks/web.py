@@ -127,7 +127,7 @@ def _page(model: Model, n: int) -> str:
         name="record", time=t, inputs={"voltage": v}, measured=measured,
         held_out=np.zeros(n, dtype=bool), residual=measured - y, deviation={}, noise=NOISE,
     )  # fmt: skip
-    page = Document("A model in a page", [], small=True)
+    page = Document("A model in a page", [])
     live = LiveModel(model, module, [row])
     add_live(page, live)
     return page.text()

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from psa_casadi.files import atomic_write
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import LiveModel, add_live
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.words.tables import Table
 
 

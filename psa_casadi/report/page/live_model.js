@@ -1,16 +1,9 @@
 // A model of psa_casadi in WebAssembly: parameters and a record in, a trajectory out. SI units.
 var psaLive = {};
 
-psaLive.bytes = function (base64) {
-  'use strict';
-  var text = atob(base64), found = new Uint8Array(text.length);
-  for (var i = 0; i < text.length; i += 1) { found[i] = text.charCodeAt(i); }
-  return found;
-};
-
 // Arrays lie in a page as base64 of little-endian numbers.
-psaLive.doubles = function (base64) { return new Float64Array(psaLive.bytes(base64).buffer); };
-psaLive.singles = function (base64) { return Float64Array.from(new Float32Array(psaLive.bytes(base64).buffer)); };
+psaLive.doubles = function (base64) { return new Float64Array(psaPacked.bytes(base64).buffer); };
+psaLive.singles = function (base64) { return Float64Array.from(new Float32Array(psaPacked.bytes(base64).buffer)); };
 
 psaLive.reasons = {
   1: 'the step size became too small', 2: 'a value is not finite', 3: 'too many steps were needed',
@@ -54,11 +47,7 @@ psaLive.load = function (told) {
       outputs: columns(page.page_outputs(), told.outputs), states: columns(page.page_states(), told.states)
     };
   }
-  function runner(instance) { return function (asked) { return run(instance.exports, asked); }; }
-  var bytes = psaLive.bytes(told.wasm), imports = {Math: Math};
-  try {
-    return Promise.resolve(runner(new WebAssembly.Instance(new WebAssembly.Module(bytes), imports)));
-  } catch (refused) { // browsers of before 2023 compile so much only beside the page's own work
-    return WebAssembly.instantiate(bytes, imports).then(function (made) { return runner(made.instance); });
-  }
+  return psaPacked.open(told.wasm).then(function (found) { return found.arrayBuffer(); }).then(function (bytes) {
+    return WebAssembly.instantiate(bytes, {Math: Math});
+  }).then(function (made) { return function (asked) { return run(made.instance.exports, asked); }; });
 };

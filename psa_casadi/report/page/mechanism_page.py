@@ -16,7 +16,7 @@ from psa_casadi.design.mechanism.mechanism import (
     step_response,
 )
 from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.document import Picture
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.theme import INK, Plot, styled
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, NOISE_COLOUR

@@ -83,26 +83,33 @@ def _error_text(grade: Grade) -> str:
 def correlation_plot(found: Identification) -> Plot:
     """Correlations of the estimates as a square of colours, strong ones with their figure."""
     names, matrix = list(found.determinacy.names), found.determinacy.correlations
-    lower = np.where(np.tri(len(names), dtype=bool), np.clip(matrix, -1.0, 1.0), np.nan)
-    written = len(names) <= _MOST_FIGURES
-    text = [[_correlation_text(v) if written and i > k else "" for k, v in enumerate(row)]
-            for i, row in enumerate(lower.tolist())]  # fmt: skip
-    plot = go.Figure(
-        go.Heatmap(
-            z=np.float32(lower), x=names, y=names, zmin=-1.0, zmax=1.0, text=text,
-            texttemplate="%{text}", textfont={"size": 10}, xgap=1.5, ygap=1.5,
-            colorscale=[[0.0, BASE_COLOUR], [0.5, PAPER], [1.0, EXTENDED_COLOUR]],
-            colorbar={"thickness": 12, "len": 0.9, "outlinewidth": 0, "tickvals": [-1, 0, 1],
-                      "ticktext": ["−1", "0", "+1"]},
-            hovertemplate="%{y} and %{x}: %{z:.3f}<extra></extra>",
-        )
-    )  # fmt: skip
+    written, plot = len(names) <= _MOST_FIGURES, go.Figure()
+    for k, name in enumerate(names):  # a column is a row of bars of one width: those below its name
+        shown = np.clip(matrix[k:, k], -1.0, 1.0).tolist()
+        plot.add_bar(
+            x=[0.92] * len(shown), base=[k - 0.46] * len(shown), y=names[k:], orientation="h",
+            width=0.92, customdata=shown, showlegend=False,
+            marker={"color": shown, "coloraxis": "coloraxis"},
+            text=["", *(_correlation_text(v) if written else "" for v in shown[1:])],
+            textposition="inside", insidetextanchor="middle", textangle=0,
+            textfont={"size": 10, "color": INK}, constraintext="none",
+            hovertemplate=f"%{{y}} and {name}: %{{customdata:.3f}}<extra></extra>",
+        )  # fmt: skip
     rows = max(10, len(found.model.structure.parameters))
     styled(plot, _MARGINS + _BAR * min(rows, 2 * len(names) + 2))
-    plot.update_layout(margin={"l": 20, "r": 4, "t": 16, "b": 20}, meta={"square": True})
+    plot.update_layout(
+        margin={"l": 20, "r": 4, "t": 16, "b": 20}, meta={"square": True}, barmode="overlay",
+        coloraxis={
+            "cmin": -1.0, "cmax": 1.0,
+            "colorscale": [[0.0, BASE_COLOUR], [0.5, PAPER], [1.0, EXTENDED_COLOUR]],
+            "colorbar": {"thickness": 12, "len": 0.9, "outlinewidth": 0, "tickvals": [-1, 0, 1],
+                         "ticktext": ["−1", "0", "+1"]},
+        },
+    )  # fmt: skip
     plot.update_xaxes(
-        showgrid=False, ticks="", tickangle=-60, mirror=False, showline=False, automargin=True
-    )
+        showgrid=False, ticks="", tickangle=-60, mirror=False, showline=False, automargin=True,
+        tickvals=list(range(len(names))), ticktext=names, range=[-0.5, len(names) - 0.5],
+    )  # fmt: skip
     return plot.update_yaxes(
         showgrid=False,
         ticks="",
