@@ -118,7 +118,7 @@ class Document:
         """
         canvas = FigureCanvasAgg(figure)
         canvas.draw()  # type: ignore[no-untyped-call]
-        drawn = np.asarray(canvas.buffer_rgba())
+        drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
         step, buffer = 255.0 / (_LEVELS - 1), io.BytesIO()
         imsave(buffer, (step * np.rint(drawn / step)).astype(np.uint8), format="png")
         data = base64.b64encode(buffer.getvalue()).decode("ascii")
