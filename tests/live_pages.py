@@ -49,7 +49,7 @@ def library(name: str) -> str:
 
 
 def case(
-    model: Model, time: FloatArray, voltage: FloatArray, *, rtol: float = 1e-6, **more: Any
+    model: Model, time: FloatArray, voltage: FloatArray, *, rtol: float | None = 1e-6, **more: Any
 ) -> dict[str, Any]:
     """Return what a page is asked for: the model's values on a voltage."""
     return {

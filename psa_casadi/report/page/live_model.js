@@ -5,6 +5,9 @@ var psaLive = {};
 psaLive.doubles = function (base64) { return new Float64Array(psaPacked.bytes(base64).buffer); };
 psaLive.singles = function (base64) { return Float64Array.from(new Float32Array(psaPacked.bytes(base64).buffer)); };
 
+// Tolerance while a slider moves: the loosest that exact steps gain from, a thousandth of what a curve's width shows.
+psaLive.dragged = 1e-5;
+
 psaLive.reasons = {
   1: 'the step size became too small', 2: 'a value is not finite', 3: 'too many steps were needed',
   10: 'there is no equilibrium to start from', 11: 'the browser gives no more memory'
@@ -30,7 +33,7 @@ psaLive.load = function (told) {
       for (var k = 0; k < n; k += 1) { inputs[k * nu + j] = given ? given[k] : input.start; }
     });
     var settle = !asked.start && (asked.settle || !told.starts_itself);
-    var status = page.page_run(asked.rtol || 1e-6, asked.hold === 'zero' ? 1 : 0, settle ? (asked.rest ? 2 : 1) : 0,
+    var status = page.page_run(asked.rtol || (asked.quick ? psaLive.dragged : 1e-6), asked.hold === 'zero' ? 1 : 0, settle ? (asked.rest ? 2 : 1) : 0,
       asked.quick ? 1 : 0, told.shown_nominal);
     function columns(at, names) {
       var all = view(at, n * names.length), found = {};
