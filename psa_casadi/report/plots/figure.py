@@ -21,6 +21,7 @@ from psa_casadi.report.words.series import (
     HELD_OUT_COLOUR,
     MEASURED_COLOUR,
     NOISE_COLOUR,
+    FloatArray,
     Series,
     bar_colour,
     kept,
@@ -89,14 +90,19 @@ def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
 
 def trajectory_figure(run: Trajectory) -> Figure:
     """Return the picture of a simulation: displacement over time and over the voltage."""
+    return response_figure(run.time, run.voltage, run.displacement)
+
+
+def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:
+    """Return the picture of a displacement [m] over time [s] and over the voltage [V]."""
     figure = Figure(
         figsize=(_SIZE_INCHES[0], 0.5 * _SIZE_INCHES[1]), dpi=_DPI, layout="constrained"
     )
     FigureCanvasAgg(figure)
     over_time, loop = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
-    scale = length_scale(float(np.ptp(run.displacement)))
-    y = scale.factor * run.displacement
-    for axes, x, label in ((over_time, run.time, "time [s]"), (loop, run.voltage, "voltage [V]")):
+    scale = length_scale(float(np.ptp(displacement)))
+    y = scale.factor * displacement
+    for axes, x, label in ((over_time, time, "time [s]"), (loop, voltage, "voltage [V]")):
         axes.plot(x, y, color=EXTENDED_COLOUR, linewidth=1.2)
         _style(axes, "Displacement" if axes is over_time else "Loop", label, f"[{scale.unit}]")
     return figure
