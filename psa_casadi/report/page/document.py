@@ -30,7 +30,7 @@ _LEVELS = 16
 #: The scripts of a model that runs in a page, by what it does there, in their order.
 _LIVE = ("live_model.js", "live_plot.js", "live_zoom.js", "live_knobs.js")
 LIVE_SCRIPTS = {
-    "report": (*_LIVE, "live.js", "live_start.js"),
+    "report": (*_LIVE, "live_budget.js", "live.js", "live_start.js"),
     "playground": (*_LIVE, "voltages.js", "playground.js", "live_start.js"),
 }
 

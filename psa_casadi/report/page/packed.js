@@ -10,10 +10,28 @@ psaPacked.bytes = function (base64) {
 
 psaPacked.able = typeof DecompressionStream !== 'undefined';
 
-// Promise of the bytes, as a Response: `.text()` or `.arrayBuffer()` gives them.
+// Promise of the bytes.
 psaPacked.open = function (base64) {
   'use strict';
   if (!psaPacked.able) { return Promise.reject(new Error('it is older than 2023')); }
-  var stream = new Blob([psaPacked.bytes(base64)]).stream().pipeThrough(new DecompressionStream('gzip'));
-  return Promise.resolve(new Response(stream));
+  var stream = new DecompressionStream('gzip'), writer = stream.writable.getWriter(), reader = stream.readable.getReader();
+  var parts = [], size = 0;
+  writer.write(psaPacked.bytes(base64));
+  writer.close();
+  function next(part) {
+    if (!part.done) {
+      parts.push(part.value);
+      size += part.value.length;
+      return reader.read().then(next);
+    }
+    var found = new Uint8Array(size), at = 0;
+    parts.forEach(function (p) { found.set(p, at); at += p.length; });
+    return found;
+  }
+  return reader.read().then(next);
+};
+
+psaPacked.text = function (base64) {
+  'use strict';
+  return psaPacked.open(base64).then(function (bytes) { return new TextDecoder().decode(bytes); });
 };

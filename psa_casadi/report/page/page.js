@@ -62,7 +62,7 @@
   }
 
   Promise.all(['arrays', 'library'].map(function (name) {
-    return psaPacked.open(document.getElementById(name).textContent).then(function (found) { return found.text(); });
+    return psaPacked.text(document.getElementById(name).textContent);
   })).then(function (found) {
     arrays = found[0].split(' ');
     begin(found[1]);
