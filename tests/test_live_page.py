@@ -140,7 +140,7 @@ def test_the_error_budget_follows(moved: dict[str, Any], shown: Diagnosis) -> No
     assert moved["fitted"] == []  # no effect is on
     at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
     values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
-    noise = 1e9 * shown.noise[0].level
+    noise = 1e9 * shown.noise_floor_rms_m  # the levels of both records are the same
     now, without = (
         rms_of(shown, {**values, **off}) ** 2 - noise**2 for off in ({}, {"creep_gain": 0.0})
     )

@@ -88,9 +88,9 @@ psaLive.report = function (box, told, run) {
       return;
     }
     var text = (record.judged.any ? 'Error on held-out samples' : 'Error') + ': ' + length(size) + ' rms, ' +
-      +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.noise) + '.';
-    if (record.base > record.noise && told.extended) {
-      var left = Math.max(0, size * size - record.noise * record.noise) / (record.base * record.base - record.noise * record.noise);
+      +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.floor) + '.';
+    if (record.base > record.floor && told.extended) {
+      var left = Math.max(0, size * size - record.floor * record.floor) / (record.base * record.base - record.floor * record.floor);
       text += left < 1
         ? ' Of the base model\u2019s error above the noise (in power) ' + Math.round(100 * (1 - left)) + ' % is removed.'
         : ' That is more than the base model leaves, which was fitted by itself: ' + length(record.base) + '.';
@@ -136,7 +136,7 @@ psaLive.report = function (box, told, run) {
     }
     var rows = on.map(function (e) { return [e.title, without(index[e.gain])]; });
     if (corrected.checked) { rows.push(['unnamed correction', size_(answer(record, true, values, false))]); }
-    psaLive.budget(budget, rows, size_(answer(record, true)), record.noise, length);
+    psaLive.budget(budget, rows, size_(answer(record, true)), record.floor, length);
   }
 
   function redraw() {
