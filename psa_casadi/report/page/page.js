@@ -35,6 +35,7 @@
     }
     var room = width || box.clientWidth;
     if (layout.meta && layout.meta.square) { layout.height = Math.min(layout.height, room + 30); }
+    box.style.height = layout.height + 'px'; // else a window that turns and darkens at once leaves none
     if (room < 480) {
       layout.font.size = 11;
       layout.margin.l = Math.min(layout.margin.l, 52);
