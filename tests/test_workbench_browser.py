@@ -62,6 +62,20 @@ def faults(tab: Steered, axe: str) -> list[str]:
     return told
 
 
+def report_runs(tab: Steered, address: str) -> None:
+    """In its sandbox the report draws its plots, and its model runs."""
+    tab.call("Page.navigate", url=address.partition("?")[0] + "report")
+    alive = "document.querySelector('.live') && document.querySelector('.live').psa"
+    tab.until(f"{alive} && document.querySelector('.main-svg')")
+
+
+def narrow(tab: Steered) -> None:
+    """A phone need not scroll sideways."""
+    tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844,
+             deviceScaleFactor=1, mobile=True)  # fmt: skip
+    assert tab.run("document.documentElement.scrollWidth") <= 390
+
+
 def of_another_layout(tab: Steered, path: Path, line: str) -> None:
     """Choose a file whose columns have other names: they are said of it alone, and go with it."""
     rows = ["time [s],voltage [V],pos", *DEMO.read_text(encoding="utf-8").splitlines()[1:300]]
@@ -92,8 +106,8 @@ def nothing_outside_nor_wrong(tab: Steered, address: str) -> None:
 @slow
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes with numbers of POSIX")
 def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) -> None:
-    record, text = tmp_path / HOSTILE, DEMO.read_text(encoding="utf-8")
-    record.write_text(text.replace("displacement [um]", "CH2"), encoding="utf-8")
+    record = tmp_path / HOSTILE
+    record.write_text(DEMO.read_text("utf-8").replace("displacement [um]", "CH2"), "utf-8")
     axe = files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
     browser = find_browser(tmp_path)
     with steered(browser) as tab:
@@ -129,7 +143,6 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         picture(tab, "result", height=3000)
         picture(tab, "phone", 390, 2600)
         picture(tab, "night", height=2200, dark=True)
-        tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844,
-                 deviceScaleFactor=1, mobile=True)  # fmt: skip
-        assert tab.run("document.documentElement.scrollWidth") <= 390
+        narrow(tab)
+        report_runs(tab, address)
         nothing_outside_nor_wrong(tab, address)
