@@ -35,6 +35,15 @@ from psa_casadi.simulation.simulate import Trajectory
 
 _SIZE_INCHES, _DPI = (16.0, 10.0), 100
 _STILL_INCHES, _STILL_DPI, _STILL_POINTS = (12.0, 6.4), 80, 4000
+#: Room around the plots of a still picture, for labels of any size that they have there.
+_STILL_ROOM = {
+    "left": 0.075,
+    "right": 0.99,
+    "top": 0.95,
+    "bottom": 0.09,
+    "hspace": 0.42,
+    "wspace": 0.3,
+}
 _FONT = 13.0
 
 
@@ -65,9 +74,9 @@ def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figur
 def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     """Return the picture of one record: measured against model, loop and residual."""
     s = _fewer(s)
-    figure = Figure(figsize=_STILL_INCHES, dpi=_STILL_DPI, layout="constrained")
+    figure = Figure(figsize=_STILL_INCHES, dpi=_STILL_DPI)
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0))
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
     _time(figure.add_subplot(grid[0, :2]), s, slice(None), origin, None)
     _loop(figure.add_subplot(grid[0, 2]), s, origin)
     _residual(figure.add_subplot(grid[1, :]), s, origin)
