@@ -33,18 +33,15 @@ class Shown:
 class Reported(Shown):
     """What a result can show of itself that has a page of its own."""
 
-    def report(
-        self, path: str | os.PathLike[str], *, small: bool = False, still: bool = False
-    ) -> None:
-        """Write the page, one HTML file that needs no network.
+    def report(self, path: str | os.PathLike[str], *, still: bool = False) -> None:
+        """Write the page, one HTML file below 1.5 MB that needs no network.
 
-        A `small` page, below 1.5 MB for mail, has one picture in place of the plots. The model
-        runs in the page unless it is to be `still`.
+        The model runs in the page unless it is to be `still`.
 
         Raises:
             InputError: `path` cannot be written to.
         """
-        _made("page", self, path, small, still)
+        _made("page", self, path, still)
 
 
 def frame(columns: dict[str, Any]) -> Any:

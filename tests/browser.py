@@ -126,18 +126,15 @@ def without_policy(text: str) -> str:
     return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text, count=1)
 
 
-def driven(
-    browser: Browser, page: Path, script: str, *flags: str, silent: bool = True, timed: bool = False
-) -> Any:
+def driven(browser: Browser, page: Path, script: str, *flags: str, silent: bool = True) -> Any:
     """Run a script in a copy of a page when all is drawn, and return what it passes to `tell`.
 
-    Where it is to be `silent`, a word on the console fails the test. A `timed` script runs before
-    the page is loaded: afterwards the clock of this browser stands still while a script runs.
+    Where it is to be `silent`, a word on the console fails the test.
     """
     copy = page.with_name(f"{page.stem}-driven.html")
     tell = "document.getElementById('driven').textContent = JSON.stringify(found);"
     wait = "window.addEventListener('load', () => setTimeout(() => {", "}, 500));"
-    begin, last = ("", "") if timed else wait
+    begin, last = wait
     call = (
         f"<pre id='driven'></pre><script>function tell(found) {{ {tell} }}"
         f"{begin}{script}{last}</script></body>"

@@ -1,6 +1,7 @@
 """What an HTML page of a report holds: its text, what it would load, its figures."""
 
 import base64
+import gzip
 import json
 import re
 from html.parser import HTMLParser
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+_ARRAYS = re.compile(r'<script type="application/gzip" id="arrays">(.*?)</script>')
 _SCRIPT = re.compile(r'<script type="application/json">(.*?)</script>', re.DOTALL)
 _DTYPES = {"f4": np.float32, "f8": np.float64, "i1": np.int8, "i2": np.int16, "i4": np.int32}
 
@@ -30,7 +32,7 @@ class Page(HTMLParser):
         self.names.add(given.get("id", ""))
         links = [v for k, v in given.items() if k in ("src", "href", "srcset", "data")]
         self.targets |= {link[1:] for link in links if link.startswith("#")}
-        self.loaded += [link for link in links if not link.startswith("#")]
+        self.loaded += [link for link in links if not link.startswith(("#", "data:image/png;"))]
 
     def handle_endtag(self, tag: str) -> None:
         while self._open and self._open.pop() != tag:
@@ -47,7 +49,13 @@ class Page(HTMLParser):
 
 def figures(page: str) -> list[dict[str, Any]]:
     """Return the plotly figures of a page in their order."""
-    return [json.loads(text) for text in _SCRIPT.findall(page)]
+    holder = _ARRAYS.search(page)
+    arrays = gzip.decompress(base64.b64decode(holder[1])).decode().split(" ") if holder else []
+
+    def resolved(part: dict[str, Any]) -> dict[str, Any]:
+        return {k: arrays[v] if k == "bdata" and isinstance(v, int) else v for k, v in part.items()}
+
+    return [json.loads(text, object_hook=resolved) for text in _SCRIPT.findall(page)]
 
 
 def numbers(values: Any) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -49,7 +49,7 @@ def library(name: str) -> str:
 
 
 def case(
-    model: Model, time: FloatArray, voltage: FloatArray, *, rtol: float = 1e-6, **more: Any
+    model: Model, time: FloatArray, voltage: FloatArray, *, rtol: float | None = 1e-6, **more: Any
 ) -> dict[str, Any]:
     """Return what a page is asked for: the model's values on a voltage."""
     return {
@@ -68,7 +68,9 @@ def run_in_browser(
     """
     given = {"model": live_data(model, web_module(model)), "cases": list(cases), "times": times}
     page: Path = browser.folder / "module.html"
-    text = _PAGE.format(library=library("live_model.js"), given=json.dumps(given))
+    text = _PAGE.format(
+        library=library("packed.js") + library("live_model.js"), given=json.dumps(given)
+    )
     page.write_text(text, encoding="utf-8")
     document, console = browser.document(page)
     found = _TOLD.search(document)

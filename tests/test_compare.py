@@ -11,10 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps
 from psa_casadi.population.finding import Finding, Found
 from psa_casadi.population.population import population
+from psa_casadi.population.replay import replayed
 from psa_casadi.report.documents.findings import read_findings
 from psa_casadi.report.documents.identification_file import identification_file
 from psa_casadi.report.page.comparison_page import MOST, write_comparison
@@ -67,6 +69,17 @@ def test_a_model_and_a_finding_of_the_same_records_are_one_device(tmp_path: Path
     assert joined.device == "a"
     assert joined.kind == "identification"
     assert joined.trace is not None
+
+
+def test_what_a_record_is_compared_with_has_the_sensors_errors() -> None:
+    plain = evident_model()
+    bent = plain.with_effect(EFFECTS["sensor_nonlinearity"])
+    gain = EFFECTS["sensor_nonlinearity"].gain or ""
+    far = replace(bent, values={**bent.values, gain: 0.05})
+    found = [replayed(m) for m in (plain, bent, far)]
+    a, b, c = (np.array(t.model) for t in found if t is not None)
+    np.testing.assert_allclose(b, a, atol=1e-5 * float(np.ptp(a)))
+    assert np.max(np.abs(c - a)) > 1e-3 * float(np.ptp(a))
 
 
 def test_names_are_text_and_plots_have_no_markup(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from psa_casadi.errors import InputError
 from psa_casadi.report.page.design_input_part import Titled
 from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.document import Picture
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.words.tables import Table
 
 

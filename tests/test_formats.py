@@ -165,6 +165,18 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
     assert "line 1, column 'y': has no unit" in problem
 
 
+def test_what_is_said_of_one_file_stands_for_what_is_said_of_all(tmp_path: Path) -> None:
+    said = "time=t:s,voltage=U:V,displacement=y:um"
+    mine = ",".join(f"b.csv@{part}" for part in ("time=t:ms", "voltage=CH1:V", "displacement=y:um"))
+    first = write(tmp_path / "a.csv", "t,U,y", *ROWS)
+    second = write(tmp_path / "b.csv", "t,CH1,y", *ROWS)
+    a, b = read_records([first, second], columns=f"{said},{mine}")
+    assert a.displacement is not None
+    assert_is(b, a.time / 1e3, a.voltage, a.displacement)
+    (problem,) = problems_of(first, mine)
+    assert "line 1" in problem
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -173,6 +185,7 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
         ("voltag=u", "'voltag' is no column of a record; is 'voltage' meant?"),
         ("torque=u", "'torque' is no column of a record; there are time, voltage"),
         ("voltage=u,voltage=v", "'voltage=v': 'voltage' is given twice"),
+        ("a.csv@voltage=u,a.csv@voltage=v", "'a.csv@voltage' is given twice"),
         ("voltage=u:um", "the unit 'um' does not measure voltage"),
         ("voltage=u:volts", "the unit 'volts' is unknown"),
         ("voltage=u:", "has no unit"),

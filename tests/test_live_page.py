@@ -50,7 +50,7 @@ def shown() -> Diagnosis:
 @pytest.fixture(scope="module")
 def page(shown: Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("live") / "page.html"
-    write_report(shown, path, small=True)
+    write_report(shown, path)
     return path
 
 
@@ -70,9 +70,12 @@ MOVES = """
 var box = document.querySelector('.live'), found = {};
 function text() { return box.querySelector('output').textContent; }
 function drawn() { return box.querySelector('canvas').toDataURL(); }
+function row() { return Array.prototype.map.call(box.querySelectorAll('.budget td'), function (c) {
+  return c.textContent; }); }
 function knob(name) { return Array.prototype.find.call(box.querySelectorAll('.knob'), function (k) {
   return k.querySelector('label').textContent === name; }); }
 found.first = text(); found.picture = drawn();
+found.fitted = row();
 var range = knob('k_L').querySelector('input[type=range]');
 range.value = '620'; range.dispatchEvent(new Event('input'));
 setTimeout(function () {
@@ -82,7 +85,7 @@ setTimeout(function () {
   number.value = '0.25'; number.dispatchEvent(new Event('change'));
   box.querySelector('.switch input').click();
   setTimeout(function () {
-    found.switched = text(); found.then = box.psa.values.slice();
+    found.budget = row(); found.switched = text(); found.then = box.psa.values.slice();
     Array.prototype.find.call(box.querySelectorAll('button'), function (b) {
       return b.textContent === 'Reset'; }).click();
     setTimeout(function () {
@@ -99,7 +102,7 @@ setTimeout(function () {
         tell(found);
       }, 300);
     }, 300);
-  }, 300);
+  }, 600);
 }, 300);
 """
 
@@ -130,6 +133,22 @@ def test_a_moved_slider_shows_what_python_simulates(
     assert moved["changed"]
     assert "% is removed" in moved["first"]
     assert "more than the base model leaves" in moved["moved"]
+
+
+@slow
+def test_the_error_budget_follows(moved: dict[str, Any], shown: Diagnosis) -> None:
+    assert moved["fitted"] == []  # no effect is on
+    at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
+    values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
+    noise = 1e9 * shown.noise_floor_rms_m  # the levels of both records are the same
+    now, without = (
+        rms_of(shown, {**values, **off}) ** 2 - noise**2 for off in ({}, {"creep_gain": 0.0})
+    )
+    name, size, share = moved["budget"]
+    number, unit = size.split()
+    assert name == "slow creep"
+    assert float(number) * (1e3 if unit == "µm" else 1.0) == pytest.approx(without**0.5, rel=6e-3)
+    assert float(share.split("\u00a0")[0]) == pytest.approx(100 * (1 - now / without), abs=0.6)
 
 
 @slow
@@ -204,7 +223,7 @@ def test_without_compiler_a_page_says_so(
 ) -> None:
     monkeypatch.setattr("psa_casadi.export.web.module.has_zig", lambda: False)
     monkeypatch.setattr(live_part, "has_zig", lambda: False)
-    write_report(shown, tmp_path / "page.html", small=True)
+    write_report(shown, tmp_path / "page.html")
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
     assert "the model does not run. It takes a compiler" in text
 

@@ -1,6 +1,7 @@
 """The design of prestress mechanisms: closed forms, goals, limits, and the coupled FMUs."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from psa_casadi.design.mechanism.mechanism import (
     mechanical_poles,
     mechanics_of,
     mechanism_model,
+    mounted_model,
     port_model,
     root_locus,
     step_response,
@@ -50,6 +52,29 @@ def assembled(p: Mapping[str, float], m: Mounting, acts_on: str, g: float = 0.0)
     held = m.mass * a_x + spring if acts_on == "wafers" else np.zeros(4)
     a_y = (-elastic + g * pull - held) / p["m_P"]
     return np.array([[0.0, 1.0, 0.0, 0.0], a_y, [0.0, 0.0, 0.0, 1.0], a_x])
+
+
+@pytest.mark.parametrize("acts_on", ["wafers", "tip"])
+@pytest.mark.parametrize("mounted", [0.0, 1.0])
+def test_a_mounted_stack_is_the_two_equations_with_the_mechanism(
+    acts_on: str, mounted: float
+) -> None:
+    design = replace(designed(damping=0.5), mounting=HEAVY, acts_on=acts_on)
+    model = mounted_model(stack_model(STACK), design).with_values({"mounted": mounted})
+    s = model.structure
+    rows = [model.state_names.index(n) for n in ("y", "v_y", "x", "v_x")]
+    zero, u = np.zeros(len(s.states)), [i.start for i in s.inputs]
+    found = np.array(s.slopes(0.0, zero, u, model.parameter_vector())[0])[np.ix_(rows, rows)]
+    wanted = assembled(model.values, HEAVY if mounted else Mounting(0.0, 0.0, 0.0), acts_on)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
+
+
+def test_a_load_on_the_mass_that_the_mechanism_pushes_on_is_refused() -> None:
+    model = stack_model(STACK).with_effect(EFFECTS["load_stiffness"])
+    design = designed(damping=0.5)
+    assert "prestress_on_wafers" in [c.name for c in mounted_model(model, design).components]
+    with pytest.raises(InputError, match="push on the same mass"):
+        mounted_model(model, replace(design, acts_on="tip"))
 
 
 @cache

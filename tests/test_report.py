@@ -49,7 +49,7 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
     assert page.loaded == []
     assert page.targets <= page.names
     assert not re.search(r"@import|url\(", text.split("<script>", 1)[0])
-    assert len(text) < 8e6
+    assert len(text) < 1.5e6
     assert SENTENCES[verdict] in page.text
     assert "synthetic data" in page.text
     assert "measured" not in page.text
@@ -86,7 +86,7 @@ def test_long_records_stay_small(tmp_path: Path) -> None:
     write_report(
         diagnosis("cause_named", tuple("abcdefgh"), 60_000), tmp_path / "r.html", still=True
     )
-    assert (tmp_path / "r.html").stat().st_size < 8e6
+    assert (tmp_path / "r.html").stat().st_size < 1.5e6
 
 
 def test_the_window_shows_where_the_difference_is_easiest_to_see() -> None:

@@ -53,12 +53,22 @@ def colours(image: np.ndarray[tuple[int, int, int], np.dtype[np.float64]]) -> in
 def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: Path) -> None:
     document, console = browser.document(page, "--window-size=1280,900")
     assert console == []
+    assert '<html lang="en" class="scripted">' in document  # no still picture is seen
     boxes = document.split('class="drawing')[1:]
     assert len(boxes) == len(re.findall('class="drawing', page.read_text(encoding="utf-8")))
     assert len(boxes) >= 14
     for box in boxes:
         assert '<svg class="main-svg"' in box
         assert re.search(r'class="(js-line|point|hm|trace)', box), "axes without any curve"
+
+
+def test_a_still_picture_is_seen_where_scripts_are_off(browser: Browser, page: Path) -> None:
+    off = page.with_name("off.html")
+    none = """<head><meta http-equiv="Content-Security-Policy" content="script-src 'none'">"""
+    off.write_text(page.read_text("utf-8").replace("<head>", none, 1), encoding="utf-8")
+    image = pixels(browser.screenshot(off, 1280, 900))
+    assert np.sum(np.all(np.abs(image - BLUE) < 0.06, axis=2)) > 2000  # the model's curves
+    assert 30_000 < len("".join(re.findall('base64,([^"]+)', off.read_text("utf-8")))) < 150_000
 
 
 def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: Path) -> None:

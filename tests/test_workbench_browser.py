@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,55 @@ def picture(tab: Steered, name: str, width: int = 1100, height: int = 1500, **ho
         tab.look(Path(PICTURES) / f"{name}.png", width, height, **how)
 
 
+def drop(tab: Steered, path: Path) -> None:
+    """Drop a file with the mouse, as from a window of the system."""
+    data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        tab.call("Input.dispatchDragEvent", type=kind, x=300, y=300, data=data)
+
+
+def faults(tab: Steered, axe: str) -> list[str]:
+    """Return what axe calls serious or critical in the page as it is now."""
+    tab.run(f"{axe}; window.found = null; axe.run({{resultTypes: ['violations']}}).then("
+            "r => { window.found = r.violations; }); 0")  # fmt: skip
+    tab.until("window.found")
+    told: list[str] = tab.run(
+        "window.found.filter(v => ['serious', 'critical'].includes(v.impact)).map("
+        "v => v.id + ': ' + v.nodes[0].html)"
+    )
+    return told
+
+
+def report_runs(tab: Steered, address: str) -> None:
+    """In its sandbox the report draws its plots, and its model runs."""
+    tab.call("Page.navigate", url=address.partition("?")[0] + "report")
+    alive = "document.querySelector('.live') && document.querySelector('.live').psa"
+    tab.until(f"{alive} && document.querySelector('.main-svg')")
+
+
+def narrow(tab: Steered) -> None:
+    """A phone need not scroll sideways."""
+    tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844,
+             deviceScaleFactor=1, mobile=True)  # fmt: skip
+    assert tab.run("document.documentElement.scrollWidth") <= 390
+
+
+def of_another_layout(tab: Steered, path: Path, line: str) -> None:
+    """Choose a file whose columns have other names: they are said of it alone, and go with it."""
+    rows = ["time [s],voltage [V],pos", *DEMO.read_text(encoding="utf-8").splitlines()[1:300]]
+    path.write_text("\n".join(rows), encoding="utf-8")
+    tab.choose("#pick", path)
+    tab.until("document.querySelector('#layout1c2')")
+    tab.run("s = document.querySelector('#layout1c2'); s.value = 'displacement'; s.onchange()")
+    tab.until("document.querySelectorAll('#curves figure').length === 2")
+    said = "time=time:s", "voltage=voltage:V", "displacement=pos:um"
+    both = ",".join([line, *(f"{path.name}@{part}" for part in said)])
+    assert tab.run("document.querySelector('#set-columns').value") == both
+    picture(tab, "layouts")
+    tab.run(f"document.querySelector('[aria-label=\"Remove {path.name}\"]').click()")
+    tab.until(f"document.querySelector('#set-columns').value === '{line}'")
+
+
 def nothing_outside_nor_wrong(tab: Steered, address: str) -> None:
     """Every request went to the server itself, and the console has no error."""
     told = [(e.get("method"), e.get("params", {})) for e in tab.heard]
@@ -57,13 +107,13 @@ def nothing_outside_nor_wrong(tab: Steered, address: str) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes with numbers of POSIX")
 def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) -> None:
     record = tmp_path / HOSTILE
-    text = DEMO.read_text(encoding="utf-8").replace("displacement [um]", "CH2")
-    record.write_text(text, encoding="utf-8")
+    record.write_text(DEMO.read_text("utf-8").replace("displacement [um]", "CH2"), "utf-8")
+    axe = files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
     browser = find_browser(tmp_path)
     with steered(browser) as tab:
         tab.call("Page.navigate", url=address)
         tab.until("location.search === '' && document.querySelector('#start')")
-        tab.choose("#pick", record)
+        drop(tab, record)
         tab.until("document.querySelector('.problems')")
         assert tab.run("document.querySelector('#files .name').textContent") == HOSTILE
         assert tab.run("document.querySelector('#start').disabled")
@@ -71,6 +121,8 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         tab.until("!document.querySelector('#start').disabled")
         line = "time=time:s,voltage=voltage:V,displacement=CH2:um"
         assert tab.run("document.querySelector('#set-columns').value") == line
+        of_another_layout(tab, tmp_path / "b.csv", line)
+        assert faults(tab, axe) == []
         picture(tab, "files")
         tab.run("document.querySelector('#start').focus()")
         tab.press("Enter", 13, "\r")
@@ -87,10 +139,10 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         assert {"report.html", "extended.json", "diagnosis.json"} <= set(tab.run(names))
         assert tab.run("document.title") == "Diagnose records"
         assert not tab.run("document.querySelector('img')")
+        assert faults(tab, axe) == []
         picture(tab, "result", height=3000)
         picture(tab, "phone", 390, 2600)
         picture(tab, "night", height=2200, dark=True)
-        tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844,
-                 deviceScaleFactor=1, mobile=True)  # fmt: skip
-        assert tab.run("document.documentElement.scrollWidth") <= 390
+        narrow(tab)
+        report_runs(tab, address)
         nothing_outside_nor_wrong(tab, address)

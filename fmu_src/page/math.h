@@ -9,9 +9,18 @@
 #define isnan(x) __builtin_isnan(x)
 #define isinf(x) __builtin_isinf(x)
 
-/* instructions of WebAssembly, or of the compiler's own library */
-double fabs(double), sqrt(double), floor(double), ceil(double), trunc(double), nearbyint(double), rint(double);
-double fmin(double, double), fmax(double, double), copysign(double, double), fmod(double, double);
+/* instructions of WebAssembly: without the built-in names each would be a call to a function in software */
+#define fabs(x) __builtin_fabs(x)
+#define sqrt(x) __builtin_sqrt(x)
+#define floor(x) __builtin_floor(x)
+#define ceil(x) __builtin_ceil(x)
+#define trunc(x) __builtin_trunc(x)
+#define nearbyint(x) __builtin_nearbyint(x)
+#define rint(x) __builtin_rint(x)
+#define copysign(x, y) __builtin_copysign(x, y)
+
+/* of the compiler's own library */
+double fmin(double, double), fmax(double, double), fmod(double, double);
 
 /* of library.c */
 double ldexp(double, int);

@@ -35,7 +35,7 @@ from psa_casadi.report.page.live_part import LiveModel, live_design
 from psa_casadi.report.words.phrases import number
 
 if TYPE_CHECKING:
-    from psa_casadi.report.page.document import Picture
+    from psa_casadi.report.page.packed import Picture
 
 _Rows = list[tuple[str, TrackingError]]
 

@@ -10,6 +10,7 @@ from psa_casadi.cli.screen import (
     EffectsOption,
     Quiet,
     StackOption,
+    StillOption,
     show,
     show_table,
     tell_written,
@@ -63,6 +64,7 @@ def mechanism(
         typer.Option(help="Also write the stack with the port that the mechanism couples to."),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
+    still: StillOption = False,
     effects: EffectsOption = None,
     quiet: Quiet = False,
 ) -> None:
@@ -102,7 +104,7 @@ def mechanism(
     if port is not None:
         save_model(port_model(chosen), port)
     if report is not None:
-        write_mechanism_page(design, report, chosen.name)
+        write_mechanism_page(design, report, chosen, still=still)
     _tell(design, quiet)
     tell_written(output, port, report, quiet=quiet)
 

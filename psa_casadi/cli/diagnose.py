@@ -16,7 +16,6 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     SampleTimeOption,
-    SmallOption,
     StillOption,
     show,
     show_table,
@@ -94,7 +93,6 @@ def diagnose(
             " causes, evidence, score and errors.",
         ),
     ] = None,
-    small: SmallOption = False,
     still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
@@ -150,7 +148,7 @@ def diagnose(
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = following or _beside(json or report)
-            d, unpatched = _finish(d, place, outputs, (origin.value, small, still), progress)
+            d, unpatched = _finish(d, place, outputs, (origin.value, still), progress)
         with stage("writing"):
             told = story(d, origin=origin.value, width=width())
     show(told, quiet)
@@ -179,24 +177,24 @@ def _finish(
     d: "Diagnosis",
     following: Path | None,
     outputs: Mapping[str, Path | None],
-    page: tuple[str, bool, bool],
+    page: tuple[str, bool],
     progress: Callable[[str], None],
 ) -> "tuple[Diagnosis, str]":
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
-    `page` says what the page calls the records, and whether it is small, and still.
+    `page` says what the page calls the records, and whether it is still.
     """
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
 
     written: list[Path] = []
-    origin, small, still = page
+    origin, still = page
     try:
         with stage("next experiment"):
             d = _with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
-            files.write(d, {**outputs, "--patch": None}, origin, written, small=small, still=still)
+            files.write(d, {**outputs, "--patch": None}, origin, written, still=still)
         with stage("unnamed correction"):
             return d, _write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:

@@ -68,7 +68,6 @@ def write(
     origin: str,
     written: list[Path],
     *,
-    small: bool = False,
     still: bool = False,
 ) -> None:
     """Write what was asked for, each file whole or not at all, and add it to what is `written`."""
@@ -78,7 +77,7 @@ def write(
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
         "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: psa.write_report(d, path, origin=origin, small=small, still=still),
+        "--report": lambda path: psa.write_report(d, path, origin=origin, still=still),
         "--figure": lambda path: psa.save_figure(d, path, origin=origin),
     }
     for option, path in outputs.items():

@@ -16,7 +16,6 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     SampleTimeOption,
-    SmallOption,
     StillOption,
     show,
     tell_written,
@@ -63,7 +62,6 @@ def identify(
         Path | None, typer.Option(help="JSON file of parameters and records to write.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
-    small: SmallOption = False,
     still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
@@ -102,7 +100,7 @@ def identify(
                 progress=progress,
             )
         profiles = _finish(
-            found, output, (json, report, small, still), profile or (), origin.value, progress
+            found, output, (json, report, still), profile or (), origin.value, progress
         )
     show(identification_text(found, origin=origin.value, width=width()), quiet)
     for found_profile in profiles:
@@ -120,14 +118,14 @@ def identify(
 def _finish(
     found: "Identification",
     output: Path,
-    more: tuple[Path | None, Path | None, bool, bool],
+    more: tuple[Path | None, Path | None, bool],
     wanted: Sequence[str],
     origin: str,
     progress: Callable[[str], None],
 ) -> "list[Profile]":
     """Write the files and return the profiles; at an interrupt the model is kept, which it says.
 
-    `more` are the JSON file, the page, and whether that is small, and still.
+    `more` are the JSON file, the page, and whether that is still.
     """
     from psa_casadi.cli.interrupts import kept
     from psa_casadi.files import atomic_write
@@ -137,7 +135,7 @@ def _finish(
     from psa_casadi.report.page.fit_page import write_fit_report
     from psa_casadi.strict_json import json_text
 
-    json, report, small, still = more
+    json, report, still = more
     done = [output]
     try:
         save_model(found.model, output)
@@ -148,9 +146,7 @@ def _finish(
             done.append(json)
         if report is not None and not found.interrupted:
             progress("writing the report")
-            write_fit_report(
-                found, report, origin=origin, profiles=profiles, small=small, still=still
-            )
+            write_fit_report(found, report, origin=origin, profiles=profiles, still=still)
         ended = found.interrupted
     except KeyboardInterrupt:
         save_model(found.model, output)

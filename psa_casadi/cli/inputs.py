@@ -18,7 +18,7 @@ from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, read_record
-from psa_casadi.records.read.column_map import parse_columns
+from psa_casadi.records.read.column_map import files_named, parse_columns
 from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.simulation.history import settled_at
 from psa_casadi.units import parse_unit, to_si, units_of
@@ -66,7 +66,7 @@ class Given:
         what --columns says. Nothing is read where that is not understood. `sample_time` [s] gives
         the time of files without one.
         """
-        wanted = self.columns(columns)
+        wanted = self.columns(columns, [*paths, *held_out])
         if wanted is None:
             return []
         found: list[Record] = []
@@ -93,7 +93,7 @@ class Given:
         self, path: Path, *, columns: str | None = None, sample_time: float | None = None
     ) -> Record | None:
         """Read a record whose voltage is to be applied; it need not have a displacement."""
-        wanted = self.columns(columns)
+        wanted = self.columns(columns, [path])
         if wanted is None:
             return None
         return self.attempt(
@@ -102,9 +102,16 @@ class Given:
             )
         )
 
-    def columns(self, text: str | None) -> ColumnMap | None:
-        """Return what --columns says, nothing where it is left out; None where it is wrong."""
-        return self.attempt(lambda: parse_columns(text)) if text is not None else {}
+    def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> ColumnMap | None:
+        """Return what --columns says, nothing where it is left out; None where it is wrong.
+
+        A file that it names must be one of the `paths`, where these are known.
+        """
+        found = self.attempt(lambda: parse_columns(text)) if text is not None else {}
+        named = files_named(found or {}) if paths is not None else set()
+        for name in sorted(named - {p.name for p in paths or ()}):
+            self.add(f"--columns: '{name}' is none of the files; give its name without a folder.")
+        return found
 
     def model(self, path: Path | None) -> Model | None:
         """Read a model that turns a voltage into a displacement; None where no file is named."""

@@ -51,13 +51,8 @@ ColumnsOption = Annotated[
         "--columns",
         help="Which array of the file is which column, if the names differ:"
         " time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:"
-        " displacement=CH2:10um",
+        " displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms",
     ),
-]
-
-SmallOption = Annotated[
-    bool,
-    typer.Option("--small", help="Page below 1.5 MB, for mail: one picture in place of the plots."),
 ]
 
 StillOption = Annotated[

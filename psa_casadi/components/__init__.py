@@ -10,7 +10,11 @@ from psa_casadi.components.mechanics import CASCADE_MECHANICS, SINGLE_MASS
 from psa_casadi.components.memory_spectrum import MEMORY_SPECTRUM
 from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
 from psa_casadi.components.position_controller import POSITION_CONTROLLER
-from psa_casadi.components.prestress import PRESTRESS_MECHANISM, PRESTRESS_PORT
+from psa_casadi.components.prestress import (
+    PRESTRESS_MECHANISM,
+    PRESTRESS_MOUNTS,
+    PRESTRESS_PORT,
+)
 from psa_casadi.components.sensor import SENSOR
 from psa_casadi.components.validity import VALIDITY, VALIDITY_WITH_TEMPERATURE
 from psa_casadi.components.wafers import BOUC_WEN, CREEP_LAG, LINEAR_FORCE
@@ -37,6 +41,7 @@ COMPONENTS: dict[str, Component] = {
         ONLINE_IDENTIFICATION,
         PRESTRESS_MECHANISM,
         PRESTRESS_PORT,
+        *PRESTRESS_MOUNTS.values(),
         VALIDITY,
         VALIDITY_WITH_TEMPERATURE,
     )

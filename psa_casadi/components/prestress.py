@@ -1,6 +1,6 @@
 """A prestress mechanism around a stack, and the port by which the two models are coupled."""
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.scales import force_scale
 from psa_casadi.variables import Input, Output, Parameter, State
 
@@ -14,15 +14,42 @@ def _mechanism(s: Symbols) -> Equations:
 
 
 def _port(s: Symbols) -> Equations:
-    pull = s.c_B * (s.v_x - s.v_y) + s.k_B * (s.x - s.y)
     return Equations(
         add={"wafer_force": s.prestress_force},
         out={
             "tip_velocity": s.v_x,
-            "tip_acceleration": (s.transmitted_force + s.tip_force - pull) / s.m_B,
+            "tip_acceleration": (s.transmitted_force + s.tip_force - _pull(s)) / s.m_B,
         },
     )
 
+
+def _pull(s: Symbols) -> Expression:
+    """Force of the bonding layers on the wafers [N]."""
+    return s.c_B * (s.v_x - s.v_y) + s.k_B * (s.x - s.y)
+
+
+def _on_wafers(s: Symbols) -> Equations:
+    acceleration = (s.transmitted_force + s.tip_force - _pull(s)) / s.m_B
+    force = s.m_m * acceleration + s.c_m * s.v_x + s.k_m * s.x
+    return Equations(add={"wafer_force": -s.mounted * force})
+
+
+def _on_tip(s: Symbols) -> Equations:
+    mass, held = s.mounted * s.m_m, s.mounted * (s.c_m * s.v_x + s.k_m * s.x)
+    beside = s.transmitted_force + s.load_force - _pull(s)
+    return Equations(add={"tip_force": -(mass * beside + s.m_B * held) / (s.m_B + mass)})
+
+
+_MECHANISM = (
+    Parameter("m_m", 0.05, "kg", (0.0, 1e3), "mass of the mechanism", "g", scale=0.01),
+    Parameter("c_m", 100.0, "N.s/m", (0.0, 1e9), "damping of the mechanism"),
+    Parameter("k_m", 5e6, "N/m", (0.0, 1e12), "stiffness of the mechanism"),
+)
+_MOUNTED = Parameter(
+    "mounted", 0.0, "1", (0.0, 1.0), "share of the mechanism that is there: 0 the free stack",
+    scale=1.0,
+)  # fmt: skip
+_COUPLED = "Yang and Zhu 2015, eq. 45: the mechanism is feedback around the stack's mechanics"
 
 PRESTRESS_MECHANISM = Component(
     name="prestress_mechanism",
@@ -30,11 +57,7 @@ PRESTRESS_MECHANISM = Component(
     source="Yang and Zhu 2015, eq. 44",
     equation_text="F = -(m x'' + c x' + k x);  W' = c x'^2",
     equations=_mechanism,
-    parameters=(
-        Parameter("m_m", 0.05, "kg", (0.0, 1e3), "mass of the mechanism", "g", scale=0.01),
-        Parameter("c_m", 100.0, "N.s/m", (0.0, 1e9), "damping of the mechanism"),
-        Parameter("k_m", 5e6, "N/m", (0.0, 1e12), "stiffness of the mechanism"),
-    ),
+    parameters=_MECHANISM,
     inputs=(
         Input("tip_position", "m", "position of the stack's output", 0.0, 1e-5, "um"),
         Input("tip_velocity", "m/s", "velocity of the stack's output", 0.0, 1e-2, "um/s"),
@@ -62,3 +85,29 @@ PRESTRESS_PORT = Component(
         Output("tip_acceleration", "m/s2", "acceleration of the output mass", 1e2),
     ),
 )
+
+#: A mechanism around a stack in one model: its force acts where the key says.
+PRESTRESS_MOUNTS = {
+    "wafers": Component(
+        name="prestress_on_wafers",
+        description="prestress mechanism around a stack, whose force acts on the wafers",
+        source=_COUPLED,
+        equation_text="f_out - (m x'' + c x' + k x) acts on the wafers",
+        needs=("cascade_mechanics",),
+        gain="mounted",
+        equations=_on_wafers,
+        parameters=(_MOUNTED, *_MECHANISM),
+        looks_like="more damping, resonances elsewhere, and a share of the stroke that is lost",
+    ),
+    "tip": Component(
+        name="prestress_on_tip",
+        description="prestress mechanism that pushes on the output mass of a stack",
+        source=_COUPLED,
+        equation_text="(m_B + m) x'' = F - c x' - k x,  F: all else that acts on the output mass",
+        needs=("cascade_mechanics",),
+        gain="mounted",
+        equations=_on_tip,
+        parameters=(_MOUNTED, *_MECHANISM),
+        looks_like="more damping, resonances elsewhere, and a share of the stroke that is lost",
+    ),
+}

@@ -8,6 +8,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.population.finding import Trace
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.ways import output_of
 
 
 def replayed(model: Model) -> Trace | None:
@@ -24,7 +25,8 @@ def replayed(model: Model) -> Trace | None:
     u = input_samples(model, time.size, inputs)
     start = known.start if known is not None else {}
     x0 = np.array([start.get(s.name, s.start) for s in model.structure.states])
-    y = run(model, time, u, x0, rtol=1e-6).y[:, model.output_names.index("displacement")]
+    shows = model.output_names.index(output_of(model) or "displacement")  # with the sensor's errors
+    y = run(model, time, u, x0, rtol=1e-6).y[:, shows]
     offset = known.offset_m if known is not None else 0.0
     shown = tuple(math.nan if v is None else v for v in found.displacement)
     return Trace(

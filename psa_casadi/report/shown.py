@@ -33,14 +33,13 @@ def plot(result: Diagnosis | Identification | Trajectory) -> Figure:
 def page(
     result: Diagnosis | Identification,
     path: str | os.PathLike[str],
-    small: bool = False,
     still: bool = False,
 ) -> None:
     """Write the page of a result, one HTML file. Raises InputError when that cannot be."""
     if isinstance(result, Diagnosis):
-        write_report(result, path, small=small, still=still)
+        write_report(result, path, still=still)
     else:
-        write_fit_report(result, path, small=small, still=still)
+        write_fit_report(result, path, still=still)
 
 
 def line(result: Diagnosis | Identification | Trajectory) -> str:

@@ -3,11 +3,15 @@ desk.columns = (function () {
   'use strict';
   var make = desk.make, units = desk.told.columns;
 
-  // What --columns says now, by the name of the array: {column, unit, scale}.
-  function wanted(text) {
-    var found = {};
-    text.split(',').forEach(function (part) {
-      var m = /^\s*([^=]+)=([^:\[\]]+)(?::\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)?\s*(.*))?$/.exec(part);
+  function parts(text) { return text.split(',').filter(function (part) { return part.trim(); }); }
+  // The file that a part of --columns names, as b.csv@time=t:ms does; '' for all of them.
+  function file(part) { var m = /^([^=]*)@/.exec(part); return m ? m[1].trim() : ''; }
+
+  // What --columns says now of a file, by the name of the array: {column, unit, scale}.
+  function wanted(text, stored) {
+    var found = {}, all = parts(text), own = all.filter(function (p) { return file(p) === stored; });
+    (own.length ? own : all.filter(function (p) { return !file(p); })).forEach(function (part) {
+      var m = /^\s*(?:[^=]*@)?([^=@]+)=([^:\[\]]+)(?::\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)?\s*(.*))?$/.exec(part);
       if (m) { found[m[2].trim()] = {column: m[1].trim(), scale: m[3] || '', unit: m[4] || ''}; }
     });
     return found;
@@ -16,8 +20,8 @@ desk.columns = (function () {
   function option(value, text, chosen) { return make('option', {value: value, selected: chosen}, text); }
 
   // The choices of one layout: what --columns says, else what the reader takes a column for.
-  function choices(head, text) {
-    var said = wanted(text), taken = Object.keys(said).map(function (n) { return said[n].column; });
+  function choices(head, text, stored) {
+    var said = wanted(text, stored), taken = Object.keys(said).map(function (n) { return said[n].column; });
     return head.names.map(function (name, k) {
       if (name && said[name]) { return said[name]; }
       var own = Object.keys(head.guess).find(function (c) { return head.guess[c][0] === k; });
@@ -27,18 +31,27 @@ desk.columns = (function () {
 
   // A unit that differs from the one in the header needs a number: what 1 in the file is.
   function line(head, chosen) {
-    var parts = [];
+    var found = [];
     chosen.forEach(function (c, k) {
       if (!c.column || !head.names[k]) { return; }
       var scale = c.scale || (head.units[k] && head.units[k] !== c.unit ? '1' : '');
-      parts.push(c.column + '=' + head.names[k] + ':' + scale + c.unit);
+      found.push(c.column + '=' + head.names[k] + ':' + scale + c.unit);
     });
-    return parts.join(',');
+    return found;
   }
 
-  function apply(head, chosen) { return desk.post('/settings', {columns: line(head, chosen)}); }
+  // Files of one layout share what is said; of several layouts, each part names its file.
+  function apply(layout, chosen) {
+    var own = line(layout.head, chosen), all = own;
+    if (layout.others) {
+      all = parts(layout.text).filter(function (p) { return layout.stored.indexOf(file(p)) < 0; });
+      layout.stored.forEach(function (name) { all = all.concat(own.map(function (p) { return name + '@' + p; })); });
+    }
+    return desk.post('/settings', {columns: all.join(',')});
+  }
 
-  function cell(head, chosen, k, id) {
+  function cell(layout, chosen, k, id) {
+    var head = layout.head;
     var own = chosen[k], name = head.names[k];
     var what = make('select', {id: id + 'c' + k, disabled: !name, ariaLabel: 'Column ' + (name || k + 1) + ' is'});
     what.append(option('', 'not used', !own.column));
@@ -54,18 +67,18 @@ desk.columns = (function () {
       own = chosen[k] = {column: what.value, scale: '', unit: what.value ? head.units[k] : ''};
       var fits = units[what.value] || [];
       if (what.value && fits.indexOf(own.unit) < 0) { own.unit = what.value === 'displacement' ? 'um' : fits.find(function (u) { return /^(s|V|N|A|K|C|m|1)$/.test(u); }) || fits[0]; }
-      apply(head, chosen);
+      apply(layout, chosen);
     };
-    unit.onchange = function () { own.unit = unit.value; apply(head, chosen); };
-    scale.onchange = function () { own.scale = scale.value.trim(); apply(head, chosen); };
+    unit.onchange = function () { own.unit = unit.value; apply(layout, chosen); };
+    scale.onchange = function () { own.scale = scale.value.trim(); apply(layout, chosen); };
     return make('td', {}, what, unit, scale);
   }
 
-  function table(head, names, text, id) {
-    var chosen = choices(head, text), row = make('tr'), top = make('tr'), body = make('tbody');
+  function table(layout, id) {
+    var head = layout.head, chosen = choices(head, layout.text, layout.stored[0]), row = make('tr'), top = make('tr'), body = make('tbody');
     head.names.forEach(function (name, k) {
       top.append(make('th', {scope: 'col'}, (name || 'a name with a mark of --columns') + (head.units[k] ? ' [' + head.units[k] + ']' : '')));
-      row.append(cell(head, chosen, k, id));
+      row.append(cell(layout, chosen, k, id));
     });
     body.append(row);
     head.rows.forEach(function (cells) {
@@ -74,8 +87,8 @@ desk.columns = (function () {
       body.append(line);
     });
     var use = make('button', {type: 'button', id: id + 'use'}, 'Read with these columns');
-    use.onclick = function () { apply(head, chosen); };
-    return make('div', {}, make('p', {className: 'note'}, names.join(', ')),
+    use.onclick = function () { apply(layout, chosen); };
+    return make('div', {}, make('p', {className: 'note'}, layout.names.join(', ')),
       make('div', {className: 'scroll', tabIndex: 0, role: 'region', ariaLabel: 'First rows'},
         make('table', {className: 'mapping'}, make('thead', {}, top), body)), use);
   }
@@ -99,12 +112,17 @@ desk.columns = (function () {
     var layouts = {}, seen = items.filter(function (i) { return i.seen && i.seen.head; });
     seen.forEach(function (i) {
       var key = JSON.stringify([i.seen.head.names, i.seen.head.units]);
-      (layouts[key] = layouts[key] || {head: i.seen.head, names: []}).names.push(i.name);
+      layouts[key] = layouts[key] || {head: i.seen.head, names: [], stored: [], text: text};
+      layouts[key].names.push(i.name);
+      layouts[key].stored.push(i.stored);
     });
     desk.filled(desk.el('columns'), JSON.stringify([layouts, text]), function () {
       var keys = Object.keys(layouts);
       if (!keys.length) { return [make('p', {className: 'note'}, 'No record yet.')]; }
-      return keys.map(function (key, k) { return table(layouts[key].head, layouts[key].names, text, 'layout' + k); });
+      return keys.map(function (key, k) {
+        layouts[key].others = keys.length > 1;
+        return table(layouts[key], 'layout' + k);
+      });
     });
     var drawn = items.filter(function (i) { return i.seen && i.seen.record; });
     var key = JSON.stringify(drawn.map(function (i) { return [i.key, i.name, i.seen.record]; }));

@@ -102,6 +102,7 @@ class Desk:
             item = self._items.pop(key, None)
             if item is not None:
                 removed(item.file.path)
+                self._settings = self._settings.without(item.file.path.name)
             self._changed()
 
     def hold(self, key: int, held: bool) -> None:

@@ -21,6 +21,8 @@ MODEL, JSON, REPORT, EVENTS, FMU = (
 #: Names that what a diagnosis leaves may have beside these.
 _MORE = ("extended_*_for_*.json", "diagnosis_next.csv")
 RESERVED = (MODEL, JSON, REPORT, EVENTS, FMU, "diagnosis_next.csv")
+#: Letters of a text: of --columns for all files that may be given.
+_LONGEST = 8000
 _FORMS = ("", "bouc-wen", "spectrum", "best")
 
 
@@ -40,7 +42,7 @@ class Settings:
     def changed(self, given: Mapping[str, Any], effects: Sequence[str]) -> "Settings":
         """Return the settings with what is given; raises InputError for what cannot be."""
         texts = ("columns", "sample_time", "stiffness", "hysteresis")
-        new = {name: str(given[name]).strip()[:2000] for name in texts if name in given}
+        new = {name: str(given[name]).strip()[:_LONGEST] for name in texts if name in given}
         left_out = given.get("leave_out", self.leave_out)
         if not isinstance(left_out, list | tuple) or not set(left_out) <= set(effects):
             raise InputError("An effect to leave out is not known.")
@@ -51,6 +53,11 @@ class Settings:
         if any(not text.isprintable() for text in new.values()):
             raise InputError("A text has characters that no command line can carry.")
         return replace(self, **new, leave_out=tuple(e for e in effects if e in left_out))
+
+    def without(self, file: str) -> "Settings":
+        """Return the settings without what --columns says of a file that is gone."""
+        kept = (p for p in self.columns.split(",") if not p.strip().startswith(f"{file}@"))
+        return replace(self, columns=",".join(kept))
 
     @property
     def seconds(self) -> float | None:

@@ -16,8 +16,8 @@ MOST_FILES, MOST_TOGETHER = 32, 2 * MOST_BYTES
 #: The longest name, in letters.
 _LONGEST = 80
 _BLOCK = 2**20
-#: What a name of a file may not have, on any system or in a command line.
-_BARRED = re.compile(r"[^\w.,+()@ -]")
+#: What a name of a file may not have, on any system, in a command line or in --columns.
+_BARRED = re.compile(r"[^\w.+() -]")
 
 
 @dataclass(frozen=True)

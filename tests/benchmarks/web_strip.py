@@ -27,7 +27,10 @@ var told = JSON.parse(box.querySelector('script').textContent);
 function start(name) {{
   return told.parameters.find(function (p) {{ return p.name === name; }}).value;
 }}
-{act}
+(function begin() {{
+  if (!box.psa) {{ setTimeout(begin, 20); return; }}
+  {act}
+}})();
 </script></body>"""
 
 

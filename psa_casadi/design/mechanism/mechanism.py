@@ -7,7 +7,11 @@ from math import inf
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.components.prestress import PRESTRESS_MECHANISM, PRESTRESS_PORT
+from psa_casadi.components.prestress import (
+    PRESTRESS_MECHANISM,
+    PRESTRESS_MOUNTS,
+    PRESTRESS_PORT,
+)
 from psa_casadi.design.mechanism.goals import Limits, check_goals, goal_texts, wanted_pairs
 from psa_casadi.design.mechanism.loop import (
     ACTS_ON,
@@ -31,7 +35,7 @@ from psa_casadi.variables import Provenance
 __all__ = [
     "ACTS_ON", "Limits", "Mechanics", "MechanismDesign", "Mounting", "bandwidth",
     "closed_polynomial", "damping_ratios", "design_mechanism", "mechanical_poles", "mechanics_of",
-    "mechanism_model", "port_model", "root_locus", "step_response", "stroke_loss",
+    "mechanism_model", "mounted_model", "port_model", "root_locus", "step_response", "stroke_loss",
 ]  # fmt: skip
 
 FloatArray = npt.NDArray[np.float64]
@@ -149,6 +153,26 @@ def mechanism_model(design: MechanismDesign, name: str = "mechanism") -> Model:
 def port_model(model: Model) -> Model:
     """Return a stack with the port for a mechanism's force and the motion of its tip."""
     return model.with_components((*model.plant().components, PRESTRESS_PORT))
+
+
+def mounted_model(model: Model, design: MechanismDesign) -> Model:
+    """Return a stack with its mechanism around it in one model; `mounted` = 0 is the free stack.
+
+    Raises InputError where the mechanism acts on the tip and the stack has a load that does so too.
+    """
+    both = {c.name for c in model.components} & {"load_stiffness", "preload_loss"}
+    if design.acts_on == "tip" and both:
+        raise InputError(
+            f"The mechanism and {' and '.join(sorted(both))} push on the same mass, which no model"
+            " here solves for: take that effect out, or couple the two FMUs (--port)."
+        )
+    m = design.mounting
+    whole = model.plant().with_components(
+        (*model.plant().components, PRESTRESS_MOUNTS[design.acts_on])
+    )
+    values = {"mounted": 1.0, "m_m": m.mass, "c_m": m.damping, "k_m": m.stiffness}
+    notes = (f"With a prestress mechanism for {' and '.join(design.goals)}.",)
+    return whole.with_values(values, provenance=Provenance(free=("m_m", "c_m", "k_m"), notes=notes))
 
 
 def root_locus(design: MechanismDesign, gains: FloatArray) -> ComplexArray:

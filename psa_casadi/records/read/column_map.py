@@ -22,7 +22,7 @@ def parse_columns(text: str) -> ColumnMap:
     or a MATLAB array: a field of a structure is written `log.u`, the second column of a matrix
     `m.2`. Without UNIT the header's own unit counts, else the SI unit; a displacement is never
     guessed. A number before UNIT says what 1 in the file is, whatever the header says: `10um` for
-    the volts of a sensor of 10 um/V.
+    the volts of a sensor of 10 um/V. `FILE@NAME=ARRAY:UNIT` is said of one file by its name.
 
     Raises:
         InputError: every part that is not of this form, names no column or no unit of it.
@@ -35,14 +35,16 @@ def parse_columns(text: str) -> ColumnMap:
         if match is None or not match["array"].strip():
             problems.add(f"{where}: is not understood; {_FORM}.")
             continue
-        name = re.sub(r"[\s-]+", "_", match["name"].strip().lower())
+        file, at, own = match["name"].strip().rpartition("@")
+        name = re.sub(r"[\s-]+", "_", own.strip().lower())
+        key = f"{file.strip()}{at}{name}"
         unit = match["unit"] if match["in"] is None else match["in"]
         if name not in COLUMNS:
             near = difflib.get_close_matches(name, COLUMNS, n=1, cutoff=0.6)
             meant = f"is '{near[0]}' meant? There are" if near else "there are"
             problems.add(f"{where}: '{name}' is no column of a record; {meant} {_NAMES}.")
-        elif name in found:
-            problems.add(f"{where}: '{name}' is given twice; remove one of the two.")
+        elif key in found:
+            problems.add(f"{where}: '{key}' is given twice; remove one of the two.")
         else:
             scaled = _SCALED.fullmatch(unit.strip()) if unit else None
             scale = float(scaled["scale"]) if scaled else None
@@ -53,6 +55,17 @@ def parse_columns(text: str) -> ColumnMap:
                 problems.add(
                     f"{where}: the scale {scale:g} leaves nothing of the numbers; correct it."
                 )
-            found[name] = Source(match["array"].strip(), unit, scale)
+            found[key] = Source(match["array"].strip(), unit, scale)
     problems.raise_if_any()
     return found
+
+
+def columns_of(wanted: ColumnMap, file: str) -> ColumnMap:
+    """Return what is said of one file: by its name, else what is said of all."""
+    own = {k.removeprefix(f"{file}@"): v for k, v in wanted.items() if k.startswith(f"{file}@")}
+    return own or {k: v for k, v in wanted.items() if "@" not in k}
+
+
+def files_named(wanted: ColumnMap) -> set[str]:
+    """Return the names of the files of which something is said."""
+    return {key.rpartition("@")[0] for key in wanted if "@" in key}

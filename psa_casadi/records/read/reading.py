@@ -23,7 +23,7 @@ from psa_casadi.records.checks import (
     check_length,
     check_time,
 )
-from psa_casadi.records.read.column_map import parse_columns
+from psa_casadi.records.read.column_map import columns_of, parse_columns
 from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.records.read.read_arrays import LOADERS, read_arrays
 from psa_casadi.records.read.read_csv import read_csv
@@ -63,7 +63,7 @@ def read_record(
     `need_displacement` demands a displacement column with values, as a comparison does;
     `need_excitation` a voltage that changes, as a fit does. `columns` names the arrays of the file
     that are the columns, such as "time=t:ms,voltage=log.u,displacement=m.2:um" (`parse_columns`);
-    `displacement=CH2:10um` says that 1 in the file is 10 um.
+    `displacement=CH2:10um` says that 1 in the file is 10 um, `b.csv@time=t:ms` is said of one file.
     `sample_time` [s] gives the time of a file without one.
 
     Raises:
@@ -71,7 +71,7 @@ def read_record(
             found, what was expected, what to do. At most 20 are listed, the others counted.
     """
     problems = Problems()
-    wanted = parse_columns(columns) if isinstance(columns, str) else columns or {}
+    wanted = _wanted(columns, Path(path).name)
     required = _required(need_displacement, sample_time)
     reader = READERS.get(Path(path).suffix.lower(), read_csv)
     samples = reader(str(path), required, wanted, problems)
@@ -138,7 +138,7 @@ def record_from(
         InputError: every mistake found, one sentence each.
     """
     problems = Problems()
-    wanted = parse_columns(columns) if isinstance(columns, str) else columns or {}
+    wanted = _wanted(columns, name)
     required = _required(need_displacement, sample_time)
     samples = read_table(table, name, required, wanted, problems)
     samples = _timed(samples, sample_time, problems)
@@ -149,6 +149,12 @@ def record_from(
     if samples is None:
         raise InputError(f"{name}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
     return _record(samples, source="")
+
+
+def _wanted(columns: str | ColumnMap | None, file: str) -> ColumnMap:
+    """Return which array of a file is which column, as far as it is said."""
+    told = parse_columns(columns) if isinstance(columns, str) else columns or {}
+    return columns_of(told, file)
 
 
 def records_given(given: Records) -> tuple[Record, ...]:

@@ -1,7 +1,8 @@
 """The part of a page that says where the error goes, with the unnamed correction's picture."""
 
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.patch_plot import patch_plot
 from psa_casadi.report.words.budget_words import budget_table, patch_text
 from psa_casadi.report.words.phrases import length_scale

@@ -3,8 +3,9 @@
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.diagnosis.residual.signature import Signature, signature
 from psa_casadi.diagnosis.result import Cause, Diagnosis
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.misfit_part import data_view, drawn
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.finding_plots import evidence_plot
 from psa_casadi.report.plots.signature_figure import size_sentence
 from psa_casadi.report.plots.view_plots import signature_plot, view_named

@@ -12,7 +12,7 @@ from psa_casadi.design.tracking.targets import Target
 from psa_casadi.design.tracking.tracking import TrackedInput
 from psa_casadi.design.tracking.trial import CorrectedInput
 from psa_casadi.design.tracking.verification import Response, TrackingError, usage
-from psa_casadi.report.page.document import Picture
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.theme import INK, Plot, styled
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, MEASURED_COLOUR, FloatArray

@@ -5,8 +5,11 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from psa_casadi.files import atomic_write
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import LiveModel, add_live
+from psa_casadi.report.page.packed import Picture
+from psa_casadi.report.plots.figure import record_figure, response_figure
+from psa_casadi.report.words.series import EXTENDED_COLOUR, Curve, Series
 from psa_casadi.report.words.tables import Table
 
 
@@ -53,6 +56,8 @@ def write_design_page(
         page.paragraph(summary[0], "verdict")
     if summary[1:]:
         page.bullets(summary[1:])
+    if live is not None:
+        _still(page, live)
     if figures:
         page.section("Figures")
     for picture in figures:
@@ -65,3 +70,17 @@ def write_design_page(
         if titled.note:
             page.paragraph(titled.note, "note")
     atomic_write(path, page.text())
+
+
+def _still(page: Document, live: LiveModel) -> None:
+    """Add what is seen of the design where no script runs: beside its path, where it has one."""
+    r = live.records[0]
+    time, voltage, model = r.time, r.inputs["voltage"], r.measured - r.residual
+    if not r.residual.any():
+        page.still(response_figure(time, voltage, model), "The model's answer to the voltage")
+        return
+    curve = Curve("model", EXTENDED_COLOUR, model)
+    series = Series(
+        r.name, time, voltage, r.measured, (curve,), r.held_out, noise=0.0, counts=False
+    )
+    page.still(record_figure(series, origin=live.aim), f"The {live.aim} and the model")

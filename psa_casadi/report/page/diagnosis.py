@@ -7,11 +7,11 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_write
 from psa_casadi.report.page.budget_part import add_budget
 from psa_casadi.report.page.cause_part import add_causes, add_evidence
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import add_live, live_diagnosis
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
-from psa_casadi.report.page.record_part import add_records, points_each
-from psa_casadi.report.plots.figure import diagnosis_figure
+from psa_casadi.report.page.packed import Picture
+from psa_casadi.report.page.record_part import add_records, add_still, points_each
 from psa_casadi.report.plots.residual_plots import time_plot
 from psa_casadi.report.words.phrases import (
     OWN_VOLTAGES,
@@ -44,25 +44,23 @@ def write_report(
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
-    small: bool = False,
     still: bool = False,
 ) -> None:
     """Write the page of a diagnosis, whole or not at all: the story first, then the details.
 
-    `origin`, "measured" or "synthetic", is what the page calls the records. A `small` page, below
-    1 MB, has one picture in place of the plots. Unless it is to be `still`, the model runs in the
-    page: sliders for its parameters, switches for its effects.
+    `origin`, "measured" or "synthetic", is what the page calls the records. Unless it is to be
+    `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
+    page is below 1.5 MB; where scripts are off it has one still picture.
 
     Raises InputError when `path` cannot be written to.
     """
     d, series = diagnosis, series_of(diagnosis)
     live = None if still else live_diagnosis(d, series)  # compiles beside what follows
-    page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin), small=small)
+    page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin))
     counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
     with one_unit(length_scale(d.base_errors.holdout_rms_m, counts=counts)):
         page.paragraph(verdict_sentence(d), "verdict")
-        if small:
-            page.still(diagnosis_figure(d, origin=origin), "The diagnosis in one picture")
+        add_still(page, most_telling(series), origin)
         _picture(page, series, origin)
         page.tiles(_tiles(d))
         add_budget(page, d)
@@ -92,7 +90,7 @@ def _picture(page: Document, series: Sequence[Series], origin: str) -> None:
     curves = listing([origin, *(c.label for c in s.curves)])
     noise = "Below: the residual; dashed: two standard deviations of the noise."
     shaded = " Shaded: held out." if s.held_out.any() else ""
-    plot = time_plot(s, origin, points_each(4))
+    plot = time_plot(s, origin, points_each(len(series)))
     page.picture(Picture(f"{s.name}: {curves}", plot, f"{noise}{shaded}"))
 
 

@@ -1,23 +1,23 @@
 """One self-contained HTML page: style, script, sections, tables and plots, nothing from the net."""
 
 import base64
-import hashlib
 import io
 import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from html import escape
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from plotly.offline import get_plotlyjs
+from matplotlib.image import imsave
 
-from psa_casadi.characters import plain
 from psa_casadi.command_line import typed
+from psa_casadi.report.page.packed import Drawings, Picture, library_hash, script_hash
+from psa_casadi.report.page.packed import words as _text
 from psa_casadi.report.plots.theme import DARK
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
@@ -25,31 +25,21 @@ from psa_casadi.version import __version__
 _FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
 _HASH = re.compile(r"[0-9a-f]{64}")
 _WIDE = 28
+#: Levels of red, green and blue of a still picture: lines on paper take few, and it is small.
+_LEVELS = 16
 #: The scripts of a model that runs in a page, by what it does there, in their order.
 _LIVE = ("live_model.js", "live_plot.js", "live_zoom.js", "live_knobs.js")
 LIVE_SCRIPTS = {
-    "report": (*_LIVE, "live.js", "live_start.js"),
+    "report": (*_LIVE, "live_budget.js", "live.js", "live_start.js"),
     "playground": (*_LIVE, "voltages.js", "playground.js", "live_start.js"),
 }
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A plotly figure with its caption and, below it, what the reader must know to read it."""
-
-    caption: str
-    plot: Any
-    note: str = ""
-
-
 class Document:
-    """Collects the parts of a page in their order and returns its text.
+    """Collects the parts of a page in their order and returns its text."""
 
-    A `small` page leaves plots out, and with them the library that draws them; it has stills.
-    """
-
-    def __init__(self, title: str, badges: Sequence[str], *, small: bool = False) -> None:
-        self._title, self.small, self._alive = title, small, ""
+    def __init__(self, title: str, badges: Sequence[str]) -> None:
+        self._title, self._alive, self._drawings = title, "", Drawings()
         marks = "".join(
             f'<span class="badge {_text(b.split()[0])}">{_text(b)}</span>' for b in badges
         )
@@ -119,23 +109,28 @@ class Document:
 
     def picture(self, picture: Picture) -> None:
         """Add a plot over the whole width."""
-        if not self.small:
-            self._parts.append(_figure(picture))
+        self._parts.append(self._drawings.figure(picture))
 
     def still(self, figure: Figure, caption: str) -> None:
-        """Add a picture that matplotlib draws, over the whole width."""
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=100)
+        """Add a picture that matplotlib draws; it is seen where the plots cannot be drawn.
+
+        That is where scripts are off, or the browser is older than 2023.
+        """
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()  # type: ignore[no-untyped-call]
+        drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+        step, buffer = 255.0 / (_LEVELS - 1), io.BytesIO()
+        imsave(buffer, (step * np.rint(drawn / step)).astype(np.uint8), format="png")
         data = base64.b64encode(buffer.getvalue()).decode("ascii")
         self._parts.append(
-            f'<figure><figcaption>{_text(caption)}</figcaption><img class="still"'
+            f'<figure class="stand-in"><figcaption>{_text(caption)}</figcaption><img class="still"'
             f' alt="{_text(caption)}" src="data:image/png;base64,{data}"></figure>'
         )
 
     def pictures(self, pictures: Iterable[Picture]) -> None:
         """Add plots side by side, two in a row where there is room."""
-        if not self.small:
-            self._parts.append(f'<div class="pair">{"".join(map(_figure, pictures))}</div>')
+        figures = "".join(map(self._drawings.figure, pictures))
+        self._parts.append(f'<div class="pair">{figures}</div>')
 
     def live(self, told: Callable[[], Mapping[str, Any] | str]) -> None:
         """Add a model that runs in the page.
@@ -163,19 +158,21 @@ class Document:
             body += [f'<nav aria-label="contents">{contents}</nav>', *self._parts]
         told = [part if isinstance(part, str) else part() for part in body]
         style = _source("page.css") + (_source("live.css") if self._alive else "")
-        library = [] if self.small else [get_plotlyjs()]
-        scripts = [] if self.small else [_source("page.js")]
+        scripts = [_source("packed.js")] if self._drawings or self._alive else []
+        scripts += [_source("page.js")] if self._drawings else []
         scripts += ["\n".join(map(_source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
+        allowed = [script_hash(text.encode()) for text in scripts]
+        allowed += [library_hash()] if self._drawings else []
         return (
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-            + _policy([*library, *scripts])
+            + _policy(allowed)
             + '<meta name="viewport" content="width=device-width, initial-scale=1">'
             f"<title>{_text(self._title)}</title><style>{style}</style>"
-            + "".join(f"<script>{text}</script>" for text in library)
             + "</head>\n<body><main>\n"
             + "\n".join(told)
             + f"\n<footer>{_text(_made())}</footer>"
             + f'\n<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
+            + (self._drawings.shared() if self._drawings else "")
             + "\n</main>"
             + "".join(f"<script>{text}</script>" for text in scripts)
             + "\n</body></html>\n"
@@ -189,8 +186,7 @@ def _source(name: str) -> str:
 
 def _policy(scripts: Iterable[str]) -> str:
     """Return what a browser is told to refuse: all scripts but these, and all requests."""
-    digests = (hashlib.sha256(text.encode()).digest() for text in scripts)
-    allowed = " ".join(f"'sha256-{base64.b64encode(d).decode('ascii')}'" for d in digests)
+    allowed = " ".join(scripts)
     rules = (
         "default-src 'none'", "style-src 'unsafe-inline'", "img-src data: blob:",
         f"script-src 'wasm-unsafe-eval' {allowed}", "base-uri 'none'", "form-action 'none'",
@@ -212,11 +208,6 @@ def _made() -> str:
     return f"Written {when:%Y-%m-%d %H:%M} UTC by psa_casadi {__version__}.{command}"
 
 
-def _text(words: str) -> str:
-    """Return words as HTML can carry them; a percent sign stays with its number."""
-    return escape(plain(words)).replace(" %", "\u00a0%")
-
-
 def _list(texts: Iterable[str]) -> str:
     return f"<ul>{''.join(f'<li>{_text(t)}</li>' for t in texts)}</ul>"
 
@@ -233,15 +224,3 @@ def _column_style(cells: Sequence[str]) -> str:
     if filled and all(_HASH.fullmatch(c) for c in filled):
         return "hash"
     return "wide" if any(len(c) > _WIDE for c in filled) else ""
-
-
-def _figure(picture: Picture) -> str:
-    # "<" is escaped so that no text in a figure can end the script that holds it
-    data = picture.plot.to_json().replace("<", "\\u003c")
-    note = f'<p class="note">{_text(picture.note)}</p>' if picture.note else ""
-    caption = _text(picture.caption)
-    return (
-        f"<figure><figcaption>{caption}</figcaption>"
-        f'<script type="application/json">{data}</script>'
-        f'<div class="drawing" role="img" aria-label="{caption}"></div>{note}</figure>'
-    )

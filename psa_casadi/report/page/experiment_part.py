@@ -14,8 +14,8 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records import write_record
 from psa_casadi.records.record import Record
 from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.document import Picture
 from psa_casadi.report.page.live_part import live_design
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.theme import styled
 from psa_casadi.report.words.phrases import (
     interval_text,

@@ -8,10 +8,10 @@ import numpy as np
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.certainty.profile import Profile, profile_sentences
 from psa_casadi.identification.identify import Identification
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import LiveModel, add_live, live_fit
-from psa_casadi.report.page.record_part import add_records
-from psa_casadi.report.plots.figure import fit_figure
+from psa_casadi.report.page.packed import Picture
+from psa_casadi.report.page.record_part import add_records, add_still
 from psa_casadi.report.plots.finding_plots import correlation_plot, determinacy_plot
 from psa_casadi.report.plots.profile_plot import profile_plot
 from psa_casadi.report.words.fit_words import (
@@ -23,7 +23,7 @@ from psa_casadi.report.words.fit_words import (
 from psa_casadi.report.words.grades import Grade, grades, named, strong_pairs
 from psa_casadi.report.words.phrases import Scale, number, one_unit
 from psa_casadi.report.words.residuals import ResidualFigures, residual_figures
-from psa_casadi.report.words.series import Series, series_of_fit
+from psa_casadi.report.words.series import Series, most_telling, series_of_fit
 from psa_casadi.report.words.tables import (
     fit_error_table,
     parameter_table,
@@ -38,21 +38,20 @@ def write_fit_report(
     *,
     origin: str = "measured",
     profiles: Sequence[Profile] = (),
-    small: bool = False,
     still: bool = False,
 ) -> None:
     """Write the page of an identification, whole or not at all.
 
     It shows what the records determine, measured and model, and what the residual is.
     `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. A `small` page, below 1 MB, has one picture in place of the plots.
-    Unless it is to be `still`, the model runs in the page.
+    beside the determinacy. Unless it is to be `still`, the model
+    runs in the page.
     Raises InputError when `path` cannot be written to.
     """
     series = series_of_fit(found)
     live = None if still else live_fit(found, series)
     with one_unit(_scale(series)):
-        page = fit_page(found, series, origin=origin, profiles=profiles, small=small, live=live)
+        page = fit_page(found, series, origin=origin, profiles=profiles, live=live)
     atomic_write(path, page)
 
 
@@ -62,7 +61,6 @@ def fit_page(
     *,
     origin: str = "measured",
     profiles: Sequence[Profile] = (),
-    small: bool = False,
     live: LiveModel | None = None,
 ) -> str:
     """Return the page; `series` are the records of the identification with the model's curve.
@@ -73,10 +71,9 @@ def fit_page(
     graded = grades(found)
     count = len(series)
     records = f"{count} record{'s' if count > 1 else ''}"
-    page = Document("Identification of a stack", [f"{origin} data", records], small=small)
+    page = Document("Identification of a stack", [f"{origin} data", records])
     _verdict(page, found, figures, graded, origin, _scale(series))
-    if small:
-        page.still(fit_figure(found, origin=origin), "The fit in one picture")
+    add_still(page, most_telling(series), origin)
     if live is not None:
         add_live(page, live)
     _determined(page, found, graded)

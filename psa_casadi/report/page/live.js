@@ -2,7 +2,9 @@
 psaLive.report = function (box, told, run) {
   'use strict';
   var make = psaLive.make, values = told.parameters.map(function (p) { return p.value; });
-  var fitted = values.slice(), record = null, waiting = false, corrected = {checked: false}, last = null;
+  var fitted = values.slice(), record = null, waiting = false, corrected = {checked: false}, last = null, idle = 0;
+  var index = {};
+  told.parameters.forEach(function (p, i) { index[p.name] = i; });
 
   told.records.forEach(function (r) {
     r.t = r.t ? psaLive.doubles(r.t) : Float64Array.from({length: r.n}, function (_, k) { return k * r.step; });
@@ -38,19 +40,19 @@ psaLive.report = function (box, told, run) {
     return count ? sum / count : 0;
   }
 
-  function simulate(r, at, quick) {
+  function simulate(r, at, quick, corrects) {
     var found = run({values: at, t: r.t, inputs: r.inputs, deviation: r.deviation, settle: true, rest: r.rest, quick: quick});
     if (found.status) { return found; }
     var y = found.outputs[told.shown];
-    for (var k = 0; k < y.length; k += 1) { y[k] += corrected.checked && r.correction ? r.correction[k] : 0; }
+    for (var k = 0; k < y.length; k += 1) { y[k] += corrects && r.correction ? r.correction[k] : 0; }
     return {status: 0, way: found.way, y: y};
   }
 
   function missed(r, y) { return r.measured.map(function (m, k) { return m - y[k]; }); }
 
   // The sensor's offset is found again for other values, as a fit does: the mean residual stays the fit's.
-  function answer(r, quick) {
-    var now = simulate(r, values, quick);
+  function answer(r, quick, at, corrects) {
+    var now = simulate(r, at || values, quick, corrects === undefined ? corrected.checked : corrects);
     if (now.status) { return now; }
     var shift = told.design ? 0 : mean(r, missed(r, now.y)) - r.center;
     now.y = now.y.map(function (y) { return y + shift; });
@@ -72,7 +74,7 @@ psaLive.report = function (box, told, run) {
     span.style.setProperty('--own', 'var(' + row[0] + ')');
     legend.appendChild(span);
   });
-  var output = make('output', {}), status = make('span', {role: 'status'});
+  var output = make('output', {}), budget = make('div', {className: 'budget'}), status = make('span', {role: 'status'});
 
   function length(metres) { return +(told.error.factor * metres).toPrecision(3) + ' ' + told.error.unit; }
 
@@ -86,9 +88,9 @@ psaLive.report = function (box, told, run) {
       return;
     }
     var text = (record.judged.any ? 'Error on held-out samples' : 'Error') + ': ' + length(size) + ' rms, ' +
-      +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.noise) + '.';
-    if (record.base > record.noise && told.extended) {
-      var left = Math.max(0, size * size - record.noise * record.noise) / (record.base * record.base - record.noise * record.noise);
+      +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.floor) + '.';
+    if (record.base > record.floor && told.extended) {
+      var left = Math.max(0, size * size - record.floor * record.floor) / (record.base * record.base - record.floor * record.floor);
       text += left < 1
         ? ' Of the base model\u2019s error above the noise (in power) ' + Math.round(100 * (1 - left)) + ' % is removed.'
         : ' That is more than the base model leaves, which was fitted by itself: ' + length(record.base) + '.';
@@ -123,6 +125,20 @@ psaLive.report = function (box, told, run) {
     });
   }
 
+  // What each effect that is on takes off the error now, by itself; when the slider rests.
+  function tell() {
+    var on = told.effects.filter(function (e) { return values[index[e.gain]] !== 0; }), which = record.judged.any ? 1 : null;
+    function size_(found) { return found.status ? NaN : rms(record, found.residual, which); }
+    function without(i) {
+      var at = values.slice();
+      at[i] = 0;
+      return size_(answer(record, true, at));
+    }
+    var rows = on.map(function (e) { return [e.title, without(index[e.gain])]; });
+    if (corrected.checked) { rows.push(['unnamed correction', size_(answer(record, true, values, false))]); }
+    psaLive.budget(budget, rows, size_(answer(record, true)), record.floor, length);
+  }
+
   function redraw() {
     if (!waiting) { return; }
     waiting = false;
@@ -130,6 +146,8 @@ psaLive.report = function (box, told, run) {
     say(now);
     draw(now);
     last = {run: ran - began, draw: performance.now() - ran, samples: record.t.length};
+    clearTimeout(idle);
+    if (!told.design && !now.status) { idle = setTimeout(tell, 300); }
   }
   function later() {
     if (waiting) { return; }
@@ -196,7 +214,7 @@ psaLive.report = function (box, told, run) {
     ? [make('label', {className: 'field', text: 'Record'}, [chosen])] : [];
   [
     make('div', {className: 'bar'}, choice.concat(buttons, [status])), legend,
-    make('div', {className: 'large'}, [figure(0)]), make('div', {className: 'pair'}, [figure(1), figure(2)]), output, note
+    make('div', {className: 'large'}, [figure(0)]), make('div', {className: 'pair'}, [figure(1), figure(2)]), output, budget, note
   ].concat(knobs.nodes(function (p) { return p.free || p.interval; }, switches)).forEach(function (n) { box.appendChild(n); });
   choose();
   window.addEventListener('resize', later);
@@ -205,7 +223,7 @@ psaLive.report = function (box, told, run) {
   box.psa = {
     values: values, redraw: redraw, last: function () { return last; }, set: function (name, value) {
       var at = values.slice();
-      at[told.parameters.findIndex(function (p) { return p.name === name; })] = value;
+      at[index[name]] = value;
       knobs.move(at);
       waiting = true;
       redraw();

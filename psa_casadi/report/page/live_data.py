@@ -11,6 +11,7 @@ from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
+from psa_casadi.report.page.packed import packed
 from psa_casadi.report.words.phrases import plain, shown_in
 from psa_casadi.simulation.ways import output_of
 from psa_casadi.units import convert
@@ -47,7 +48,7 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
     s = model.structure
     return {
         "name": model.name,
-        "wasm": base64.b64encode(module).decode("ascii"),
+        "wasm": packed(module),
         "parameters": [_parameter(model, p) for p in s.parameters],
         "effects": [_effect(model, c) for c in model.effects],
         "inputs": [{"name": i.name, "unit": i.unit, "start": i.start} for i in s.inputs],

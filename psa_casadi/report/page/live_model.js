@@ -1,16 +1,12 @@
 // A model of psa_casadi in WebAssembly: parameters and a record in, a trajectory out. SI units.
 var psaLive = {};
 
-psaLive.bytes = function (base64) {
-  'use strict';
-  var text = atob(base64), found = new Uint8Array(text.length);
-  for (var i = 0; i < text.length; i += 1) { found[i] = text.charCodeAt(i); }
-  return found;
-};
-
 // Arrays lie in a page as base64 of little-endian numbers.
-psaLive.doubles = function (base64) { return new Float64Array(psaLive.bytes(base64).buffer); };
-psaLive.singles = function (base64) { return Float64Array.from(new Float32Array(psaLive.bytes(base64).buffer)); };
+psaLive.doubles = function (base64) { return new Float64Array(psaPacked.bytes(base64).buffer); };
+psaLive.singles = function (base64) { return Float64Array.from(new Float32Array(psaPacked.bytes(base64).buffer)); };
+
+// Tolerance while a slider moves: the loosest that exact steps gain from, a thousandth of what a curve's width shows.
+psaLive.dragged = 1e-5;
 
 psaLive.reasons = {
   1: 'the step size became too small', 2: 'a value is not finite', 3: 'too many steps were needed',
@@ -37,7 +33,7 @@ psaLive.load = function (told) {
       for (var k = 0; k < n; k += 1) { inputs[k * nu + j] = given ? given[k] : input.start; }
     });
     var settle = !asked.start && (asked.settle || !told.starts_itself);
-    var status = page.page_run(asked.rtol || 1e-6, asked.hold === 'zero' ? 1 : 0, settle ? (asked.rest ? 2 : 1) : 0,
+    var status = page.page_run(asked.rtol || (asked.quick ? psaLive.dragged : 1e-6), asked.hold === 'zero' ? 1 : 0, settle ? (asked.rest ? 2 : 1) : 0,
       asked.quick ? 1 : 0, told.shown_nominal);
     function columns(at, names) {
       var all = view(at, n * names.length), found = {};
@@ -54,11 +50,11 @@ psaLive.load = function (told) {
       outputs: columns(page.page_outputs(), told.outputs), states: columns(page.page_states(), told.states)
     };
   }
-  function runner(instance) { return function (asked) { return run(instance.exports, asked); }; }
-  var bytes = psaLive.bytes(told.wasm), imports = {Math: Math};
-  try {
-    return Promise.resolve(runner(new WebAssembly.Instance(new WebAssembly.Module(bytes), imports)));
-  } catch (refused) { // browsers of before 2023 compile so much only beside the page's own work
-    return WebAssembly.instantiate(bytes, imports).then(function (made) { return runner(made.instance); });
-  }
+  return psaPacked.open(told.wasm).then(function (bytes) {
+    try {
+      return new WebAssembly.Instance(new WebAssembly.Module(bytes), {Math: Math});
+    } catch (refused) { // browsers of before 2023 compile so much only beside the page's own work
+      return WebAssembly.instantiate(bytes, {Math: Math}).then(function (made) { return made.instance; });
+    }
+  }).then(function (instance) { return function (asked) { return run(instance.exports, asked); }; });
 };

@@ -37,8 +37,9 @@ class LiveRecord:
     """A record that a model runs on, arrays (n,) in SI units: what it is compared with, and how.
 
     `deviation` holds the start of states off where the voltage puts them, `center` the residual of
-    the model as it was fitted, `base` the base model's rms error, `correction` what an unnamed
-    correction adds. It begins in motion, or at `rest`.
+    the model as it was fitted, `floor` the noise that errors are judged by (0: `noise`), `base` the
+    base model's rms error, `correction` what an unnamed correction adds. It begins in motion, or
+    at `rest`.
     """
 
     name: str
@@ -49,6 +50,7 @@ class LiveRecord:
     residual: FloatArray
     deviation: Mapping[str, float]
     noise: float
+    floor: float = 0.0
     base: float = 0.0
     correction: FloatArray | None = None
     rest: bool = False
@@ -77,10 +79,12 @@ def live_diagnosis(d: Diagnosis, rows: Sequence[Series]) -> LiveModel:
     beyond = (
         [] if patch is None else [p - x for p, x in zip(patch.predicted, d.extended, strict=True)]
     )
+    # the page's other errors are judged by the noise of all records together
+    share = d.noise_floor_rms_m / (float(np.sqrt(np.mean([s.noise**2 for s in rows]))) or 1.0)
     return LiveModel(
         model=d.model,
         module=begun_module(d.model),
-        records=_fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond),
+        records=_fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond, share),
         extended=added(d),
         correction="" if patch is None else f"{patch.name}, as it was found: it does not follow",
         counts=any(s.counts for s in rows),
@@ -126,8 +130,12 @@ def _fitted_records(
     experiments: Sequence[Experiment],
     series: Sequence[Series],
     beyond: Sequence[FloatArray],
+    share: float = 1.0,
 ) -> list[LiveRecord]:
-    """Return the records of a fit; `beyond` is what an unnamed correction adds to each."""
+    """Return the records of a fit; `beyond` is what an unnamed correction adds to each.
+
+    `share` is what counts of each record's noise where errors are judged.
+    """
     theta = shared_starts(model, fit.unknowns, fit.theta, experiments)[0]
     rows = []
     for k, (e, s) in enumerate(zip(experiments, series, strict=True)):
@@ -142,6 +150,7 @@ def _fitted_records(
                 residual=s.residual(s.curves[-1]),
                 deviation=fit.unknowns.start(theta, k),
                 noise=s.noise,
+                floor=share * s.noise,
                 base=_judged_rms(s.residual(s.curves[0]), s.held_out),
                 correction=beyond[k] if beyond else None,
             )
@@ -230,6 +239,7 @@ def _record(r: LiveRecord, limit: int) -> dict[str, Any]:
         "center": float(np.mean(residual[fitted])) if fitted.any() else 0.0,
         "deviation": dict(r.deviation),
         "noise": r.noise,
+        "floor": r.floor or r.noise,
         "rest": r.rest,
         "range": _range(r),
         "base": r.base,

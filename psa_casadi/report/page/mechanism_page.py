@@ -12,17 +12,24 @@ from psa_casadi.design.mechanism.mechanism import (
     MechanismDesign,
     Mounting,
     Reached,
+    mounted_model,
     root_locus,
     step_response,
 )
+from psa_casadi.design.tracking.verification import respond
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Model
 from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.document import Picture
+from psa_casadi.report.page.live_part import LiveModel, live_design
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.theme import INK, Plot, styled
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, NOISE_COLOUR
 from psa_casadi.report.words.tables import Table
 
 _FREE = Mounting(0.0, 0.0, 0.0)
+#: Samples of the step that the page's model runs on.
+_STEP_SAMPLES = 3000
 
 
 @dataclass(frozen=True)
@@ -159,8 +166,29 @@ def step_plot(d: MechanismDesign) -> Plot:
     return styled(plot, 400)
 
 
-def write_mechanism_page(d: MechanismDesign, path: str | os.PathLike[str], stack: str) -> None:
-    """Write the design as an HTML page; raises InputError if it cannot be written."""
+def _live(d: MechanismDesign, model: Model) -> LiveModel:
+    """Begin what lets the mounted stack run in the page, on a step of the rated voltage."""
+    whole = mounted_model(model, d)
+    end = 2.0 * float(response_times(d.mechanics, d.mounting)[-1])
+    time = np.linspace(0.0, end, _STEP_SAMPLES)
+    voltage = np.where(time > 0.02 * end, model.values["u_rated"], 0.0)
+    played = respond(whole, time, voltage)
+    return live_design(whole, (time, voltage, played.displacement), rest=True)
+
+
+def write_mechanism_page(
+    d: MechanismDesign, path: str | os.PathLike[str], model: Model, *, still: bool = False
+) -> None:
+    """Write the design as an HTML page; `model` is the stack.
+
+    Unless it is to be `still`, the stack with its mechanism runs in the page. Raises InputError if
+    it cannot be written.
+    """
+    why, live = "", None
+    try:
+        live = None if still else _live(d, model)
+    except InputError as error:
+        why = f"The model does not run in this page. {error}"
     tables: Sequence[_Titled] = (
         _Titled("Mechanism", mechanism_table(d)),
         _Titled(
@@ -184,8 +212,9 @@ def write_mechanism_page(d: MechanismDesign, path: str | os.PathLike[str], stack
     )
     write_design_page(
         path,
-        title=f"Prestress mechanism for {stack}",
-        summary=mechanism_sentences(d),
+        title=f"Prestress mechanism for {model.name}",
+        summary=[*mechanism_sentences(d), *([why] if why else [])],
+        live=live,
         tables=tables,
         figures=figures,
     )

@@ -6,7 +6,8 @@ import numpy as np
 
 from psa_casadi.diagnosis.residual.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.view_plots import spectrum_view_plot, view_named, view_plot
 from psa_casadi.report.words.phrases import (
     added,

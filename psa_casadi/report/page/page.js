@@ -4,7 +4,10 @@
   var scheme = window.matchMedia('(prefers-color-scheme: dark)');
   var finger = window.matchMedia('(pointer: coarse)').matches;
   var boxes = Array.prototype.slice.call(document.querySelectorAll('.drawing'));
-  var config = {responsive: true, displaylogo: false, displayModeBar: false};
+  var config, arrays;
+  if (!psaPacked.able) { return; } // the still picture stays
+  document.documentElement.classList.add('scripted');
+  config = {responsive: true, displaylogo: false, displayModeBar: false};
 
   // every colour of a figure is written for paper; at night each has a counterpart
   function painted(part, night) {
@@ -14,7 +17,10 @@
     if (Array.isArray(part)) {
       return part.map(function (p) { return painted(p, night); });
     }
-    if (part === null || typeof part !== 'object' || 'bdata' in part) { return part; }
+    if (part === null || typeof part !== 'object') { return part; }
+    if ('bdata' in part) { // a number stands for an array that several curves share
+      return typeof part.bdata === 'number' ? Object.assign({}, part, {bdata: arrays[part.bdata]}) : part;
+    }
     var copy = {};
     Object.keys(part).forEach(function (key) { copy[key] = painted(part[key], night); });
     return copy;
@@ -29,6 +35,7 @@
     }
     var room = width || box.clientWidth;
     if (layout.meta && layout.meta.square) { layout.height = Math.min(layout.height, room + 30); }
+    box.style.height = layout.height + 'px'; // else a window that turns and darkens at once leaves none
     if (room < 480) {
       layout.font.size = 11;
       layout.margin.l = Math.min(layout.margin.l, 52);
@@ -45,8 +52,23 @@
     });
   }
 
-  all(scheme.matches, false);
-  scheme.addEventListener('change', function () { all(scheme.matches, false); });
-  window.addEventListener('beforeprint', function () { all(false, true); });
-  window.addEventListener('afterprint', function () { all(scheme.matches, false); });
+  function begin(library) {
+    var script = document.createElement('script');
+    script.textContent = library;
+    document.head.appendChild(script);
+    all(scheme.matches, false);
+    scheme.addEventListener('change', function () { all(scheme.matches, false); });
+    window.addEventListener('beforeprint', function () { all(false, true); });
+    window.addEventListener('afterprint', function () { all(scheme.matches, false); });
+  }
+
+  Promise.all(['arrays', 'library'].map(function (name) {
+    return psaPacked.text(document.getElementById(name).textContent);
+  })).then(function (found) {
+    arrays = found[0].split(' ');
+    begin(found[1]);
+  }).catch(function (error) {
+    document.documentElement.classList.remove('scripted');
+    throw error;
+  });
 })();

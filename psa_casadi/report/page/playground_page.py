@@ -38,7 +38,7 @@ def playground(model: Model | None = None) -> str:
         if not {p.name for p in effect.parameters} & set(whole.parameter_names):
             whole = whole.with_effect(effect)
     title = next((n for n in STACKS if stack_model(n).name == given.name), given.name)
-    page = Document(f"Play with {title}", ["every effect", "no network"], small=True)
+    page = Document(f"Play with {title}", ["every effect", "no network"])
     page.paragraph(
         "A piezo stack that runs in this page: give it a voltage, switch effects on, change what it"
         " is made of.",

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 from psa_casadi.files import atomic_write
 from psa_casadi.population.population import Population
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
+from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot
 from psa_casadi.report.words.population_words import (
     METHOD,

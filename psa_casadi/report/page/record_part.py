@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
-from psa_casadi.report.page.document import Document, Picture
+from psa_casadi.report.page.document import Document
+from psa_casadi.report.page.packed import Picture
+from psa_casadi.report.plots.figure import record_figure
 from psa_casadi.report.plots.residual_plots import (
     autocorrelation_plot,
     distribution_plot,
@@ -16,10 +18,8 @@ from psa_casadi.report.words.fit_words import residual_sentence
 from psa_casadi.report.words.residuals import ResidualFigures
 from psa_casadi.report.words.series import Series
 
-#: Samples of all records that may be drawn together: with all their curves about 2 MB of text.
-_MOST_POINTS = 22_000
-#: Samples of one record beyond which no screen shows more.
-_POINTS = 12_000
+#: Samples of all records that may be drawn together: with all their curves about 0.5 MB of text.
+_MOST_POINTS = 13_000
 #: Records that are drawn; of more, those that the model misses most.
 MOST_RECORDS = 16
 
@@ -48,9 +48,14 @@ def add_records(
         _add(page, series[k], figures[k], origin, points_each(len(shown)), above)
 
 
+def add_still(page: Document, shown: Series, origin: str) -> None:
+    """Add what is seen of a record where no script runs: measured against model, loop, residual."""
+    page.still(record_figure(shown, origin=origin), f"{shown.name}: {origin} and model")
+
+
 def points_each(records: int) -> int:
-    """Return how many samples of one record may be drawn, so that the page stays below 8 MB."""
-    return min(_POINTS, _MOST_POINTS // max(1, records))
+    """Return how many samples of each record may be drawn, so that the page stays below 1.5 MB."""
+    return _MOST_POINTS // min(MOST_RECORDS, max(1, records))
 
 
 def _worst(figures: Sequence[ResidualFigures]) -> list[int]:

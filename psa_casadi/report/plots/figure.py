@@ -3,6 +3,7 @@
 import math
 import os
 import textwrap
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,8 +21,10 @@ from psa_casadi.report.words.series import (
     HELD_OUT_COLOUR,
     MEASURED_COLOUR,
     NOISE_COLOUR,
+    FloatArray,
     Series,
     bar_colour,
+    kept,
     most_telling,
     series_of,
     series_of_fit,
@@ -31,6 +34,16 @@ from psa_casadi.report.words.series import (
 from psa_casadi.simulation.simulate import Trajectory
 
 _SIZE_INCHES, _DPI = (16.0, 10.0), 100
+_STILL_INCHES, _STILL_DPI, _STILL_POINTS = (12.0, 6.4), 80, 4000
+#: Room around the plots of a still picture, for labels of any size that they have there.
+_STILL_ROOM = {
+    "left": 0.075,
+    "right": 0.99,
+    "top": 0.95,
+    "bottom": 0.09,
+    "hspace": 0.42,
+    "wspace": 0.3,
+}
 _FONT = 13.0
 
 
@@ -52,9 +65,21 @@ def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figur
     shown = most_telling(series)
     figure, grid = _sheet()
     _record(figure, grid, shown, origin)
-    _residual(figure.add_subplot(grid[1, :2]), shown)
+    _residual(figure.add_subplot(grid[1, :2]), shown, "measured")
     _evidence(figure.add_subplot(grid[1, 2]), diagnosis)
     figure.suptitle(_title(diagnosis, series, shown, origin), fontsize=_FONT + 3)
+    return figure
+
+
+def record_figure(s: Series, *, origin: str = "measured") -> Figure:
+    """Return the picture of one record: measured against model, loop and residual."""
+    s = _fewer(s)
+    figure = Figure(figsize=_STILL_INCHES, dpi=_STILL_DPI)
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
+    _time(figure.add_subplot(grid[0, :2]), s, slice(None), origin, None)
+    _loop(figure.add_subplot(grid[0, 2]), s, origin)
+    _residual(figure.add_subplot(grid[1, :]), s, origin)
     return figure
 
 
@@ -64,7 +89,7 @@ def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
     shown = most_telling(series)
     figure, grid = _sheet()
     _record(figure, grid, shown, origin)
-    _residual(figure.add_subplot(grid[1, :]), shown)
+    _residual(figure.add_subplot(grid[1, :]), shown, "measured")
     which = f"{origin} record: {shown.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the model misses most)"
@@ -74,17 +99,30 @@ def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
 
 def trajectory_figure(run: Trajectory) -> Figure:
     """Return the picture of a simulation: displacement over time and over the voltage."""
+    return response_figure(run.time, run.voltage, run.displacement)
+
+
+def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:
+    """Return the picture of a displacement [m] over time [s] and over the voltage [V]."""
     figure = Figure(
         figsize=(_SIZE_INCHES[0], 0.5 * _SIZE_INCHES[1]), dpi=_DPI, layout="constrained"
     )
     FigureCanvasAgg(figure)
     over_time, loop = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
-    scale = length_scale(float(np.ptp(run.displacement)))
-    y = scale.factor * run.displacement
-    for axes, x, label in ((over_time, run.time, "time [s]"), (loop, run.voltage, "voltage [V]")):
+    scale = length_scale(float(np.ptp(displacement)))
+    y = scale.factor * displacement
+    for axes, x, label in ((over_time, time, "time [s]"), (loop, voltage, "voltage [V]")):
         axes.plot(x, y, color=EXTENDED_COLOUR, linewidth=1.2)
         _style(axes, "Displacement" if axes is over_time else "Loop", label, f"[{scale.unit}]")
     return figure
+
+
+def _fewer(s: Series) -> Series:
+    """Return a record with as many samples as a still picture can show, extremes among them."""
+    part = kept([s.voltage, s.measured, *(s.residual(c) for c in s.curves)], _STILL_POINTS)
+    curves = tuple(replace(c, values=c.values[part]) for c in s.curves)
+    columns = {n: getattr(s, n)[part] for n in ("time", "voltage", "measured", "held_out")}
+    return replace(s, curves=curves, **columns)
 
 
 def _sheet() -> tuple[Figure, GridSpec]:
@@ -141,7 +179,7 @@ def _time(axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None) -
         _shade_held_out(axes, s)
         low, high = s.time[zoom][0], s.time[zoom][-1]
         axes.axvspan(low, high, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
-    title = "The part in the box"
+    title = "Displacement" if len(time) == len(s.time) else "The part in the box"
     if zoom is not None:
         title = "Displacement (box: the part on the right)"
     _style(axes, title, "time [s]", f"displacement [{scale.unit}]")
@@ -162,19 +200,19 @@ def _loop(axes: Axes, s: Series, origin: str) -> None:
     axes.legend(fontsize=_FONT - 1, framealpha=0.85, loc="upper left")
 
 
-def _residual(axes: Axes, s: Series) -> None:
+def _residual(axes: Axes, s: Series, origin: str) -> None:
     scale = s.residual_scale
     _shade_held_out(axes, s)
     for curve in s.curves:
         values = scale.factor * s.residual(curve)
         axes.plot(s.time, values, color=curve.colour, linewidth=0.9, label=f"of the {curve.label}")
     band = 2.0 * scale.factor * s.noise
-    for edge in (-band, band):
+    for edge in (-band, band) if band > 0 else ():
         label = "noise (2 sigma)" if edge > 0 else None
         axes.axhline(edge, color="black", linewidth=1.3, linestyle="--", label=label)
-    _style(axes, "Residual: measured minus model", "time [s]", f"residual [{scale.unit}]")
+    _style(axes, f"Residual: {origin} minus model", "time [s]", f"residual [{scale.unit}]")
     axes.margins(x=0.005)
-    largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves) * scale.factor
+    largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves) * scale.factor or 1.0
     axes.set_ylim(-1.1 * largest, 1.45 * largest)
     axes.legend(
         fontsize=_FONT - 1.5, ncols=4, loc="upper center", columnspacing=1.2, handlelength=1.4

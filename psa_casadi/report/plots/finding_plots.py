@@ -11,7 +11,6 @@ from psa_casadi.report.plots.theme import (
     AXIS,
     BOUND_COLOUR,
     INK,
-    PAPER,
     WEAK_COLOUR,
     Plot,
     styled,
@@ -83,30 +82,36 @@ def _error_text(grade: Grade) -> str:
 def correlation_plot(found: Identification) -> Plot:
     """Correlations of the estimates as a square of colours, strong ones with their figure."""
     names, matrix = list(found.determinacy.names), found.determinacy.correlations
-    lower = np.where(np.tri(len(names), dtype=bool), np.clip(matrix, -1.0, 1.0), np.nan)
-    written = len(names) <= _MOST_FIGURES
-    text = [[_correlation_text(v) if written and i > k else "" for k, v in enumerate(row)]
-            for i, row in enumerate(lower.tolist())]  # fmt: skip
-    plot = go.Figure(
-        go.Heatmap(
-            z=np.float32(lower), x=names, y=names, zmin=-1.0, zmax=1.0, text=text,
-            texttemplate="%{text}", textfont={"size": 10}, xgap=1.5, ygap=1.5,
-            colorscale=[[0.0, BASE_COLOUR], [0.5, PAPER], [1.0, EXTENDED_COLOUR]],
-            colorbar={"thickness": 12, "len": 0.9, "outlinewidth": 0, "tickvals": [-1, 0, 1],
-                      "ticktext": ["−1", "0", "+1"]},
-            hovertemplate="%{y} and %{x}: %{z:.3f}<extra></extra>",
-        )
-    )  # fmt: skip
+    written, plot = len(names) <= _MOST_FIGURES, go.Figure()
+    cells = [(i, k, float(np.clip(matrix[i, k], -1.0, 1.0)))
+             for i in range(len(names)) for k in range(i + 1)]  # fmt: skip
+    for sign, colour, said in ((1.0, EXTENDED_COLOUR, "positive"), (-1.0, BASE_COLOUR, "negative")):
+        shown = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
+        plot.add_bar(  # a cell is a bar that begins at its column
+            base=[k - 0.46 for _, k, _ in shown], x=[0.92] * len(shown), width=0.92,
+            y=[names[i] for i, _, _ in shown], orientation="h", name=said,
+            marker={"color": colour, "opacity": [abs(v) for _, _, v in shown]},
+            text=[_correlation_text(v) if written and i > k else "" for i, k, v in shown],
+            textposition="inside", insidetextanchor="middle", textangle=0, constraintext="none",
+            textfont={"size": 10, "color": INK},
+            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in shown],
+            hovertemplate="%{hovertext}<extra></extra>",
+        )  # fmt: skip
     rows = max(10, len(found.model.structure.parameters))
     styled(plot, _MARGINS + _BAR * min(rows, 2 * len(names) + 2))
-    plot.update_layout(margin={"l": 20, "r": 4, "t": 16, "b": 20}, meta={"square": True})
-    plot.update_xaxes(
-        showgrid=False, ticks="", tickangle=-60, mirror=False, showline=False, automargin=True
+    plot.update_layout(
+        margin={"l": 20, "r": 4, "t": 40, "b": 20}, meta={"square": True}, barmode="overlay"
     )
+    plot.update_xaxes(
+        showgrid=False, ticks="", tickangle=-60, mirror=False, showline=False, automargin=True,
+        tickvals=list(range(len(names))), ticktext=names, range=[-0.5, len(names) - 0.5],
+    )  # fmt: skip
     return plot.update_yaxes(
         showgrid=False,
         ticks="",
-        autorange="reversed",
+        categoryorder="array",
+        categoryarray=names,
+        range=[len(names) - 0.5, -0.5],
         mirror=False,
         showline=False,
         automargin=True,

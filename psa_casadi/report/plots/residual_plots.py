@@ -20,6 +20,7 @@ from psa_casadi.report.words.series import (
     MEASURED_COLOUR,
     NOISE_COLOUR,
     FloatArray,
+    IndexArray,
     Series,
     compact,
     kept,
@@ -32,13 +33,21 @@ _ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
 _FULL, _HALF = 500, 330
 
 
+def _shown(s: Series, limit: int) -> IndexArray:
+    """Return the samples of a record that plots over all of it show.
+
+    They are the same in all of them: so the page holds each curve once.
+    """
+    return kept([s.voltage, s.measured, *(s.residual(c) for c in s.curves)], limit)
+
+
 def time_plot(s: Series, origin: str, limit: int) -> Plot:
     """Displacement over time above the residual over the same time, held-out part shaded."""
     plot = make_subplots(
         rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.6, 0.4]
     )
     residuals = [s.residual(c) for c in s.curves]
-    shown = kept([s.measured, *residuals], limit)
+    shown = _shown(s, limit)
     scale, small, clock = s.scale, s.residual_scale, s.time_scale
     time = compact(clock.factor * s.time[shown])
 
@@ -89,7 +98,7 @@ def zoom_plot(s: Series, origin: str, limit: int) -> Plot:
 
 def loop_plot(s: Series, origin: str, limit: int) -> Plot:
     """Displacement over voltage."""
-    shown = kept([s.voltage, s.measured, *(c.values for c in s.curves)], limit)
+    shown = _shown(s, limit)
     scale, plot = s.scale, go.Figure()
     rows = [(s.measured, MEASURED_COLOUR, origin, 3.0)]
     rows += [(c.values, c.colour, c.label, 1.2) for c in s.curves]
@@ -104,7 +113,7 @@ def loop_plot(s: Series, origin: str, limit: int) -> Plot:
 def error_loop_plot(s: Series, limit: int) -> Plot:
     """Residual over voltage: where in the loop the model goes wrong."""
     residuals = [s.residual(c) for c in s.curves]
-    shown = kept([s.voltage, *residuals], limit)
+    shown = _shown(s, limit)
     small, plot = s.residual_scale, go.Figure()
     for curve, residual in zip(s.curves, residuals, strict=True):
         plot.add_scatter(

@@ -12,7 +12,7 @@ from psa_casadi.report.words.series import (
     NOISE_COLOUR,
 )
 
-INK, GRID, AXIS, PAPER = "#222222", "#e4e7ea", "#9aa1a8", "#fefefe"
+INK, GRID, AXIS = "#222222", "#e4e7ea", "#9aa1a8"
 WEAK_COLOUR, BOUND_COLOUR = "#e69f00", "#a8568f"
 
 #: What takes a colour's place on a dark screen. Every colour in a plot is a key of this table.
@@ -20,7 +20,6 @@ DARK = {
     INK: "#e4e6e8",
     GRID: "#2c343b",
     AXIS: "#69747e",
-    PAPER: "#15191d",
     MEASURED_COLOUR: "#d9dcdf",
     BASE_COLOUR: "#ff8a45",
     EXTENDED_COLOUR: "#56b4e9",
