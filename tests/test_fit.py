@@ -16,6 +16,7 @@ from psa_casadi.identification.fitting.prediction import Prediction, motions_of,
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.search.multistart import free_parameters
+from psa_casadi.identification.search.refitting import same_place
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
@@ -267,3 +268,23 @@ def test_numbers_that_overflow_are_no_simulation(monkeypatch: pytest.MonkeyPatch
     record = record_of(model_with(), 1)
     with pytest.raises(SimulationError, match="numbers of the fit overflow"):
         fit(model_with(), [whole(record)], ["k_L"], sigma=[SIGMA])
+
+
+def test_fits_of_one_minimum_are_the_same_place_wherever_their_priors_count_from() -> None:
+    """The prior of a lag is a factor of e around the given model's value, here off by e^7."""
+    model = stack_model("demo")
+    time = time_grid(4e-3, 5e-6)
+    voltage = multisine(time, 0.0, 60.0, (500.0, 3e4), seed=3)
+    x = simulate(model, time, voltage, memory={"f_H": 0.0}).displacement
+    noise = 2e-9 * np.random.default_rng(3).standard_normal(time.size)
+    record = Record(name="fast", time=time, voltage=voltage, displacement=x + noise)
+    free, experiments, right = ["k_L", "c_B", "m_B"], [whole(record)], model.values["c_B"]
+    off = model.with_values({"c_B": right * np.exp(7.0)})
+    near = fit(model, experiments, free, sigma=[2e-9])
+    far = fit(off, experiments, free, sigma=[2e-9], start={"c_B": right})
+    assert far.cost > near.cost + 45.0
+    for found in (near, far):
+        squares = float(np.sum((found.residuals / 2e-9) ** 2))
+        assert found.data_cost == pytest.approx(squares, rel=1e-9)
+    assert far.data_cost == pytest.approx(near.data_cost, abs=0.1)
+    assert same_place(near, far, experiments)

@@ -4,7 +4,8 @@ Records come from the independent reference with white noise of 0.1 % of the lar
 loops at three amplitudes and two frequencies, a multisine. `identify` gets the records and the
 stiffness k_B, nothing else. What is compared is what voltage and displacement determine: forces
 over the stack's stiffness, lags, and masses over stiffnesses, each with the interval that the
-covariance of the fit gives it.
+covariance of the fit gives it. Every stack has its own draws. Beside the share that is covered
+stands what these draws alone give (`coverage_control`).
 """
 
 import os
@@ -19,8 +20,9 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.noise.residual_tests import whiteness
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.identify import Identification, identify
-from psa_casadi.model.stacks import STACKS
+from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.words.tables import Table
+from tests.benchmarks.coverage_control import drawn_scores, gradients
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable
 from tests.benchmarks.records import Values, clean_set, with_noise
 
@@ -37,18 +39,27 @@ _WHITE = 0.01
 
 @dataclass(frozen=True)
 class Found:
-    """One quantity of one run: its truth, estimate, standard error, and whether it is told."""
+    """One quantity of one run: its truth, estimate, standard error, and whether it is told.
+
+    `drawn` is by how many standard errors the draws of the noise move it in linear theory.
+    """
 
     name: str
     truth: float
     value: float
     error: float
     determined: bool
+    drawn: float
 
     @property
     def covered(self) -> bool:
         """Whether the truth lies in the 95 % interval."""
         return abs(self.value - self.truth) <= _NORMAL_95 * self.error
+
+    @property
+    def covered_by_draws(self) -> bool:
+        """Whether it would lie there in linear theory at the truth."""
+        return abs(self.drawn) <= _NORMAL_95
 
     @property
     def relative(self) -> float:
@@ -69,9 +80,17 @@ class Run:
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
-    """Identify every named stack from `SEEDS` sets of records, on all cores."""
-    names = QUICK_STACKS if quick else tuple(STACKS)
-    seeds = QUICK_SEEDS if quick else SEEDS
+    """Identify every named stack from `SEEDS` sets of records, or two of them from two."""
+    return _over(QUICK_STACKS, QUICK_SEEDS, progress) if quick else run_sized(progress, SEEDS)
+
+
+def run_sized(progress: Progress, count: int) -> Outcome:
+    """Identify every named stack from `count` sets of records."""
+    return _over(tuple(STACKS), count, progress)
+
+
+def _over(names: Sequence[str], seeds: int, progress: Progress) -> Outcome:
+    """Identify the named stacks from `seeds` sets of records each, on all cores."""
     runs: list[Run] = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
         for name in names:
@@ -87,37 +106,40 @@ def one_run(name: str, seed: int) -> Run:
     truth = {key: f.value for key, f in STACKS[name].values.items()}
     clean = clean_set(truth)
     level = NOISE * max(r.range_m for r in clean)
-    records = with_noise(clean, NOISE, seed)
+    records = with_noise(clean, NOISE, (tuple(STACKS).index(name), seed))
     found = identify(records, stiffness=truth["k_B"])
+    size = static_compliance(truth) * truth["h_ref"]
+    drawn = drawn_scores(
+        stack_model(name),
+        clean,
+        records,
+        found.determinacy.names,
+        level,
+        lambda p: quantities(p, size),
+    )
     white = tuple(whiteness(r) > _WHITE for r in found.fit.residuals_of(found.experiments))
     return Run(
         stack=name,
         seed=seed,
-        found=compared(found, truth),
+        found=compared(found, truth, drawn),
         rms_ratio=found.fit.rms / level,
         white=white,
         converged=found.fit.converged,
     )
 
 
-def compared(found: Identification, truth: Values) -> tuple[Found, ...]:
+def compared(found: Identification, truth: Values, drawn: Values) -> tuple[Found, ...]:
     """Return every quantity with its truth and its standard error (delta method)."""
     known, p = found.determinacy, found.model.values
     size = static_compliance(truth) * truth["h_ref"]
     true, value = quantities(truth, size), quantities(p, size)
-    gradients: dict[str, list[float]] = {name: [] for name in value}
-    for name in known.names:
-        step = 1e-5 * max(abs(p[name]), 1e-300)
-        up, down = (quantities({**p, name: p[name] + h}, size) for h in (step, -step))
-        for key, gradient in gradients.items():
-            gradient.append((up[key] - down[key]) / (2.0 * step))
+    slopes = gradients(p, known.names, lambda values: quantities(values, size))
+    errors = np.sqrt(np.einsum("qk,kl,ql->q", slopes, known.covariance, slopes))
     open_ones = {*known.undetermined, *known.on_bound}
     results = []
-    for key, parts in gradients.items():
-        g: FloatArray = np.array(parts)
-        error = float(np.sqrt(g @ known.covariance @ g))
+    for key, error in zip(value, errors.tolist(), strict=True):
         told = key in known.names and key not in open_ones and error < _WEAK * abs(value[key])
-        results.append(Found(key, true[key], value[key], error, told))
+        results.append(Found(key, true[key], value[key], error, told, drawn[key]))
     return tuple(results)
 
 
@@ -160,7 +182,7 @@ def _quantities(runs: Sequence[Run]) -> TitledTable:
             all_found = [f for r in own for f in r.found if f.name == name]
             told = [f for f in all_found if f.determined]
             if not told:
-                rows.append((stack, shown, f"0 of {len(all_found)}", "", "", "", ""))
+                rows.append((stack, shown, f"0 of {len(all_found)}", *[""] * 5))
                 continue
             errors = 100.0 * np.array([f.relative for f in told])
             limit = 5.0 if name in ("n", "beta", "gamma") else 1.0
@@ -170,21 +192,36 @@ def _quantities(runs: Sequence[Run]) -> TitledTable:
                     shown,
                     f"{len(told)} of {len(all_found)}",
                     f"{100.0 * np.mean([f.covered for f in told]):.0f} %",
+                    f"{100.0 * np.mean([f.covered_by_draws for f in told]):.0f} %",
                     f"{np.median([100.0 * f.error / abs(f.value) for f in told]):.2g} %",
                     f"{np.median(errors):.2g} %",
                     f"{100.0 * np.mean(errors < limit):.0f} % within {limit:g} %",
                 )
             )
-    told = [f for r in runs for f in r.found if f.determined]
-    share = 100.0 * float(np.mean([f.covered for f in told]))
     head = (
-        "stack", "quantity", "determined in", "truth in its 95 % interval",
+        "stack", "quantity", "determined in", "truth in its 95 % interval", "by the draws alone",
         "standard error, median", "error, median", "close to the truth",
     )  # fmt: skip
     return TitledTable(
-        "Identified from scratch, against the truth",
-        Table(head, tuple(rows)),
-        f"Of {len(told)} intervals {share:.1f} % hold the truth.",
+        "Identified from scratch, against the truth", Table(head, tuple(rows)), share_sentence(runs)
+    )
+
+
+def share_sentence(runs: Sequence[Run]) -> str:
+    """Say how many intervals hold the truth, with the error of that share.
+
+    Quantities of one run depend on each other, so the error is that of a mean over runs.
+    """
+    each = [[f for f in r.found if f.determined] for r in runs]
+    told = [f for own in each for f in own]
+    share = float(np.mean([f.covered for f in told]))
+    drawn = float(np.mean([f.covered_by_draws for f in told]))
+    over = [sum(f.covered for f in own) - share * len(own) for own in each]
+    error = float(np.sqrt(np.sum(np.square(over)))) / len(told)
+    held = sum(f.covered for f in told)
+    return (
+        f"Of {len(told)} intervals {held} hold the truth, {100.0 * share:.1f} % (standard error"
+        f" {100.0 * error:.1f} %). By these draws alone it would be {100.0 * drawn:.1f} %."
     )
 
 

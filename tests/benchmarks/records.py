@@ -124,7 +124,7 @@ def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[Record, ...]:
     return tuple(found)
 
 
-def with_noise(records: Sequence[Record], share: float, seed: int) -> list[Record]:
+def with_noise(records: Sequence[Record], share: float, seed: int | Sequence[int]) -> list[Record]:
     """Return the records with white noise of `share` times the largest range of the set added."""
     level = share * max(r.range_m for r in records)
     draw = np.random.default_rng(seed)

@@ -53,7 +53,8 @@ BENCHES: dict[str, Bench] = {
         _later(
             "coverage",
             "coverage",
-            "identified parameters and their intervals against the truth, over seeds and stacks",
+            "identified parameters and their intervals against the truth, over stacks (--size)",
+            sized=True,
         ),
         _later(
             "paper_method",

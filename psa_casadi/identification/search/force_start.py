@@ -80,7 +80,7 @@ def retuned(
             return replace(best, interrupted=True)
         except (PsaError, np.linalg.LinAlgError):
             return best
-        if better is None or better.cost > best.cost - _BETTER:
+        if better is None or better.data_cost > best.data_cost - _BETTER:
             return best
         best = better
     return best
@@ -104,11 +104,11 @@ def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
         _begun(best, experiments, names, _values(best, linear.theta))
         for linear in _linear_fits(best, parts)[:_BEGUN]
     ]
-    found = sorted((f for f in begun if f is not None), key=lambda f: f.cost)[:_ENDED]
+    found = sorted((f for f in begun if f is not None), key=lambda f: f.data_cost)[:_ENDED]
     ended = [refit(f, experiments, names, sigma=best.sigma) for f in found]
     if any(f.interrupted for f in (*found, *ended)):
         raise KeyboardInterrupt
-    return min(ended, key=lambda f: f.cost, default=None)
+    return min(ended, key=lambda f: f.data_cost, default=None)
 
 
 def _begun(

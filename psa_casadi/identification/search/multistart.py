@@ -135,7 +135,7 @@ def _search(
     sigma = residual_noise(found[0][1], experiments)
     polished: list[Fit] = []
     for name, quick in found:
-        near = quick.cost < (_NEAR if thorough else _CLOSE) * found[0][1].cost
+        near = quick.data_cost < (_NEAR if thorough else _CLOSE) * found[0][1].data_cost
         missed = thorough and len(polished) < _FOLLOWED and all(map(_misses, polished))
         if polished and (polished[0].interrupted or not (missed or (near and len(polished) < 2))):
             break
@@ -144,8 +144,8 @@ def _search(
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit_or_keep(quick, experiments, free, sigma)
         polished.append(ended)
-        keep(min(polished, key=lambda f: f.cost))
-    best = min(polished, key=lambda f: f.cost)
+        keep(min(polished, key=lambda f: f.data_cost))
+    best = min(polished, key=lambda f: f.data_cost)
     outcomes, not_unique = _outcomes(found, polished, best, experiments)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
@@ -165,7 +165,7 @@ def _search(
 
 def _misses(found: Fit) -> bool:
     """Whether a fit leaves much more than the noise, or lost itself on the way there."""
-    return found.cost > _MISSED * len(found.residuals)
+    return found.data_cost > _MISSED * len(found.residuals)
 
 
 def _outcomes(
@@ -178,13 +178,13 @@ def _outcomes(
     outcomes, not_unique = [], set[str]()
     for k, (name, quick) in enumerate(found):
         if k >= len(polished):
-            outcomes.append(StartOutcome(name, quick.cost, quick.rms, None))
+            outcomes.append(StartOutcome(name, quick.data_cost, quick.rms, None))
             continue
         final = polished[k]
         names = differing(best, final, experiments)
         agrees = final is best or (names == () and equal(best, final))
         not_unique |= set(names)
-        outcomes.append(StartOutcome(name, final.cost, final.rms, agrees))
+        outcomes.append(StartOutcome(name, final.data_cost, final.rms, agrees))
     return tuple(outcomes), not_unique
 
 
@@ -213,10 +213,10 @@ def _quick_fits(
             found = [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
             break
         found.append((name, quick))
-        keep(min((f for _, f in found), key=lambda f: f.cost))
+        keep(min((f for _, f in found), key=lambda f: f.data_cost))
         if quick.interrupted:
             break
-    found.sort(key=lambda pair: pair[1].cost)
+    found.sort(key=lambda pair: pair[1].data_cost)
     for k, (name, quick) in enumerate(found[: _FINALISTS if len(rounds) > 1 else 0]):
         if any(f.interrupted for _, f in found):
             break
@@ -233,4 +233,4 @@ def _quick_fits(
             "The base model could not be simulated from any start; the voltage's unit or the"
             " displacement's sign is the likely cause: check the record."
         )
-    return sorted(found, key=lambda pair: pair[1].cost)
+    return sorted(found, key=lambda pair: pair[1].data_cost)

@@ -43,7 +43,7 @@ def with_fast(best: Fit, experiments: Sequence[Experiment], progress: Progress) 
     except PsaError:
         return best
     needed = len(told) * np.log(len(best.residuals))
-    return wider if wider.interrupted or wider.cost < best.cost - needed else best
+    return wider if wider.interrupted or wider.data_cost < best.data_cost - needed else best
 
 
 def without_blur(best: Fit, experiments: Sequence[Experiment]) -> Fit:
@@ -73,7 +73,7 @@ def exchanged(
             if other is None:
                 continue
             different |= set(differing(best, other, experiments))
-            if other.cost < best.cost and (other.interrupted or not equal(best, other)):
+            if other.data_cost < best.data_cost and (other.interrupted or not equal(best, other)):
                 best = other
                 break
         if best is before or best.interrupted:
@@ -96,7 +96,7 @@ def _from(
     moved = {n: min(max(v, low_high[n][0]), low_high[n][1]) for n, v in values.items()}
     model = best.model.with_values(moved)
     quick = quick_from(best, model, experiments, free, start_states=states, evaluations=_FIRST)
-    if quick is None or quick.interrupted or quick.cost > _HOPEFUL * best.cost:
+    if quick is None or quick.interrupted or quick.data_cost > _HOPEFUL * best.data_cost:
         return None
     try:
         return fit(

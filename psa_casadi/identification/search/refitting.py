@@ -162,9 +162,9 @@ def equal(one: Fit, other: Fit) -> bool:
     more about the lack than about the parameters.
     """
     count = max(len(one.residuals), 1)
-    excess = max(min(one.cost, other.cost) - count, 0.0)
-    limit = _EQUAL * max(one.cost / count, 1.0) + _OF_EXCESS * excess
-    return abs(one.cost - other.cost) < limit
+    excess = max(min(one.data_cost, other.data_cost) - count, 0.0)
+    limit = _EQUAL * max(one.data_cost / count, 1.0) + _OF_EXCESS * excess
+    return abs(one.data_cost - other.data_cost) < limit
 
 
 def differing(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[str, ...]:
