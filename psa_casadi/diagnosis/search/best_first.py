@@ -28,7 +28,7 @@ from psa_casadi.diagnosis.search.fits import (
     without,
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.known import NONE, Known, Names, Searched, is_left
+from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names, Searched, is_left
 from psa_casadi.diagnosis.search.modes import with_modes
 from psa_casadi.diagnosis.search.several import fit_sets
 from psa_casadi.diagnosis.search.view import View, examine
@@ -44,8 +44,8 @@ _EXPANSIONS, _VISITS = 5, 24
 #: Neighbours whose residual is within this factor of the noise, or that remove this share of the
 #: excess power, need no fits afresh; of a first and a further cause so many get some.
 _SETTLED, _NEARLY, _AFRESH, _AFRESH_FURTHER = 1.02, 0.95, 4, 2
-#: So many neighbours are fitted first, and so many to the end.
-_PACE, _FINALISTS = 2, 3
+#: So many neighbours are fitted first.
+_PACE = 2
 
 
 def best_first(base: Fit, task: Task) -> Searched:
@@ -197,7 +197,7 @@ class _Search:
             self.known.note(found)
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
-        self.known.finish([c for c in self.known.leaders(h) if not c.final][:_FINALISTS])
+        self.known.finish([c for c in self.known.leaders(h) if not c.final][:FINALISTS])
 
     @stage("fits of candidates")
     def several_modes(self, h: Hypothesis, view: View) -> bool:

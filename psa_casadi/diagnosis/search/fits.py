@@ -30,7 +30,7 @@ from psa_casadi.simulation.side_by_side import side_by_side
 _BESIDE, _AFRESH = 12, 17
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Tolerance of stepper and fit, and evaluations, to the end.
-_POLISHING = ((1e-5, 1e-3, 30), (FIT_RTOL, 1e-4, 8))
+_POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
 
 
 def with_cause(
@@ -61,9 +61,37 @@ def with_causes(
         {k: v for d in start.directions for k, v in d.memory[r].items()} | own
         for r, own in enumerate(before.fit.starts())
     )
-    quick = fit_with_all(before.fit, experiments, added, memory, {}, _AFRESH, goal)
-    causes = (*before.causes, *(d.effect for d in start.directions))
-    return hypothesis(causes, quick, experiments)
+    return _with_all(before, experiments, added, memory, {}, goal)
+
+
+def with_causes_afresh(
+    before: Hypothesis, experiments: Sequence[Experiment], start: Together, goal: float = np.inf
+) -> Hypothesis | None:
+    """Fit several more causes at once from an ordinary base, with gains of an ordinary size.
+
+    Their signs are those that fit best together: a base fit without the causes has bent its loop to
+    imitate them, and the sizes of their gains with it.
+    """
+    added = []
+    for d, gain in zip(start.directions, start.gains, strict=True):
+        size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), gain)
+        values = _ordinary_form(d.effect, d.values)
+        added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
+    ordinary = ordinary_values(before.fit.model, [e.record for e in experiments])
+    return _with_all(before, experiments, added, tuple(before.fit.starts()), ordinary, goal)
+
+
+def _with_all(
+    before: Hypothesis,
+    experiments: Sequence[Experiment],
+    added: Sequence[tuple[Component, dict[str, float], float]],
+    memory: tuple[dict[str, float], ...],
+    reset: dict[str, float],
+    goal: float,
+) -> Hypothesis | None:
+    """Fit quickly with several more causes, each from its values and gain."""
+    quick = fit_with_all(before.fit, experiments, added, memory, reset, _AFRESH, goal)
+    return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
 
 
 def afresh(
@@ -204,14 +232,11 @@ def _from_ordinary(
 ) -> list[Fit]:
     """Quick fits from an ordinary base and gains; forms and frequencies are the `known` ones."""
     gain = next(p for p in effect.parameters if p.name == effect.gain)
-    size = gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
+    size = _typical(before, effect)
     sizes = [_ORDINARY, *(s for s in effect.finite_step if s > _ORDINARY)]
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
-    values = {
-        n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
-        for n, grid in effect.probe.items()
-    }
+    values = _ordinary_form(effect, known)
     ordinary = ordinary_values(before.model, [e.record for e in experiments])
     starts = [(values, s * size, tuple(before.starts())) for s in sizes]
     found = side_by_side(
@@ -234,6 +259,20 @@ def _best_continued(
 
     best = list({f.cost: f for f in sorted(fits, key=lambda f: f.cost)}.values())[:count]
     return min([*fits, *side_by_side(further, best)], key=lambda f: f.cost, default=None)
+
+
+def _typical(before: Fit, effect: Component) -> float:
+    """Return an ordinary size of an effect's gain beside a fit."""
+    gain = next(p for p in effect.parameters if p.name == effect.gain)
+    return gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
+
+
+def _ordinary_form(effect: Component, known: Mapping[str, float]) -> dict[str, float]:
+    """Return an effect's declared values where it has trials; forms and frequencies are `known`."""
+    return {
+        n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
+        for n, grid in effect.probe.items()
+    }
 
 
 def _declared(effect: Component, name: str) -> float:

@@ -22,6 +22,8 @@ from psa_casadi.simulation.side_by_side import side_by_side
 #: Neighbours are nearly as likely as the best one if their evidence is this share of its, or within
 #: so many nats of it.
 SHARE, NEAR = 0.8, 30.0
+#: So many fits of neighbours go to their end.
+FINALISTS = 3
 #: Effects far behind in the screening are fitted afresh where less than this share of the excess
 #: power is explained.
 _EXPLAINED = 0.8

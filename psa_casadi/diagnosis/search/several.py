@@ -1,8 +1,9 @@
 """Several causes at once: from the base to the sets of effects that promise most together."""
 
 from psa_casadi.diagnosis.screening.sets import best_sets
-from psa_casadi.diagnosis.search.fits import with_causes
-from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.fits import to_end, with_causes, with_causes_afresh
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis
+from psa_casadi.diagnosis.search.known import FINALISTS, Known
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -33,5 +34,23 @@ def fit_sets(known: Known, task: Task) -> None:
     said = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes at once: fitting {said}")
     goal = cost_beside(known.best().fit, root.fit, task.experiments)
-    for found in side_by_side(lambda s: with_causes(root, task.experiments, s, goal), starts):
-        known.note(found)
+    ways = [with_causes]
+    if "fits afresh" not in task.method.without:
+        ways.append(with_causes_afresh)
+    jobs = [(way, s) for way in ways for s in starts]
+    found = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
+    fitted = [h for h in found if h is not None]
+    for h in _best_to_end(fitted, known, task):
+        known.note(h)
+
+
+def _best_to_end(found: list[Hypothesis], known: Known, task: Task) -> list[Hypothesis]:
+    """Return fits of sets, the best of them to their end.
+
+    Of two fits of one set the better one so far need not be the one that ends lower.
+    """
+    ranked = sorted(found, key=lambda h: -known.scale.score(h))
+    best, others = ranked[:FINALISTS], ranked[FINALISTS:]
+    said = ", ".join("+".join(sorted(h.names)) for h in best)
+    task.progress(f"{said} to the end")
+    return [*side_by_side(lambda h: to_end(h, task.experiments), best), *others]
