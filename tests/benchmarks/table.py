@@ -56,6 +56,11 @@ BENCHES: dict[str, Bench] = {
             "identified parameters and their intervals against the truth, over seeds and stacks",
         ),
         _later(
+            "causes.command",
+            "causes",
+            "hidden causes as a data set for other methods: write, answer, table",
+        ),
+        _later(
             "paper_method",
             "paper",
             "the paper's identification beside the prediction-error fit, against noise and window",
