@@ -87,4 +87,8 @@ if __name__ == "__main__":
         from tests.benchmarks.fuzz import app as fuzz_app
 
         fuzz_app(sys.argv[2:], prog_name="python -m tests.benchmarks fuzz")
+    if sys.argv[1:2] == ["causes"]:
+        from tests.benchmarks.causes.command import app as causes_app
+
+        causes_app(sys.argv[2:], prog_name="python -m tests.benchmarks causes")
     app(prog_name="python -m tests.benchmarks")

@@ -57,6 +57,11 @@ BENCHES: dict[str, Bench] = {
             sized=True,
         ),
         _later(
+            "causes.command",
+            "causes",
+            "hidden causes as a data set for other methods: write, answer, table",
+        ),
+        _later(
             "paper_method",
             "paper",
             "the paper's identification beside the prediction-error fit, against noise and window",

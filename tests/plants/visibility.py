@@ -25,20 +25,28 @@ FREE = ("r_s", "a", "beta", "gamma", "n", "delta", "tau")
 
 def base_directions(run: Run) -> FloatArray:
     """Orthonormal directions in which the base model can move, (N, 11)."""
-    x = run.displacement
-    columns = [np.ones_like(x), x, np.gradient(x, run.times), run.command]
-    columns += [_derivative(run, name) for name in FREE]
-    matrix = np.column_stack([column / np.linalg.norm(column) for column in columns])
-    return np.asarray(np.linalg.qr(matrix)[0], dtype=np.float64)
+    matrix = base_columns(run.stack, run.times, run.command, run.displacement)
+    return np.asarray(np.linalg.qr(matrix / np.linalg.norm(matrix, axis=0))[0], dtype=np.float64)
 
 
-def _derivative(run: Run, name: str) -> FloatArray:
-    def moved(factor: float) -> FloatArray:
-        stack: Stack = replace(run.stack, **{name: getattr(run.stack, name) * factor})
-        return simulate_base(stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+def base_columns(
+    stack: Stack, times: FloatArray, command: FloatArray, displacement: FloatArray
+) -> FloatArray:
+    """What moves the base's displacement (N,) [m], (N, 11): 1, it, its rate [m/s], the command [V],
+    and the derivatives by the logarithms of FREE [m].
+    """
 
-    step = RELATIVE_STEP / 2.0
-    return (moved(1.0 + step) - moved(1.0 - step)) / RELATIVE_STEP
+    def moved(name: str, factor: float) -> FloatArray:
+        changed: Stack = replace(stack, **{name: getattr(stack, name) * factor})
+        return simulate_base(changed, times, command, COARSE_SUB_INTERVALS).displacement
+
+    def derivative(name: str) -> FloatArray:
+        step = RELATIVE_STEP / 2.0
+        return (moved(name, 1.0 + step) - moved(name, 1.0 - step)) / RELATIVE_STEP
+
+    rate = np.gradient(displacement, times)
+    columns = [np.ones_like(displacement), displacement, rate, command]
+    return np.column_stack([*columns, *(derivative(name) for name in FREE)])
 
 
 def left_over(directions: FloatArray, contribution: FloatArray) -> FloatArray:
