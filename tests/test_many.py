@@ -72,6 +72,18 @@ def test_a_set_that_cannot_be_simulated_leaves_the_others_alone() -> None:
     assert np.array_equal(found[[0, 2]], simulate_many(model, [given[0], given[2]], record()))
 
 
+def test_what_is_kept_of_each_set() -> None:
+    """Whole rows, a number and an array of each set; groups of four lanes and the stepper alike."""
+    model = stack("P-885.51")
+    given = sets(model, 5)
+    for one in (record(), record(uneven=True)):
+        rows = simulate_many(model, given, one)
+        ranges = simulate_many(model, given, one, reduce=np.ptp)
+        thinned = simulate_many(model, given, one, reduce=lambda row: row[::100])
+        assert np.array_equal(ranges, np.ptp(rows, axis=1))
+        assert np.array_equal(thinned, rows[:, ::100])
+
+
 def test_uneven_records_run_in_the_stepper() -> None:
     model = stack("P-885.51")
     found = simulate_many(model, [{}, {"k_L": 1.1 * model.values["k_L"]}], record(uneven=True))
