@@ -56,6 +56,12 @@ BENCHES: dict[str, Bench] = {
             "identified parameters and their intervals against the truth, over seeds and stacks",
         ),
         _later(
+            "posterior",
+            "posterior",
+            "whole posteriors: calibration (--size), and evidence by bridge sampling",
+            sized=True,
+        ),
+        _later(
             "paper_method",
             "paper",
             "the paper's identification beside the prediction-error fit, against noise and window",
