@@ -1,16 +1,16 @@
 """Evidence of effects: Schwarz's approximation beside bridge sampling on the same density."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 import psa_casadi as psa
 from psa_casadi.effects import EFFECTS
 from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.density import Density
+from psa_casadi.posterior.density import Block, Density
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread
@@ -20,11 +20,11 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Effects that are tried, and gains in ordinary changes that the record has.
 CASES = (
-    ("slow_creep", 0.0),
-    ("slow_creep", 1.0),
     ("field_dependent_gain", 0.0),
-    ("field_dependent_gain", 0.3),
-    ("offset_drift", 0.1),
+    ("field_dependent_gain", 0.03),
+    ("sensor_nonlinearity", 0.0),
+    ("sensor_nonlinearity", 0.03),
+    ("saturation_of_strain", 0.03),
 )
 FREE = ("k_L", "A", "n", "tau")
 NOISE = 1e-3
@@ -70,23 +70,34 @@ def evidence_table(progress: Progress, quick: bool) -> TitledTable:
 
 def evidence(task: Task) -> Evidence:
     """Return ln Z of a task up to the constant that models of the same record share."""
-    density = task.density
+    density = _of_all_samples(task)
     with one_thread():
         found = chains_of(density, chains=CHAINS, draws=DRAWS, tune=TUNE, seed=1)
     flat = found.u.reshape(-1, density.size)
     # of a density in u: the Jacobian of z, and what normal priors are short of
-    known = task.unknowns.prior[np.isfinite(task.unknowns.prior)]
+    kept = np.isfinite(task.unknowns.prior)
+    known = task.unknowns.prior[kept]
+    low, high = (edge[kept] / known for edge in task.unknowns.bounds())
     constant = float(np.linalg.slogdet(density.factor)[1])
     constant -= float(np.sum(np.log(known * np.sqrt(2.0 * np.pi))))
+    constant -= float(np.sum(np.log(norm.cdf(high) - norm.cdf(low))))  # cut at the bounds
+    counts = sum(b.count for b in density.blocks)
+    level = counts * float(np.log(task.levels[0]))  # residuals are weighted by a fit's own
+    constant -= level
     bridge, error = bridge_sampled(density, flat)
     peak, _ = density(np.zeros(density.size))
     laplace = peak + 0.5 * density.size * np.log(2.0 * np.pi)
-    counts = sum(b.count for b in density.blocks)
     found_rows = density.evaluate(task.theta)
     assert found_rows is not None
     fitted = sum(0.5 * b.count * np.log(_power(found_rows[0][b.rows])) for b in density.blocks)
-    schwarz = -fitted - 0.5 * len(task.unknowns.names) * np.log(counts)
+    schwarz = -fitted - level - 0.5 * len(task.unknowns.names) * np.log(counts)
     return Evidence(bridge + constant, error, laplace + constant, schwarz)
+
+
+def _of_all_samples(task: Task) -> Density:
+    """Return the density with every sample counted, as two models of one record need it."""
+    rows = [b.rows for b in task.density.blocks]
+    return replace(task.density, blocks=tuple(Block(r, float(r.stop - r.start)) for r in rows))
 
 
 def _power(values: FloatArray) -> float:
