@@ -16,6 +16,7 @@ WRITTEN_BY = {
     "model": "`psa identify -o`, `psa diagnose -o`, `psa.save_model`",
     "diagnosis": "`psa diagnose --json`",
     "identification": "`psa identify --json`",
+    "posterior": "`psa sample --json`",
     "check": "`psa check --json`",
     "device": "`psa batch`, in the folder of each device",
 }

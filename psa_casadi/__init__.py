@@ -63,6 +63,8 @@ if TYPE_CHECKING:
     from psa_casadi.model.system.nanopositioner import nanopositioner
     from psa_casadi.model.system.system import System, connect
     from psa_casadi.model.system.tuning import controller_for, margins_of
+    from psa_casadi.posterior.result import Posterior
+    from psa_casadi.posterior.sample import sample
     from psa_casadi.records import (
         Record,
         read_record,
@@ -172,6 +174,8 @@ _HOMES = {
     "psa_casadi.any_model.identify": ("OdeIdentification",),
     "psa_casadi.any_model.result": ("OdeDiagnosis",),
     "psa_casadi.identification.identify": ("Identification",),
+    "psa_casadi.posterior.sample": ("sample",),
+    "psa_casadi.posterior.result": ("Posterior",),
     "psa_casadi.diagnosis.verdict": ("patched_model",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),
     "psa_casadi.report.words.text": ("story",),
@@ -246,6 +250,8 @@ __all__ = [
     "Identification",
     "OdeIdentification",
     "identify",
+    "sample",
+    "Posterior",
     "diagnose",
     "Diagnosis",
     "OdeDiagnosis",

@@ -23,6 +23,7 @@ from psa_casadi.cli.export_modelica import modelica
 from psa_casadi.cli.export_ssp import ssp
 from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.identify import identify
+from psa_casadi.cli.sample import sample
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
 from psa_casadi.cli.surroundings import prepare
@@ -67,6 +68,9 @@ app.command(epilog="Example: psa demo my_demo")(guarded(demo))
 app.command(epilog="Example: psa identify slow.csv fast.csv -o model.json --report fit.html")(
     guarded(identify)
 )
+app.command(
+    epilog="Example: psa sample model.json record.csv -o posterior.nc --figure posterior.png"
+)(guarded(sample))
 app.command(epilog="Example: psa simulate --model model.json --input planned.csv -o motion.csv")(
     guarded(simulate)
 )

@@ -177,6 +177,19 @@ class Given:
             self.add(f"{option} is '{text}'; give {what} with commas between, such as 150,0.")
             return ()
 
+    def priors(self, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+        """Return centres and widths of priors that are given as NAME=CENTRE:WIDTH."""
+        centres: dict[str, float] = {}
+        widths: dict[str, float] = {}
+        for text in texts:
+            name, _, figures = text.partition("=")
+            centre, _, width = figures.partition(":")
+            try:
+                centres[name], widths[name] = float(centre), float(width)
+            except ValueError:
+                self.add(f"--prior is '{text}'; give NAME=CENTRE:WIDTH, such as k_L=7.3:0.1.")
+        return centres, widths
+
     def fixed_step(self, text: str | None, *, wanted: bool) -> float | None:
         """Return the time [s] of a fixed step, where one is wanted."""
         if wanted != (text is not None):

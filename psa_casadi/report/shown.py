@@ -11,21 +11,27 @@ from matplotlib.figure import Figure
 
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.identify import Identification
+from psa_casadi.posterior.result import Posterior
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
 from psa_casadi.report.plots.figure import diagnosis_figure, fit_figure, trajectory_figure
+from psa_casadi.report.plots.posterior_figure import posterior_figure
 from psa_casadi.report.words.phrases import number, percent, plain
+from psa_casadi.report.words.posterior_words import posterior_text
 from psa_casadi.report.words.text import identification_text, story
 from psa_casadi.simulation.simulate import Trajectory
+
+Result = Diagnosis | Identification | Trajectory | Posterior
 
 _FIGURES: dict[type, Callable[[Any], Figure]] = {
     Diagnosis: diagnosis_figure,
     Identification: fit_figure,
     Trajectory: trajectory_figure,
+    Posterior: posterior_figure,
 }
 
 
-def plot(result: Diagnosis | Identification | Trajectory) -> Figure:
+def plot(result: Result) -> Figure:
     """Return the picture of a result as a matplotlib figure."""
     return _FIGURES[type(result)](result)
 
@@ -42,7 +48,7 @@ def page(
         write_fit_report(result, path, still=still)
 
 
-def line(result: Diagnosis | Identification | Trajectory) -> str:
+def line(result: Result) -> str:
     """Return a result in one line."""
     if isinstance(result, Diagnosis):
         return _diagnosis_line(result)
@@ -52,6 +58,9 @@ def line(result: Diagnosis | Identification | Trajectory) -> str:
         rest = number(100.0 * result.fit.rms / span, 2)
         free = len(result.determinacy.names)
         return f"<Identification: {free} parameters from {records}; residual {rest} % of range rms>"
+    if isinstance(result, Posterior):
+        names = ", ".join(f.name for f in result.figures)
+        return f"<Posterior of {names}: {result.chains} chains of {result.draws} draws>"
     outputs = ", ".join(result.outputs)
     return (
         f"<Trajectory: {len(result.time)} samples from {number(float(result.time[0]))} to"
@@ -68,12 +77,14 @@ def _diagnosis_line(d: Diagnosis) -> str:
     return f"<Diagnosis {d.verdict}{': ' if causes else ''}{causes}; held-out error {errors}>"
 
 
-def cell(result: Diagnosis | Identification | Trajectory) -> str:
+def cell(result: Result) -> str:
     """Return a result as a notebook shows it: its words and its picture."""
     if isinstance(result, Diagnosis):
         words = story(result)
     elif isinstance(result, Identification):
         words = identification_text(result)
+    elif isinstance(result, Posterior):
+        words = posterior_text(result)
     else:
         words = line(result)
     buffer = io.BytesIO()

@@ -62,6 +62,12 @@ BENCHES: dict[str, Bench] = {
             "hidden causes as a data set for other methods: write, answer, table",
         ),
         _later(
+            "posterior",
+            "posterior",
+            "whole posteriors: calibration (--size), and evidence by bridge sampling",
+            sized=True,
+        ),
+        _later(
             "paper_method",
             "paper",
             "the paper's identification beside the prediction-error fit, against noise and window",

@@ -33,7 +33,9 @@ from psa_casadi.report.words.series import (
 )
 from psa_casadi.simulation.simulate import Trajectory
 
-_SIZE_INCHES, _DPI = (16.0, 10.0), 100
+#: What all pictures share.
+SIZE_INCHES, DPI = (16.0, 10.0), 100
+FONT = 13.0
 _STILL_INCHES, _STILL_DPI, _STILL_POINTS = (12.0, 6.4), 80, 4000
 #: Room around the plots of a still picture, for labels of any size that they have there.
 _STILL_ROOM = {
@@ -44,7 +46,6 @@ _STILL_ROOM = {
     "hspace": 0.42,
     "wspace": 0.3,
 }
-_FONT = 13.0
 
 
 def save_figure(
@@ -56,7 +57,7 @@ def save_figure(
     "synthetic", names the record's curve. Raises InputError when `path` cannot be written to.
     """
     with atomic_path(path) as temporary:
-        diagnosis_figure(diagnosis, origin=origin).savefig(temporary, format="png", dpi=_DPI)
+        diagnosis_figure(diagnosis, origin=origin).savefig(temporary, format="png", dpi=DPI)
 
 
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
@@ -67,7 +68,7 @@ def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figur
     _record(figure, grid, shown, origin)
     _residual(figure.add_subplot(grid[1, :2]), shown, "measured")
     _evidence(figure.add_subplot(grid[1, 2]), diagnosis)
-    figure.suptitle(_title(diagnosis, series, shown, origin), fontsize=_FONT + 3)
+    figure.suptitle(_title(diagnosis, series, shown, origin), fontsize=FONT + 3)
     return figure
 
 
@@ -93,7 +94,7 @@ def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
     which = f"{origin} record: {shown.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the model misses most)"
-    figure.suptitle(which, fontsize=_FONT + 3)
+    figure.suptitle(which, fontsize=FONT + 3)
     return figure
 
 
@@ -105,7 +106,7 @@ def trajectory_figure(run: Trajectory) -> Figure:
 def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:
     """Return the picture of a displacement [m] over time [s] and over the voltage [V]."""
     figure = Figure(
-        figsize=(_SIZE_INCHES[0], 0.5 * _SIZE_INCHES[1]), dpi=_DPI, layout="constrained"
+        figsize=(SIZE_INCHES[0], 0.5 * SIZE_INCHES[1]), dpi=DPI, layout="constrained"
     )
     FigureCanvasAgg(figure)
     over_time, loop = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
@@ -113,7 +114,7 @@ def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatAr
     y = scale.factor * displacement
     for axes, x, label in ((over_time, time, "time [s]"), (loop, voltage, "voltage [V]")):
         axes.plot(x, y, color=EXTENDED_COLOUR, linewidth=1.2)
-        _style(axes, "Displacement" if axes is over_time else "Loop", label, f"[{scale.unit}]")
+        style(axes, "Displacement" if axes is over_time else "Loop", label, f"[{scale.unit}]")
     return figure
 
 
@@ -126,7 +127,7 @@ def _fewer(s: Series) -> Series:
 
 
 def _sheet() -> tuple[Figure, GridSpec]:
-    figure = Figure(figsize=_SIZE_INCHES, dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=SIZE_INCHES, dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
     return figure, figure.add_gridspec(2, 3, **ratios)
@@ -146,11 +147,12 @@ def _title(d: Diagnosis, series: tuple[Series, ...], shown: Series, origin: str)
     return "\n".join([*textwrap.wrap(verdict_sentence(d), 125), which])
 
 
-def _style(axes: Axes, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=_FONT + 1, loc="left")
-    axes.set_xlabel(x, fontsize=_FONT)
-    axes.set_ylabel(y, fontsize=_FONT)
-    axes.tick_params(labelsize=_FONT - 1)
+def style(axes: Axes, title: str, x: str, y: str) -> None:
+    """Give axes the title, labels and look that all pictures share."""
+    axes.set_title(title, fontsize=FONT + 1, loc="left")
+    axes.set_xlabel(x, fontsize=FONT)
+    axes.set_ylabel(y, fontsize=FONT)
+    axes.tick_params(labelsize=FONT - 1)
     axes.grid(visible=True, color="#dddddd", linewidth=0.8)
     axes.set_axisbelow(True)
 
@@ -182,10 +184,10 @@ def _time(axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None) -
     title = "Displacement" if len(time) == len(s.time) else "The part in the box"
     if zoom is not None:
         title = "Displacement (box: the part on the right)"
-    _style(axes, title, "time [s]", f"displacement [{scale.unit}]")
+    style(axes, title, "time [s]", f"displacement [{scale.unit}]")
     axes.margins(x=0.01)
     if zoom is None:
-        axes.legend(fontsize=_FONT - 1, framealpha=0.85)
+        axes.legend(fontsize=FONT - 1, framealpha=0.85)
 
 
 def _loop(axes: Axes, s: Series, origin: str) -> None:
@@ -196,8 +198,8 @@ def _loop(axes: Axes, s: Series, origin: str) -> None:
     for curve in s.curves:
         values = scale.factor * curve.values
         axes.plot(s.voltage, values, color=curve.colour, linewidth=0.9, label=curve.label)
-    _style(axes, "Loop", "voltage [V]", f"displacement [{scale.unit}]")
-    axes.legend(fontsize=_FONT - 1, framealpha=0.85, loc="upper left")
+    style(axes, "Loop", "voltage [V]", f"displacement [{scale.unit}]")
+    axes.legend(fontsize=FONT - 1, framealpha=0.85, loc="upper left")
 
 
 def _residual(axes: Axes, s: Series, origin: str) -> None:
@@ -215,7 +217,7 @@ def _residual(axes: Axes, s: Series, origin: str) -> None:
     largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves) * scale.factor or 1.0
     axes.set_ylim(-1.1 * largest, 1.45 * largest)
     axes.legend(
-        fontsize=_FONT - 1.5, ncols=4, loc="upper center", columnspacing=1.2, handlelength=1.4
+        fontsize=FONT - 1.5, ncols=4, loc="upper center", columnspacing=1.2, handlelength=1.4
     )
 
 
@@ -234,11 +236,11 @@ def _evidence(axes: Axes, d: Diagnosis) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
     for k, c in enumerate(rows):
         text = f" {share_text(c)}"
-        axes.annotate(text, (max(c.evidence, 0.0), k), va="center", fontsize=_FONT - 1.5)
+        axes.annotate(text, (max(c.evidence, 0.0), k), va="center", fontsize=FONT - 1.5)
     every = len(shown) == len(d.candidates)
     count = "" if every else f" ({len(shown)} of {len(d.candidates)} effects)"
     title = f"Evidence{count}"
-    _style(axes, title, "evidence over the base [ln units]", "")
+    style(axes, title, "evidence over the base [ln units]", "")
     axes.grid(visible=False, axis="y")
 
 

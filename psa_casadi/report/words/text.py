@@ -50,7 +50,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
     lines += [("wrong", wrong)] if wrong else []
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
     lines += [
-        ("records", _records(d.experiments, origin)),
+        ("records", records_text(d.experiments, origin)),
         ("noise", f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"),
         ("base", _errors(d.base_errors, scale)),
     ]
@@ -68,7 +68,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
     lines.append(("blind to", _blind(d)))
     lines.append(("next", d.next_experiment.why))
     lines.extend(("note", _FIRST.split(note, maxsplit=1)[0]) for note in d.notes)
-    return "\n".join(_line(label, text, width) for label, text in lines)
+    return "\n".join(labelled(label, text, width) for label, text in lines)
 
 
 def _cause(d: Diagnosis, cause: Cause) -> str:
@@ -112,16 +112,16 @@ def identification_text(
     span = max(e.record.range_m for e in found.experiments)
     share = number(100.0 * found.fit.rms / span, 2)
     head = [
-        ("records", _records(found.experiments, origin)),
+        ("records", records_text(found.experiments, origin)),
         ("error", f"{scale.text(found.fit.rms)} rms, {share} % of the largest range"),
     ]
     tail = [("warning", w) for w in found.warnings]
     tail += [("open", c.sentence) for c in found.combinations]
     tail += [("next", a.sentence) for a in found.advice]
     tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
-    blocks = ["\n".join(_line(label, text, width) for label, text in head)]
+    blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
     blocks.append(str(parameter_table(found.model, found)))
-    blocks += ["\n".join(_line(label, text, width) for label, text in tail)] if tail else []
+    blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
     return "\n\n".join(blocks)
 
 
@@ -134,7 +134,7 @@ def effect_page(effect: Component, width: int = 100) -> str:
         ("signature", effect.looks_like),
         ("source", effect.source),
     ]
-    body = "\n".join(_line(label, text, width) for label, text in lines)
+    body = "\n".join(labelled(label, text, width) for label, text in lines)
     return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect)}"
 
 
@@ -149,7 +149,8 @@ def check_sentence(report: "CheckReport") -> str:
     return f"{Path(report.path).name} did not pass: {failed}.{against}"
 
 
-def _line(label: str, text: str, width: int) -> str:
+def labelled(label: str, text: str, width: int) -> str:
+    """Return a text beside its label, in lines of the given width."""
     # a percent sign stays with its number
     return textwrap.fill(
         text.replace(" %", "\u00a0%"),
@@ -166,7 +167,8 @@ def _scale(experiments: Iterable[Experiment], size: float) -> Scale:
     return length_scale(size, counts=counts)
 
 
-def _records(experiments: Iterable[Experiment], origin: str) -> str:
+def records_text(experiments: Iterable[Experiment], origin: str) -> str:
+    """Return the records with their samples, duration and what they are."""
     parts = []
     for e in experiments:
         held = int(e.held_out.sum())

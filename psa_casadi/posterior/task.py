@@ -1,0 +1,246 @@
+"""What is sampled: the records as a fit has them, the priors, the fit, and the density there."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.identification.fitting.fit import FIT_RTOL
+from psa_casadi.identification.fitting.further import further_of
+from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum
+from psa_casadi.identification.fitting.minimum import Effort, accurate_minimum, objective
+from psa_casadi.identification.fitting.prediction import measured, motions_of
+from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
+from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.search.multistart import free_parameters
+from psa_casadi.identification.search.refitting import noise_levels
+from psa_casadi.identification.start.columns import columns_of, with_levels
+from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.model.compose import Model
+from psa_casadi.posterior.density import Block, Density
+from psa_casadi.posterior.within import Within
+from psa_casadi.records.quality.gaps import without_gaps
+from psa_casadi.records.quality.noise import autocovariance
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment, Level, whole
+from psa_casadi.simulation.ways import Way
+
+FloatArray = npt.NDArray[np.float64]
+
+_EVALUATIONS, _TOLERANCE, _ROUNDS = 60, 1e-6, 2
+#: A start nearer to a bound than this share of a standard deviation is moved inwards.
+_INSIDE = 0.3
+#: Curvature that a coordinate at its bound has in z at least: a tail as exp(z) has none.
+_TAIL = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A posterior to sample: `density` in u, and the fit that it is centred on.
+
+    `theta` (size,) are the coordinates of the fit, `covariance` theirs, white residuals assumed;
+    `inflation` is by how much colour makes every record's samples count less, `levels` the residual
+    rms of every record [m]. `sentences` tell what was done to the records.
+    """
+
+    model: Model
+    experiments: tuple[Experiment, ...]
+    unknowns: Unknowns
+    density: Density
+    theta: FloatArray
+    covariance: FloatArray
+    levels: tuple[float, ...]
+    inflation: tuple[float, ...]
+    way: Way
+    converged: bool
+    sentences: tuple[str, ...]
+
+
+def task_of(
+    model: Model,
+    records: Sequence[Record],
+    *,
+    free: Sequence[str] | None = None,
+    prior: Mapping[str, float] | None = None,
+    widths: Mapping[str, float] | None = None,
+) -> Task:
+    """Fit the model from its values and set up the density around that fit.
+
+    `free` are the parameters that are sampled (by default those that the model was fitted in, else
+    those that records of a stack can tell); `prior` are the values that the priors are centred at
+    and `widths` their standard deviations, in ln units for parameters that span decades, else in
+    ordinary changes. Raises InputError, SimulationError.
+    """
+    parts, said = without_gaps(list(records))
+    ready = [prepared(r) for r in parts]
+    fitted = [r for r, _ in ready]
+    columns = columns_of(model.with_declared_starts(), fitted)
+    experiments = with_levels([whole(r) for r in fitted], columns.fitted)
+    names = tuple(free or model.provenance.free or free_parameters(columns.model, fitted))
+    _refuse(columns.model, names, {**(prior or {}), **(widths or {})})
+    centre = columns.model.with_values(_centres(columns.model, fitted, names, prior or {}))
+    values = {n: columns.model.values[n] for n in names}
+    sigma = noise_levels(experiments)
+    unknowns = _unknowns(centre, experiments, names, sigma, widths or {})
+    theta = np.zeros(unknowns.size)
+    theta[: len(names)] = unknowns.coordinates(values)
+    for r in range(unknowns.records):
+        unknowns.place(theta, r, {}, 0.0)
+    for _ in range(_ROUNDS):
+        found, way, sigma, experiments = _fitted(centre, experiments, unknowns, theta, sigma)
+        theta = found.theta
+    return _task(
+        centre, experiments, unknowns, found, way, sigma,
+        (*said, *(s for _, own in ready for s in own), *columns.left_out),
+    )  # fmt: skip
+
+
+def _refuse(model: Model, names: Sequence[str], given: Mapping[str, float]) -> None:
+    problems = Problems()
+    for name in names:
+        if name not in model.values:
+            problems.add(
+                f"'{name}' is no parameter of the model '{model.name}'; it has"
+                f" {', '.join(model.parameter_names)}."
+            )
+    for name in given:
+        if name not in names:
+            problems.add(
+                f"A prior of '{name}' was given, which is not sampled; sampled are"
+                f" {', '.join(names)}."
+            )
+    problems.raise_if_any()
+
+
+def _centres(
+    model: Model, records: Sequence[Record], names: Sequence[str], given: Mapping[str, float]
+) -> dict[str, float]:
+    """Return where the priors are centred: as given, else a stack of the records' size.
+
+    Never where a fit ended, which would count the records twice. What such a stack does not have
+    (effects) is centred at the declared value; a loop of the other sign at the model's own, as its
+    coordinates do not pass 0.
+    """
+    stiffness = next((model.values[n] for n in ("k_B", "k") if n in model.values), None)
+    ordinary = starting_model(records, stiffness).values
+    declared = {n: model.parameter(n).value for n in names}
+    centre = {n: ordinary.get(n, declared[n]) for n in names}
+    if "A" in centre and centre["A"] * model.values["A"] <= 0.0:
+        centre |= {n: model.values[n] for n in ("k_L", "A", "beta", "gamma") if n in centre}
+    return {**centre, **given}
+
+
+def _unknowns(
+    centre: Model,
+    experiments: Sequence[Experiment],
+    names: Sequence[str],
+    sigma: Sequence[float],
+    widths: Mapping[str, float],
+) -> Unknowns:
+    """Return the coordinates around the priors' centre, with the widths that were given."""
+    motions = [motions_of(centre, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
+    first = [float(e.record.voltage[0]) for e in experiments]
+    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
+    found = unknowns_of(centre, names, motions, first, 30.0 * max(scale, 1e-12))
+    prior = found.prior.copy()
+    for name, width in widths.items():
+        if not width > 0.0:
+            raise InputError(f"The prior of '{name}' has the width {width:g}; give one above 0.")
+        prior[names.index(name)] = width
+    return replace(found, prior=prior)
+
+
+def _fitted(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    sigma: Sequence[float],
+) -> tuple[Minimum, Way, list[float], tuple[Experiment, ...]]:
+    """Return the fit, and the levels that its residuals suggest: of records and of columns."""
+    counts = [int(e.used.sum()) for e in experiments]
+    weights = np.repeat(np.array(sigma), counts)
+    linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
+    effort = Effort(_TOLERANCE, _EVALUATIONS, np.inf, linear, FIRST_RADIUS)
+    found, way, _ = accurate_minimum(
+        model, experiments, unknowns, weights, theta, sigma, FIT_RTOL, effort
+    )
+    if found.interrupted:
+        raise KeyboardInterrupt
+    own = np.split(found.residual[: len(weights)] * weights, np.cumsum(counts)[:-1])
+    rms = [max(float(np.sqrt(np.mean(r**2))), 1e-15) for r in own]
+    beside = further_of(model, experiments, unknowns, found.theta, way=way)
+    levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in beside)
+    return found, way, rms, tuple(replace(e, further=levels) for e in experiments)
+
+
+def _task(
+    model: Model,
+    experiments: tuple[Experiment, ...],
+    unknowns: Unknowns,
+    found: Minimum,
+    way: Way,
+    sigma: Sequence[float],
+    sentences: tuple[str, ...],
+) -> Task:
+    counts = [int(e.used.sum()) for e in experiments]
+    evaluate = objective(model, experiments, unknowns, np.repeat(np.array(sigma), counts), way)
+    low, high = unknowns.bounds()
+    again = evaluate(found.theta)
+    if again is None:
+        raise InputError("The model cannot be simulated at its fit; start from another model.")
+    residual, jacobian = again
+    blocks, inflation, precision = [], [], np.zeros((unknowns.size, unknowns.size))
+    edges = np.cumsum([0, *counts])
+    for first, last in pairwise(edges.tolist()):
+        rows = slice(first, last)
+        coloured = _inflation(residual[rows])
+        inflation.append(coloured)
+        blocks.append(Block(rows, (last - first) / coloured))
+        precision += jacobian[rows].T @ jacobian[rows] / coloured
+    rest = jacobian[edges[-1] :]
+    precision += rest.T @ rest
+    within = Within(low, high)
+    covariance: FloatArray = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=np.float64)
+    centre, factor = _whitening(within, found.theta, precision, covariance)
+    return Task(
+        model=model,
+        experiments=experiments,
+        unknowns=unknowns,
+        density=Density(evaluate, tuple(blocks), within, centre, factor),
+        theta=found.theta,
+        covariance=covariance,
+        levels=tuple(sigma),
+        inflation=tuple(inflation),
+        way=way,
+        converged=found.converged,
+        sentences=sentences,
+    )
+
+
+def _inflation(residual: FloatArray) -> float:
+    """Return how many neighbouring samples count as one: the residual's long-run variance ratio."""
+    lags = autocovariance(residual)
+    return max(1.0, float(2.0 * np.sum(lags) / lags[0] - 1.0)) if lags[0] > 0.0 else 1.0
+
+
+def _whitening(
+    within: Within, theta: FloatArray, precision: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return z at the fit, a little inside the bounds, and a factor of the covariance of z."""
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    room = np.where(within.bounded, 0.25 * (within.high - within.low), np.inf)
+    edge = np.where(within.bounded, np.minimum(_INSIDE * spread, room), 0.0)
+    inside = np.clip(theta, within.low + edge, within.high - edge)
+    z = within.z(inside)
+    _, slope, bend = within.theta(z)
+    curvature = precision * np.outer(slope, slope)
+    both = np.isfinite(within.low) & np.isfinite(within.high)
+    own = np.where(both, 0.5 * (1.0 - bend**2), 0.0)
+    curvature += np.diag(own + np.where(inside != theta, _TAIL, 0.0))
+    sizes, directions = np.linalg.eigh(curvature)
+    sizes = np.maximum(sizes, 1e-12 * sizes[-1])
+    return z, directions / np.sqrt(sizes)
