@@ -105,9 +105,7 @@ def trajectory_figure(run: Trajectory) -> Figure:
 
 def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:
     """Return the picture of a displacement [m] over time [s] and over the voltage [V]."""
-    figure = Figure(
-        figsize=(SIZE_INCHES[0], 0.5 * SIZE_INCHES[1]), dpi=DPI, layout="constrained"
-    )
+    figure = Figure(figsize=(SIZE_INCHES[0], 0.5 * SIZE_INCHES[1]), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     over_time, loop = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
     scale = length_scale(float(np.ptp(displacement)))
@@ -212,7 +210,7 @@ def _residual(axes: Axes, s: Series, origin: str) -> None:
     for edge in (-band, band) if band > 0 else ():
         label = "noise (2 sigma)" if edge > 0 else None
         axes.axhline(edge, color="black", linewidth=1.3, linestyle="--", label=label)
-    _style(axes, f"Residual: {origin} minus model", "time [s]", f"residual [{scale.unit}]")
+    style(axes, f"Residual: {origin} minus model", "time [s]", f"residual [{scale.unit}]")
     axes.margins(x=0.005)
     largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves) * scale.factor or 1.0
     axes.set_ylim(-1.1 * largest, 1.45 * largest)
