@@ -100,7 +100,7 @@ def correlation_plot(found: Identification) -> Plot:
     rows = max(10, len(found.model.structure.parameters))
     styled(plot, _MARGINS + _BAR * min(rows, 2 * len(names) + 2))
     plot.update_layout(
-        margin={"l": 20, "r": 4, "t": 40, "b": 20}, meta={"square": True}, barmode="overlay"
+        margin={"l": 20, "r": 12, "t": 40, "b": 20}, meta={"square": True}, barmode="overlay"
     )
     plot.update_xaxes(
         showgrid=False, ticks="", tickangle=-60, mirror=False, showline=False, automargin=True,
