@@ -74,6 +74,26 @@ def test_a_start_outside_the_box_is_moved_into_it() -> None:
     assert all(np.all((x >= 0) & (x <= 1)) for x in seen)
 
 
+@pytest.mark.parametrize("size", [1e80, 1e160])
+def test_a_start_whose_squares_overflow_counts_as_none(size: float) -> None:
+    """A simulation that diverges to a huge and finite value: no damping is large enough there."""
+    box = (np.array([-1.0, -1.0]), np.array([0.1, 1.0]))
+
+    def diverged(_: FloatArray) -> Pair:
+        return size * np.array([-1.0, 1.0]), size * np.array([[1.0, 0.5], [0.5, -1.0]])
+
+    assert minimise(diverged, np.zeros(2), box, tolerance=1e-9, evaluations=20) is None
+
+
+def test_a_step_into_overflow_is_taken_back() -> None:
+    def cliff(x: FloatArray) -> Pair:
+        return (np.full(1, 1e200), np.eye(1)) if x[0] > 2.0 else (x - 1.0, np.eye(1))
+
+    found = solved(minimise(cliff, np.full(1, -4.0), (OPEN[0][:1], OPEN[1][:1]), tolerance=1e-9,
+                            evaluations=50, radius=20.0))  # fmt: skip
+    np.testing.assert_allclose(found.theta, 1.0, atol=1e-9)
+
+
 def test_what_cannot_be_evaluated() -> None:
     def nowhere(_: FloatArray) -> Pair | None:
         return None

@@ -55,6 +55,8 @@ def minimise(
 ) -> Minimum | None:
     """Minimise |r(theta)|^2 within bounds; None if the start cannot be evaluated.
 
+    A point where the squares of r or J exceed double precision counts as one that cannot be.
+
     Each step minimises |r + J step|^2 within a radius (Levenberg's damping, found by bisection;
     Moré 1978) and the bounds, and is accepted if the cost falls; the radius, at first as given,
     follows the ratio of actual to predicted decrease.
@@ -69,7 +71,7 @@ def minimise(
     low, high = bounds
     columns = list(linear)
     theta = np.clip(theta, low, high)
-    start = evaluate(theta)
+    start = _measurable(evaluate(theta))
     if start is None:
         return None
     theta, residual, jacobian = _at_best(theta, start, columns)
@@ -84,7 +86,7 @@ def minimise(
             converged = True
             break
         try:
-            found = evaluate(trial)
+            found = _measurable(evaluate(trial))
         except KeyboardInterrupt:
             interrupted = True
             break
@@ -107,6 +109,18 @@ def minimise(
                 break
         converged = converged or radius < _SMALLEST_RADIUS
     return Minimum(theta, residual, jacobian, cost, converged, interrupted, count, radius)
+
+
+def _measurable(
+    found: tuple[FloatArray, FloatArray] | None,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return residual and Jacobian where |J|^2 |r|^2 is finite, else None: the model diverged."""
+    if found is None:
+        return None
+    residual, jacobian = found
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = float(np.vdot(residual, residual)) * max(1.0, float(np.vdot(jacobian, jacobian)))
+    return found if np.isfinite(size) else None
 
 
 def _at_best(
