@@ -135,6 +135,9 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
     assert validate_fmu(str(path)) == []
     with zipfile.ZipFile(path) as archive:
         archive.extractall(folder)
+    equations = (folder / "documentation" / "index.html").read_text(encoding="utf-8")
+    assert "<h1>PTBS200</h1>" in equations
+    assert "creep_gain" in equations
     model, stack = loads(played["chosen"]), stack_model("PTBS200")
     assert model.name == "PTBS200"
     assert {n for n, v in stack.values.items() if model.values[n] != v} == {"tau"}

@@ -8,9 +8,12 @@ from dataclasses import replace
 from typing import Any
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.common.html_page import page
 from psa_casadi.export.common.markup import default_span, describe
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
 from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
+from psa_casadi.export.fmu.documentation import equations
 from psa_casadi.export.fmu.sources import switch_scales
 from psa_casadi.export.fmu.terminals import terminal_entries
 from psa_casadi.export.fmu.texts import exported_texts
@@ -20,6 +23,7 @@ from psa_casadi.variables import Provenance
 
 #: What stands in the texts for the model's name.
 NAME = "psa_name_in_page"
+_README = "sources/README.txt"
 #: Kinds of variables whose usual size follows from the values of parameters.
 _SIZED = ("state", "input", "output", "option")
 
@@ -37,6 +41,7 @@ def fmu_parts(model: Model) -> dict[str, Any] | None:
         return None
     entries = {f"sources/{n}": t.encode() for n, t in texts.items()} | terminal_entries(blank)
     entries |= {
+        DOCUMENTATION_ENTRY: _documentation(blank).encode(),
         LICENSE_ENTRY: license_text(blank, 3).encode(),
         "modelDescription.xml": xml.encode(),
     }
@@ -44,6 +49,19 @@ def fmu_parts(model: Model) -> dict[str, Any] | None:
     files = [[n, len(e), any(m in e for m in marks)] for n, e in sorted(entries.items())]
     content = b"".join(entry for _, entry in sorted(entries.items()))
     return {"name": NAME, "token": token, "files": files, "packed": packed(content)}
+
+
+def _documentation(model: Model) -> str:
+    """Return a page of the equations, which hold whatever the values are."""
+    parts = [
+        f"<h1>{NAME}</h1>",
+        "<p>Start values are in modelDescription.xml; an effect is off while its gain is 0.</p>",
+        f'<p>To compile the sources: <a href="../{_README}">{_README}</a>. The terms:'
+        f' <a href="../{LICENSE_ENTRY}">{LICENSE_ENTRY}</a>.</p>',
+        "<h2>Equations</h2>",
+        equations(model),
+    ]
+    return page(NAME, parts, "The page on the model")
 
 
 def fmu_figures(model: Model, about: Model) -> dict[str, Any]:
