@@ -1,11 +1,16 @@
 """The playground: every effect on one page, any voltage, and what it tells is what Python says."""
 
+import base64
 import csv
+import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
+import fmpy
 import numpy as np
 import pytest
+from fmpy.validation import validate_fmu
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
@@ -14,6 +19,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import loads, save_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.page.playground_page import playground
+from psa_casadi.simulation.compiler import run_compiler
 from psa_casadi.simulation.simulate import simulate
 from tests.browser import Browser, driven, find_browser, on_a_phone
 from tests.sampled_models import controller
@@ -61,7 +67,19 @@ setTimeout(function () {
         'Zeit;t (ms);U [kV]\\n1;0,0;0,1\\n2;1,0;0,2\\n3;2,0;0,3\\n4;3,5;0,1\\n');
       found.none = [psaLive.voltages.corners('1 0, 0 5', 5), psaLive.voltages.read('a,b\\n1,2\\n')];
       found.spent = box.psa.last();
-      tell(found);
+      var knob = Array.prototype.find.call(box.querySelectorAll('.knob'), function (k) {
+        return k.querySelector('label').textContent === 'tau'; }).querySelector('[type=range]');
+      knob.value = '650'; knob.dispatchEvent(new Event('input'));
+      found.chosen = box.psa.file();
+      var create = URL.createObjectURL;
+      URL.createObjectURL = function (blob) {
+        var reader = new FileReader();
+        reader.onload = function () { found.fmu = reader.result.split(',')[1]; tell(found); };
+        reader.readAsDataURL(blob);
+        return create.call(URL, blob);
+      };
+      Array.prototype.find.call(box.querySelectorAll('button'), function (b) {
+        return b.textContent === 'Download FMU'; }).click();
     }, 400);
   }, 400);
 }, 400);
@@ -106,6 +124,48 @@ def test_what_it_downloads_is_what_python_simulates(played: dict[str, Any]) -> N
     wanted = simulate(model, t, v).displacement
     shown = table[:, head.index("measured_displacement [m]")]
     assert np.max(np.abs(shown - wanted)) < 2e-6 * np.ptp(wanted)
+
+
+@slow
+def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
+    played: dict[str, Any], tmp_path: Path
+) -> None:
+    path, folder = tmp_path / "page.fmu", tmp_path / "fmu"
+    path.write_bytes(base64.b64decode(played["fmu"]))
+    assert validate_fmu(str(path)) == []
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(folder)
+    equations = (folder / "documentation" / "index.html").read_text(encoding="utf-8")
+    assert "<h1>PTBS200</h1>" in equations
+    assert "creep_gain" in equations
+    model, stack = loads(played["chosen"]), stack_model("PTBS200")
+    assert model.name == "PTBS200"
+    assert {n for n, v in stack.values.items() if model.values[n] != v} == {"tau"}
+    assert model.values["creep_gain"] > 0.0
+    described = {v.name: v for v in fmpy.read_model_description(folder).modelVariables}
+    assert {n: float(described[n].start) for n in model.values} == model.values
+    nominals = [float(described[n].nominal) for n in model.state_names]
+    assert nominals == model.state_nominals().tolist()
+    others = {c.gain for c in EFFECTS.values()} - {"creep_gain"}
+    assert {float(described[gain].start) for gain in others if gain} == {0.0}
+
+    if not shutil.which("gcc"):
+        pytest.skip("gcc is not installed")
+    lines = (folder / "sources" / "README.txt").read_text(encoding="utf-8").splitlines()
+    line = next(t for t in lines if " cc " in t).replace("-O2", "-O0").split()
+    run_compiler(["gcc", *line[1:]], folder / "sources")
+    binaries = folder / "binaries" / fmpy.platform_tuple
+    binaries.mkdir(parents=True)
+    shutil.move(folder / "sources" / line[-1], binaries)
+    t = np.linspace(0.0, 4e-3, 401)
+    v = 100.0 * np.where((t > 2e-4) & (t < 3.5e-3), 1.0 - np.cos(2.0 * np.pi * t / 2e-3), 0.0)
+    found = fmpy.simulate_fmu(
+        folder, fmi_type="CoSimulation", stop_time=t[-1], output_interval=t[1],
+        relative_tolerance=1e-8,
+        input=np.array(list(zip(t, v, strict=True)), [("time", float), ("voltage", float)]),
+    )  # fmt: skip
+    wanted = simulate(model, t, v, rtol=1e-9, hold="zero").displacement
+    assert np.max(np.abs(found["measured_displacement"] - wanted)) < 1e-7 * np.ptp(wanted)
 
 
 @slow

@@ -123,6 +123,8 @@ def test_a_record_starts_where_it_does_here_and_gains_of_0_leave_the_base(browse
     rows = {e.name: base.with_effect(e) for e in EFFECTS.values()}
     rows = {n: m.with_values({EFFECTS[n].gain or "": ordinary_size(m, EFFECTS[n])})
             for n, m in rows.items()}  # fmt: skip
+    gains = {e.gain or "": ordinary_size(model, e) for e in EFFECTS.values()}
+    rows["every effect"] = model.with_values(gains)
     cases = [case(model.with_values(m.values), t, v, quick=True) for m in (base, *rows.values())]
     told = run_in_browser(browser, model, cases)
     wanted = [simulate(base, t, v).displacement]
@@ -131,6 +133,9 @@ def test_a_record_starts_where_it_does_here_and_gains_of_0_leave_the_base(browse
         at = m.structure.f(t[0], x0, inputs(m, v)[0], m.parameter_vector())[1]
         first = float(at[m.output_names.index("measured_displacement")])
         assert abs(row["shown"][0] - first) < SAME * np.ptp(wanted[0]), name
+        own = m.structure.f(t[0], started(m, t, v), inputs(m, v)[0], m.parameter_vector())[1]
+        here = float(own[m.output_names.index("measured_displacement")])
+        assert abs(here - first) < SAME * np.ptp(wanted[0]), name
     assert off(told[0]["shown"], wanted[0]) < 1e-5  # one run of exact steps
 
 

@@ -235,6 +235,16 @@ def _newton(s: Structure, rows: list[int], x: Expression) -> Expression:
     return ca.vertcat(*parts)
 
 
+def _solved(matrix: Expression, right: Expression) -> Expression:
+    """Return matrix^-1 right, refined once.
+
+    CasADi orthogonalises the columns one by one, which loses digits as the condition grows (to 3e11
+    with every effect). A rest is corrected by the next step; nothing corrects a motion.
+    """
+    first = ca.solve(matrix, right)
+    return first + ca.solve(matrix, right - matrix @ first)
+
+
 def _in_motion(
     s: Structure,
     rest: Expression,
@@ -249,8 +259,8 @@ def _in_motion(
     drive = by_input[fast, :] @ rate
     if memory:
         drive += jacobian[fast, memory] @ _at(s, _slopes(s), x)[memory]
-    steady = -ca.solve(jacobian[fast, fast], drive)
-    lag = ca.solve(jacobian[fast, fast], steady)
+    steady = -_solved(jacobian[fast, fast], drive)
+    lag = _solved(jacobian[fast, fast], steady)
     parts = [rest[i] for i in range(len(s.states))]
     for k, i in enumerate(fast):
         parts[i] = parts[i] + lag[k]

@@ -114,12 +114,17 @@ def log_categories(root: ET.Element) -> None:
         ET.SubElement(categories, "Category", {"name": name, "description": meaning})
 
 
-def default_experiment(root: ET.Element, model: Model) -> None:
-    """Append the DefaultExperiment: 40 times what the model needs to settle, in 1000 steps.
+def default_span(model: Model) -> float:
+    """Return how long the default experiment takes [s].
 
     Two digits are given, as the last ones of an eigenvalue differ from machine to machine.
     """
-    span = float(f"{40.0 * time_scale(model):.2g}")
+    return float(f"{40.0 * time_scale(model):.2g}")
+
+
+def default_experiment(root: ET.Element, model: Model) -> None:
+    """Append the DefaultExperiment: 40 times what the model needs to settle, in 1000 steps."""
+    span = default_span(model)
     experiment = {"startTime": "0", "stopTime": number(span), "tolerance": "1e-05"}
     ET.SubElement(root, "DefaultExperiment", {**experiment, "stepSize": number(span / 1000.0)})
 

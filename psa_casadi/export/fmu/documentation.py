@@ -111,7 +111,7 @@ def documentation(
         f"<p>{html.escape(_start(model))}</p>",
         *_interface(model, table),
         "<h2>Equations</h2>",
-        _equations(model),
+        equations(model),
         "<h2>Parameters</h2>",
         _parameters(model, table),
         "<h2>Files</h2>",
@@ -205,7 +205,8 @@ def _interface(model: Model, table: Sequence[Variable]) -> list[str]:
     return parts
 
 
-def _equations(model: Model) -> str:
+def equations(model: Model) -> str:
+    """Return the table of a model's components, with their equations and sources."""
     rows = [(c.name, c.description, c.equation_text, c.source) for c in model.components]
     return table_of(("component", "what it is", "equation", "source"), rows)
 

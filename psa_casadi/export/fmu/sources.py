@@ -170,7 +170,7 @@ def _settling(model: Model) -> list[str]:
     ]
 
 
-def _switch_scales(model: Model, nominals: Sequence[float]) -> list[float]:
+def switch_scales(model: Model, nominals: Sequence[float]) -> list[float]:
     """Return sum_j |dz/dx_j| nominal_j of every switch z at rest: its noise at a tolerance of 1."""
     s = model.structure
     slopes = ca.jacobian(ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.x)
@@ -189,7 +189,7 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         return [v.start or 0.0 for v in table if v.kind == kind]
 
     nominals = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
-    scales = _switch_scales(model, nominals)
+    scales = switch_scales(model, nominals)
     held = [*starts("parameter"), *starts("sampled")]
     lines = [
         '#include "fmi_data.h"',

@@ -31,7 +31,7 @@ _LEVELS = 16
 _LIVE = ("live_model.js", "live_plot.js", "live_zoom.js", "live_knobs.js")
 LIVE_SCRIPTS = {
     "report": (*_LIVE, "live_budget.js", "live.js", "live_start.js"),
-    "playground": (*_LIVE, "voltages.js", "playground.js", "live_start.js"),
+    "playground": (*_LIVE, "live_fmu.js", "voltages.js", "playground.js", "live_start.js"),
 }
 
 

@@ -207,7 +207,12 @@ psaLive.playground = function (box, told, run) {
       field('or corners (s V, s V, ...)', corners), field('or a CSV file', file),
       button('Reset', function () { setStack(told.stacks.indexOf(stack), true); }),
       button('Download CSV', function () { psaLive.save('trajectory.csv', csv(), 'text/csv'); })
-    ].concat(told.file ? [button('Download MODEL.json', function () {
+    ].concat(told.fmu ? [button('Download FMU', function () {
+      psaLive.fmu(told, values, stack).then(function (bytes) {
+        psaLive.save(stack.name.replace(/\W/g, '_') + '.fmu', bytes, 'application/octet-stream');
+        status.textContent = 'The FMU (FMI 3.0) has C sources and no binaries: compile it, or let its importer do so.';
+      });
+    })] : []).concat(told.file ? [button('Download MODEL.json', function () {
       psaLive.save('MODEL.json', psaLive.file(told, values, stack), 'application/json');
     })] : [], [status]))
   ];

@@ -12,6 +12,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_data import live_data
+from psa_casadi.report.page.live_fmu import fmu_figures, fmu_parts
 
 #: The stack that a page has where no model is given, and where the answer to a step ends [kHz].
 STACK, _BAND = "P-885.51", 100.0
@@ -50,7 +51,10 @@ def playground(model: Model | None = None) -> str:
 
 def _told(given: Model, whole: Model, title: str) -> dict[str, Any]:
     stacks = [_stack(given, whole, title, given.description)]
-    if {c.name for c in given.components} >= {c.name for c in BASE}:
+    # the terms of a model that states some are not those of other stacks
+    if not given.publication.stated and {c.name for c in given.components} >= {
+        c.name for c in BASE
+    }:
         others = [name for name in STACKS if name != title]
         stacks += [
             _stack(stack_model(name), whole, name, STACKS[name].description) for name in others
@@ -59,6 +63,7 @@ def _told(given: Model, whole: Model, title: str) -> dict[str, Any]:
         "kind": "playground",
         **live_data(whole, web_module(whole)),
         "stacks": stacks,
+        "fmu": fmu_parts(whole),
         "of_effects": [p.name for c in whole.effects for p in c.parameters],
         "band": _BAND,
     }
@@ -67,10 +72,12 @@ def _told(given: Model, whole: Model, title: str) -> dict[str, Any]:
 def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str, Any]:
     base = {p.name for c in whole.components if c.gain is None for p in c.parameters}
     values = {n: v for n, v in model.values.items() if n in base}
+    chosen = whole.with_values(values)
     return {
         "name": name,
         "description": description,
         "values": values,
         "rated": model.values.get("u_rated", 1.0),
-        "nominals": whole.with_values(values).state_nominals().tolist(),
+        "nominals": chosen.state_nominals().tolist(),
+        "fmu": fmu_figures(chosen, model),
     }
