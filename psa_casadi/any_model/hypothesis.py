@@ -48,6 +48,11 @@ class OdeHypothesis:
         """Names of the causes."""
         return frozenset(c.name for c in self.causes)
 
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """The held-out rms of every output, that of used samples where none is held out."""
+        return tuple(held or train for held, train in zip(self.held, self.train, strict=True))
+
 
 def hypothesis_of(
     causes: Sequence[Component], fit: OdeFit | None, runs: Sequence[Run], *, final: bool = False
@@ -62,6 +67,22 @@ def hypothesis_of(
     held = tuple(rms_of(runs, predicted, o.index, Run.judged) for o in fit.outputs)
     train = tuple(rms_of(runs, predicted, o.index, Run.fitted) for o in fit.outputs)
     return OdeHypothesis(tuple(causes), fit, predicted, held, train, final)
+
+
+def share_removed(
+    noise: Sequence[float], root: Sequence[float], before: Sequence[float], after: Sequence[float]
+) -> float:
+    """Return the share of the root's error above the noise that one model removes of another's.
+
+    rms errors of every output; their powers are taken over that of their noise and added.
+    """
+    floors = [max(n, 1e-300) for n in noise]
+    base, old, new = (
+        sum((e / n) ** 2 for e, n in zip(errors, floors, strict=True))
+        for errors in (root, before, after)
+    )
+    above = base - len(floors)
+    return float((old - new) / above) if above > 0 else 0.0
 
 
 def errors_at(
