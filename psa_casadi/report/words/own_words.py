@@ -63,8 +63,9 @@ def own_gain(d: OdeDiagnosis) -> str:
         return f"the held-out errors of {len(falls)} outputs fall by {low:.0f} to {high:.0f} %"
     if len(falls) == 1:
         return f"the held-out error falls by {falls[0]:.0f} %"
-    each = [f"of {e.output} by {f:.0f} %" for e, f in zip(d.errors, falls, strict=True)]
-    return f"the held-out error falls {listing(each)}"
+    (first, own), *others = zip(d.errors, falls, strict=True)
+    each = [f"that of {e.output} by {f:.0f} %" for e, f in others]
+    return listing([f"the held-out error of {first.output} falls by {own:.0f} %", *each])
 
 
 def fall_of(e: OutputError) -> float:
