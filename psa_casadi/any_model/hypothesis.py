@@ -19,7 +19,7 @@ from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
 from psa_casadi.diagnosis.screening.evidence import estimated
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.search.worth import confirmed
 from psa_casadi.errors import PsaError
 
 FloatArray = npt.NDArray[np.float64]
@@ -193,12 +193,12 @@ def _along(runs: Sequence[Run], output: FittedOutput) -> list[FloatArray]:
 
 
 def held_out_confirms(
-    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, *, alarm: bool
+    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, score: float
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.worth.confirmed`), the gains in
-    log-likelihood and what is promised summed over the outputs.
+    log-likelihood and what is promised summed over the outputs; `score` is what is gained of it.
     """
     gained = promise = 0.0
     for k, (o, own) in enumerate(zip(of.fit.outputs, (colour, *colour.further), strict=True)):
@@ -212,7 +212,4 @@ def held_out_confirms(
         promise += 0.5 * samples * float(np.mean((new - old) ** 2)) / after**2
     if promise == 0.0 and gained == 0.0:
         return True
-    least = thresholds().held_out
-    if alarm:
-        least = min(least, promise - 2.0 * float(np.sqrt(2.0 * promise)))
-    return bool(gained > least)
+    return confirmed(gained, promise, score)

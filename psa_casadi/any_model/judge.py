@@ -11,9 +11,10 @@ from psa_casadi.any_model.identify import with_told
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
 from psa_casadi.any_model.search import Known, with_cause, without
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.judgement import SMALL_NOTE, least_share, rivals, verdict_by
 from psa_casadi.diagnosis.noise.colour import noise_rms
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
-from psa_casadi.diagnosis.screening.evidence import credible_set, probabilities, temperature
+from psa_casadi.diagnosis.screening.evidence import probabilities, temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.records.checks import FEWEST_SAMPLES
@@ -33,10 +34,6 @@ _LITTLE = (
     " than {:.0%} and much remains."
 )
 _UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
-_SMALL = (
-    "{} is in the extended model and removes {:.0%} of the held-out error above the noise. It is"
-    " not named: structure remains, and so little may only correct the form of what is named."
-)
 
 
 def judged(known: Known) -> OdeDiagnosis:
@@ -84,14 +81,13 @@ def _verdict(
     withdrawn: bool,
 ) -> Verdict:
     causes = last.of.causes
-    if not (first.test.alarm or causes):
-        return "adequate"
     partly = last.test.alarm
-    if not causes or withdrawn or (partly and share < _ENOUGH):
-        return "unexplained"
-    if any(len(_rivals(told[c.name], c.name)) > 0 for c in causes[:1]):
-        return "ambiguous"
-    return "partly_explained" if partly else "cause_named"
+    return verdict_by(
+        missing=first.test.alarm or bool(causes),
+        withdrawn=withdrawn or not causes or (partly and share < _ENOUGH),
+        ambiguous=any(rivals(told[c.name], c.name) for c in causes[:1]),
+        more=partly,
+    )
 
 
 def _beaten_by(
@@ -134,10 +130,6 @@ def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, f
     return probabilities({n: e for n, e in evidences.items() if np.isfinite(e)})
 
 
-def _rivals(chances: Mapping[str, float], cause: str) -> tuple[str, ...]:
-    return tuple(n for n in credible_set(chances, thresholds().credible) if n != cause)
-
-
 def _diagnosis(
     known: Known,
     verdict: Verdict,
@@ -151,8 +143,8 @@ def _diagnosis(
     sure = certainty(named.fit)
     partly = known.view(named).test.alarm
     shares = {c.name: _own_share(known, named, c, floors) for c in named.causes}
-    largest = max(shares.values(), default=0.0)
-    small = [n for n, s in shares.items() if partly and s < min(thresholds().form, largest)]
+    least = least_share(shares.values())
+    small = [n for n, s in shares.items() if partly and s < least]
     causes = tuple(
         PortCause(
             effect=c.name,
@@ -168,7 +160,7 @@ def _diagnosis(
                 for p in c.parameters
                 if p.name in sure.intervals
             },
-            cannot_be_told_from=_rivals(told[c.name], c.name),
+            cannot_be_told_from=rivals(told[c.name], c.name),
             explained_share=float(np.clip(shares[c.name], 0.0, 1.0)),
         )
         for c in named.causes
@@ -189,7 +181,7 @@ def _diagnosis(
             for k, (o, floor) in enumerate(zip(named.fit.outputs, floors, strict=True))
         ),
         remaining=_remaining(known.view(named)),
-        notes=(*notes, *(_SMALL.format(n, max(shares[n], 0.0)) for n in small)),
+        notes=(*notes, *(SMALL_NOTE.format(n, 100 * max(shares[n], 0.0)) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
         extended_fit=named.fit,
