@@ -15,6 +15,7 @@ PAGE, FOLDER = "json.md", "schemas"
 WRITTEN_BY = {
     "model": "`psa identify -o`, `psa diagnose -o`, `psa.save_model`",
     "diagnosis": "`psa diagnose --json`",
+    "own_model": "`psa.diagnose(model, records).to_json()`",
     "identification": "`psa identify --json`",
     "posterior": "`psa sample --json`",
     "check": "`psa check --json`",
@@ -45,7 +46,7 @@ def section(name: str, schema: Schema) -> str:
     file = f"{name}.schema.json"
     link = f"[`{file}`]({FOLDER}/{file})"
     parts = [
-        f"## {name.capitalize()}",
+        f"## {name.capitalize().replace('_', ' ')}",
         f"{schema['description']} Written by {WRITTEN_BY[name]}; schema: {link}.",
         markdown_table(_members(name, schema)),
     ]

@@ -44,6 +44,18 @@ class Reported(Shown):
         _made("page", self, path, still)
 
 
+class StillReported(Shown):
+    """What a result can show of itself whose page holds no model that runs."""
+
+    def report(self, path: str | os.PathLike[str]) -> None:
+        """Write the page, one HTML file below 1.5 MB that needs no network.
+
+        Raises:
+            InputError: `path` cannot be written to.
+        """
+        _made("page", self, path, True)
+
+
 def frame(columns: dict[str, Any]) -> Any:
     """Return a pandas DataFrame of columns by name. Raises ImportError that says what to do."""
     try:

@@ -1,10 +1,11 @@
 """Diagnosis of models that are no stacks: causes that independent plants hide, and clean ones."""
 
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 from fmpy import simulate_fmu
@@ -18,72 +19,11 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.from_casadi.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
 from tests import own_plants as plants
+from tests.browser import DARK, find_browser
+from tests.html_page import Page, figures, numbers
 from tests.modelica_runs import load
-
-
-def _parameter(name: str, value: float, unit: str) -> psa.Parameter:
-    return psa.Parameter(name, value, unit, (0.03 * value, 30.0 * value), name, log=True)
-
-
-def oscillator() -> psa.Model:
-    x, v, force, m, c, k = (ca.SX.sym(n) for n in ("x", "v", "force", "m", "c", "k"))
-    return psa.ode_model(
-        {"x": [x, v], "u": force, "p": [m, c, k], "ode": [v, (force - c * v - k * x) / m], "y": x},
-        name="oscillator",
-        states=[psa.State("x", "m", "position", 1.0), psa.State("v", "m/s", "velocity", 1.0)],
-        inputs=[psa.Input("force", "N", "force")],
-        outputs=[psa.Output("position", "m", "position")],
-        parameters=[
-            _parameter("m", 1.0, "kg"),
-            _parameter("c", 30.0, "N.s/m"),
-            _parameter("k", 6e4, "N/m"),
-        ],
-    )
-
-
-def motor() -> psa.Model:
-    i, w, u, R, k, J, b = (ca.SX.sym(n) for n in ("current", "speed", "voltage", *"RkJb"))
-    return psa.ode_model(
-        {
-            "x": [i, w], "u": u, "p": [R, k, J, b], "y": [w, i],
-            "ode": [(u - R * i - k * w) / 2e-3, (k * i - b * w) / J],
-        },
-        name="motor",
-        outputs=[psa.Output("w", "rad/s", "speed"), psa.Output("i", "A", "current")],
-        parameters=[
-            _parameter("R", 1.5, "Ohm"),
-            _parameter("k", 0.04, "N.m/A"),
-            _parameter("J", 2e-5, "kg.m2"),
-            _parameter("b", 1e-5, "N.m.s"),
-        ],
-    )  # fmt: skip
-
-
-def tanks() -> psa.Model:
-    upper, lower, pump, a, c, d = (ca.SX.sym(n) for n in ("h1", "h2", "pump", "a", "c", "d"))
-    through, out = (f * ca.sqrt(ca.fmax(h, 1e-4)) for f, h in ((a, upper), (c, lower)))
-    return psa.ode_model(
-        {
-            "x": [upper, lower], "u": pump, "p": [a, c, d], "y": lower,
-            "ode": [d * pump - through, through - out],
-        },
-        name="tanks",
-        states=[psa.State(n, "m", n, 1.0, 0.1) for n in ("h1", "h2")],
-        outputs=[psa.Output("level", "m", "level of the lower tank")],
-        parameters=[_parameter(n, v, "1") for n, v in (("a", 0.02), ("c", 0.02), ("d", 0.003))],
-    )  # fmt: skip
-
-
-def pair() -> psa.Model:
-    x, v, z, w, f1, f2 = (ca.SX.sym(n) for n in ("x1", "v1", "x2", "v2", "f1", "f2"))
-    k, kc, c = (ca.SX.sym(n) for n in ("k", "kc", "c"))
-    rates = [v, f1 - k * x - kc * (x - z) - c * v, w, f2 - k * z - kc * (z - x) - c * w]
-    return psa.ode_model(
-        {"x": [x, v, z, w], "u": [f1, f2], "p": [k, kc, c], "ode": rates, "y": [x, z]},
-        name="pair",
-        outputs=["y1", "y2"],
-        parameters=[_parameter(n, v, "1") for n, v in (("k", 80.0), ("kc", 30.0), ("c", 0.5))],
-    )
+from tests.own_models import motor, oscillator, pair, tanks
+from tests.test_schemas import valid
 
 
 @cache
@@ -95,7 +35,7 @@ def _only(d: psa.OdeDiagnosis, effect: str) -> bool:
     return d.verdict == "cause_named" and [c.effect for c in d.causes] == [effect]
 
 
-def test_a_clean_model_of_two_outputs_is_identified_with_its_errors() -> None:
+def test_a_clean_model_of_two_outputs_is_identified_with_its_errors(tmp_path: Path) -> None:
     found = psa.identify(motor(), plants.motor(2, friction=0.0), starts=3)
     true = {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}
     for name, value in true.items():
@@ -105,9 +45,20 @@ def test_a_clean_model_of_two_outputs_is_identified_with_its_errors() -> None:
     assert found.rms["i"] == pytest.approx(0.005, rel=0.05)
     assert not found.warnings
     assert found.model.provenance.identified_from[0][0] == "drive"
+    found.report(tmp_path / "fit.html")
+    page = Page((tmp_path / "fit.html").read_text("utf-8"))
+    assert "w by 0.301 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
+    assert "R 1.200 1.199 to 1.200 Ohm fit" in page.text
+    assert page.loaded == []
+
+
+#: Tests that share a diagnosis run in one process.
+shares_hysteresis = pytest.mark.xdist_group("own hysteresis")
+_HOSTILE = "</script><img src=x onerror=alert(1)> $x_"
 
 
 @pytest.mark.slow
+@shares_hysteresis
 def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> None:
     d = _hysteresis()
     assert _only(d, "hysteresis_of_x_in_v")
@@ -125,6 +76,57 @@ def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> No
 
 
 @pytest.mark.slow
+@shares_hysteresis
+def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
+    d, path = _hysteresis(), tmp_path / "page.html"
+    d.report(path)
+    text = path.read_text("utf-8")
+    page = Page(text)
+    (run,) = d.runs
+    held = (run.outputs[:, 0] - d.extended[0][:, 0])[run.held_out]
+    rms = 1e6 * np.sqrt(np.mean(held**2))
+    gain = 100.0 * (1.0 - rms / (1e6 * d.errors[0].base))
+    assert page.text.startswith("Diagnosis of oscillator: cause named")
+    assert (
+        "The cause is hysteresis of x in v (the rate of v, confidence 99 %):"
+        f" the held-out error falls by {gain:.0f} %." in page.text
+    )
+    assert f"position: held-out rms {rms:.2f} µm" in page.text
+    assert re.search(r"hysteresis_of_x_in_v_n 0\.99\d+ 0\.99\d+ to 1\.0\d+ 1 fit", page.text)
+    assert page.loaded == []
+    assert page.targets <= page.names
+    assert "default-src 'none'" in text
+    above, below, *_ = (t for t in figures(text)[0]["data"] if t["name"] == "base model")
+    miss = 1e3 * (run.outputs - d.base[0])[:, 0]  # in mm
+    assert np.max(np.abs(numbers(below["y"]))) == pytest.approx(np.max(np.abs(miss)), rel=1e-5)
+    assert len(numbers(above["y"])) == len(numbers(below["y"])) > 1000
+    assert path.stat().st_size < 1_500_000
+    assert valid("own_model", d.to_json())["causes"][0]["port"] == "the rate of v"
+    assert find_browser(tmp_path).serious_faults(path, DARK) == []
+
+
+@pytest.mark.slow
+@shares_hysteresis
+def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
+    d, path = _hysteresis(), tmp_path / "page.html"
+    (run,), (cause,) = d.runs, d.causes
+    hostile = replace(
+        d,
+        runs=(replace(run, signals=replace(run.signals, name=_HOSTILE)),),
+        causes=(replace(cause, description=_HOSTILE),),
+        missed=replace(d.missed, where=_HOSTILE),
+        notes=(_HOSTILE,),
+    )
+    hostile.report(path)
+    text = path.read_text("utf-8")
+    assert "<img src=x" not in text
+    page = Page(text)
+    assert page.loaded == []
+    assert page.text.count(_HOSTILE) >= 6  # the record thrice and more, cause, misfit, note
+
+
+@pytest.mark.slow
+@shares_hysteresis
 def test_the_extended_model_is_exported_like_any_other(tmp_path: Path) -> None:
     d, record = _hysteresis(), plants.bouc_wen(1)
     fmu = psa.export_fmu(d.model, tmp_path / "extended.fmu")
@@ -179,6 +181,15 @@ def test_a_cause_that_no_effect_has_is_unexplained() -> None:
     assert d.verdict == "unexplained"
     assert not d.causes
     assert d.extended_fit is d.base_fit
+    free = d.correction
+    assert free is not None
+    assert f"{free.share:.0%}" in d.unnamed
+    x = d.runs[0].outputs[:, 0]  # the state that it follows is what was measured
+    assert free.variable == "x"
+    assert len(free.along) == len(free.added) == len(x)
+    assert np.std(x - free.along) < np.std(x - d.base[0][:, 0])  # with it, the model is nearer
+    assert free.unit == "m/s2"
+    valid("own_model", d.to_json())
 
 
 @pytest.mark.slow

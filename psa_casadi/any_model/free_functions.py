@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.any_model.fit import OdeFit, fit_ode
-from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of
-from psa_casadi.any_model.predict import traced
+from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of, share_removed
+from psa_casadi.any_model.predict import shown_by, states_of, traced
+from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
 from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.any_model.start import start_of
@@ -38,13 +39,74 @@ _FITTED, _EVALUATIONS = 2, 25
 
 
 @dataclass(frozen=True)
+class _Law:
+    """The monomials of a free function, and the sizes that its variables are taken over."""
+
+    names: tuple[str, ...]
+    terms: tuple[tuple[str, ...], ...]
+    scales: dict[str, float]
+
+    def coefficients(self, prefix: str) -> list[str]:
+        """Return the names of the coefficients."""
+        return [f"{prefix}_{k}" for k in range(len(self.terms))]
+
+
+@dataclass(frozen=True)
 class Free:
-    """A free function: of what, at which port, its evidence over the base, and what it removes."""
+    """A free function: of what, at which port, its evidence over the base, and what it removes.
+
+    `law` are its monomials in the variables over their `scales`, `fit` the base with it.
+    """
 
     port: Port
     of: str
     evidence: float
     share: float
+    law: _Law
+    fit: OdeFit
+
+
+def curve_of(free: Free, runs: Sequence[Run]) -> tuple[str, FloatArray, FloatArray]:
+    """Return what a free function adds along all records, and the variable that this follows most.
+
+    (name, values (n,) of the variable, what is added (n,) to the port's sum). Raises PsaError.
+    """
+    values = {n: _along(free, runs, n) for n in free.law.names}
+    (component,) = free.fit.model.effects
+    model = free.fit.model
+    added = sum(
+        model.values[c] * prod(values[n] / free.law.scales[n] for n in term)
+        for c, term in zip(free.law.coefficients(component.name), free.law.terms, strict=True)
+    )
+    added = np.asarray(added, dtype=np.float64)
+    name = min(values, key=lambda n: _scatter(values[n], added))
+    return name, values[name], added
+
+
+def _scatter(along: FloatArray, added: FloatArray) -> float:
+    """Return what a polynomial of one variable leaves of what is added (sum of squares)."""
+    place = along / max(float(np.max(np.abs(along))), 1e-300)
+    powers = np.vander(place, _OF_SIGNAL + 1)
+    rest = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
+    return float(rest @ rest)
+
+
+def _along(free: Free, runs: Sequence[Run], name: str) -> FloatArray:
+    """Return a variable along all records: an input, a state, or an output before its sensor."""
+    model, fit, starts = free.fit.model, free.fit, free.fit.starts()
+    if name in model.input_names:
+        return np.concatenate([r.inputs[:, model.input_names.index(name)] for r in runs])
+    if name in model.state_names:
+        k = model.state_names.index(name)
+        rows = zip(runs, starts, strict=True)
+        return np.concatenate([states_of(model, r, s, fit.rtol)[:, k] for r, s in rows])
+    (component,) = model.effects
+    none = model.with_values(dict.fromkeys(free.law.coefficients(component.name), 0.0))
+    k = model.output_names.index(name)
+    parts = [
+        shown_by(none, r, s, r.signals.n, fit.rtol)[:, k] for r, s in zip(runs, starts, strict=True)
+    ]
+    return np.concatenate(parts)
 
 
 def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
@@ -52,32 +114,29 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
     root = view.of
     sizes = sizes_of(known.table.base, known.runs, root.fit.starts())
     tried = [_free(known.table.base, p, sizes) for p in ports_of(known.table.base)]
-    scored: list[tuple[float, Attached, str]] = []
-    for attached, of in tried:
+    scored: list[tuple[float, Attached, _Law]] = []
+    for attached, law in tried:
         try:
-            scored.append((_decrease(known, view, attached), attached, of))
+            scored.append((_decrease(known, view, attached), attached, law))
         except PsaError:
             continue
     scored.sort(key=lambda s: -s[0])
     found = []
-    for _, attached, of in scored[:_FITTED]:
+    for _, attached, law in scored[:_FITTED]:
         known.progress(f"a free function in {attached.port.words}")
         h = hypothesis_of((attached.component,), _fitted(known, root, attached), known.runs)
         if h is not None:
-            found.append(Free(attached.port, of, known.evidence(h), _share(known, root, h, view)))
+            share = _share(root, h, view)
+            of = " and ".join(law.names)
+            found.append(Free(attached.port, of, known.evidence(h), share, law, h.fit))
     return tuple(sorted(found, key=lambda f: -f.evidence))
 
 
-def _share(known: Known, root: OdeHypothesis, h: OdeHypothesis, view: OdeView) -> float:
+def _share(root: OdeHypothesis, h: OdeHypothesis, view: OdeView) -> float:
     """Return what it removes of the held-out error above the noise."""
     colours = (view.screening.colour, *view.screening.colour.further)
-    above = left = 0.0
-    for k, (o, own) in enumerate(zip(h.fit.outputs, colours, strict=True)):
-        noise = max(noise_rms(o.residuals, own), 1e-300)
-        base, new = (x.held[k] or x.train[k] for x in (root, h))
-        above += (base / noise) ** 2 - 1.0
-        left += (new / noise) ** 2 - 1.0
-    return 1.0 - left / above if above > 0 else 0.0
+    noise = [noise_rms(o.residuals, c) for o, c in zip(h.fit.outputs, colours, strict=True)]
+    return share_removed(noise, root.errors, root.errors, h.errors)
 
 
 def _fitted(known: Known, root: OdeHypothesis, attached: Attached) -> OdeFit | None:
@@ -115,8 +174,8 @@ def _decrease(known: Known, view: OdeView, attached: Attached) -> float:
     return float(np.sum((free.T @ without(residual, basis)) ** 2))
 
 
-def _free(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, str]:
-    """Return the free function of a port, and of what it is, in words."""
+def _free(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, _Law]:
+    """Return the free function of a port, and its monomials."""
     scales = {**sizes.inputs, **sizes.states}
     if port.kind == "rate":
         rate = model.structure.xdot[model.state_names.index(port.variable)]
@@ -131,7 +190,7 @@ def _free(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, str]:
         symbols = {port.variable: "" if port.kind == "input" else true_output(port.variable)}
     terms = [t for p in powers for t in combinations_with_replacement(names, p)]
     prefix = f"free_in_{port.kind}_{port.variable}"
-    equations = _law(port, prefix, terms, {n: symbols[n] or n for n in names}, scales)
+    equations = _equations(port, prefix, terms, {n: symbols[n] or n for n in names}, scales)
     component = Component(
         name=prefix,
         description=f"{port.words}: a free function of {' and '.join(names)}",
@@ -146,10 +205,11 @@ def _free(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, str]:
         ),
         gain=f"{prefix}_0",
     )  # fmt: skip
-    return Attached(component, port), " and ".join(names)
+    own = {n: scales[n] for n in names}
+    return Attached(component, port), _Law(tuple(names), tuple(terms), own)
 
 
-def _law(
+def _equations(
     port: Port,
     prefix: str,
     terms: Sequence[tuple[str, ...]],

@@ -19,7 +19,7 @@ from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
 from psa_casadi.diagnosis.screening.evidence import estimated
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.search.worth import confirmed
 from psa_casadi.errors import PsaError
 
 FloatArray = npt.NDArray[np.float64]
@@ -48,6 +48,11 @@ class OdeHypothesis:
         """Names of the causes."""
         return frozenset(c.name for c in self.causes)
 
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """The held-out rms of every output, that of used samples where none is held out."""
+        return tuple(held or train for held, train in zip(self.held, self.train, strict=True))
+
 
 def hypothesis_of(
     causes: Sequence[Component], fit: OdeFit | None, runs: Sequence[Run], *, final: bool = False
@@ -62,6 +67,22 @@ def hypothesis_of(
     held = tuple(rms_of(runs, predicted, o.index, Run.judged) for o in fit.outputs)
     train = tuple(rms_of(runs, predicted, o.index, Run.fitted) for o in fit.outputs)
     return OdeHypothesis(tuple(causes), fit, predicted, held, train, final)
+
+
+def share_removed(
+    noise: Sequence[float], root: Sequence[float], before: Sequence[float], after: Sequence[float]
+) -> float:
+    """Return the share of the root's error above the noise that one model removes of another's.
+
+    rms errors of every output; their powers are taken over that of their noise and added.
+    """
+    floors = [max(n, 1e-300) for n in noise]
+    base, old, new = (
+        sum((e / n) ** 2 for e, n in zip(errors, floors, strict=True))
+        for errors in (root, before, after)
+    )
+    above = base - len(floors)
+    return float((old - new) / above) if above > 0 else 0.0
 
 
 def errors_at(
@@ -172,12 +193,12 @@ def _along(runs: Sequence[Run], output: FittedOutput) -> list[FloatArray]:
 
 
 def held_out_confirms(
-    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, *, alarm: bool
+    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, score: float
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.worth.confirmed`), the gains in
-    log-likelihood and what is promised summed over the outputs.
+    log-likelihood and what is promised summed over the outputs; `score` is what is gained of it.
     """
     gained = promise = 0.0
     for k, (o, own) in enumerate(zip(of.fit.outputs, (colour, *colour.further), strict=True)):
@@ -191,7 +212,4 @@ def held_out_confirms(
         promise += 0.5 * samples * float(np.mean((new - old) ** 2)) / after**2
     if promise == 0.0 and gained == 0.0:
         return True
-    least = thresholds().held_out
-    if alarm:
-        least = min(least, promise - 2.0 * float(np.sqrt(2.0 * promise)))
-    return bool(gained > least)
+    return confirmed(gained, promise, score)

@@ -22,7 +22,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import first_order_noise
 from psa_casadi.records.signals import signals_given
-from psa_casadi.shown import frame
+from psa_casadi.shown import StillReported, frame
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Parameter, Provenance
 from psa_casadi.version import __version__
@@ -41,17 +41,18 @@ _MISSED = 1.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OdeIdentification:
+class OdeIdentification(StillReported):
     """A model with fitted values, how sure they are, and warnings.
 
     `errors` are the parameters' standard errors, `intervals` their 95 % intervals in
     `model.provenance`; `rms` is what is left of every measured output and `noise` the fast part of
     that, in the outputs' units. `costs` are those of the starts, nan for one that failed; `agreed`
-    of them led to the same minimum.
+    of them led to the same minimum. `runs` are the records.
     """
 
     model: Model
     fit: OdeFit
+    runs: tuple[Run, ...]
     errors: Mapping[str, float]
     undetermined: tuple[str, ...]
     rms: Mapping[str, float]
@@ -270,6 +271,7 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
     return OdeIdentification(
         model=with_told(fit.model, runs, sure, fit.interrupted),
         fit=fit,
+        runs=tuple(runs),
         errors=sure.errors,
         undetermined=sure.undetermined,
         rms=rms,

@@ -5,16 +5,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from psa_casadi.any_model.certainty import certainty
-from psa_casadi.any_model.free_functions import Free, free_functions
-from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView
+from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
+from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, share_removed
 from psa_casadi.any_model.identify import with_told
-from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
+from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
 from psa_casadi.any_model.search import Known, with_cause, without
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.judgement import SMALL_NOTE, least_share, rivals, verdict_by
 from psa_casadi.diagnosis.noise.colour import noise_rms
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
-from psa_casadi.diagnosis.screening.evidence import credible_set, probabilities, temperature
+from psa_casadi.diagnosis.screening.evidence import probabilities, temperature
 from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.errors import PsaError
 from psa_casadi.records.checks import FEWEST_SAMPLES
 
 #: Where structure remains, causes are named that remove this share of the held-out error above the
@@ -32,10 +34,6 @@ _LITTLE = (
     " than {:.0%} and much remains."
 )
 _UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
-_SMALL = (
-    "{} is in the extended model and removes {:.0%} of the held-out error above the noise. It is"
-    " not named: structure remains, and so little may only correct the form of what is named."
-)
 
 
 def judged(known: Known) -> OdeDiagnosis:
@@ -70,22 +68,8 @@ def judged(known: Known) -> OdeDiagnosis:
 def removed(
     root: OdeHypothesis, before: OdeHypothesis, after: OdeHypothesis, floors: Sequence[float]
 ) -> float:
-    """Return the share of the root's held-out error above the noise that one removes of another's.
-
-    Powers of the outputs are taken over that of their noise and added.
-    """
-    noise = [max(f, 1e-300) for f in floors]
-    base, old, new = (
-        sum((e / n) ** 2 for e, n in zip(_errors(h), noise, strict=True))
-        for h in (root, before, after)
-    )
-    above = base - len(noise)
-    return float((old - new) / above) if above > 0 else 0.0
-
-
-def _errors(h: OdeHypothesis) -> tuple[float, ...]:
-    """Return the held-out rms of every output, that of used samples where none is held out."""
-    return tuple(held or train for held, train in zip(h.held, h.train, strict=True))
+    """Return what one removes of another's held-out error: the share of the root's above noise."""
+    return share_removed(floors, root.errors, before.errors, after.errors)
 
 
 def _verdict(
@@ -97,14 +81,13 @@ def _verdict(
     withdrawn: bool,
 ) -> Verdict:
     causes = last.of.causes
-    if not (first.test.alarm or causes):
-        return "adequate"
     partly = last.test.alarm
-    if not causes or withdrawn or (partly and share < _ENOUGH):
-        return "unexplained"
-    if any(len(_rivals(told[c.name], c.name)) > 0 for c in causes[:1]):
-        return "ambiguous"
-    return "partly_explained" if partly else "cause_named"
+    return verdict_by(
+        missing=first.test.alarm or bool(causes),
+        withdrawn=withdrawn or not causes or (partly and share < _ENOUGH),
+        ambiguous=any(rivals(told[c.name], c.name) for c in causes[:1]),
+        more=partly,
+    )
 
 
 def _beaten_by(
@@ -147,10 +130,6 @@ def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, f
     return probabilities({n: e for n, e in evidences.items() if np.isfinite(e)})
 
 
-def _rivals(chances: Mapping[str, float], cause: str) -> tuple[str, ...]:
-    return tuple(n for n in credible_set(chances, thresholds().credible) if n != cause)
-
-
 def _diagnosis(
     known: Known,
     verdict: Verdict,
@@ -164,8 +143,8 @@ def _diagnosis(
     sure = certainty(named.fit)
     partly = known.view(named).test.alarm
     shares = {c.name: _own_share(known, named, c, floors) for c in named.causes}
-    largest = max(shares.values(), default=0.0)
-    small = [n for n, s in shares.items() if partly and s < min(thresholds().form, largest)]
+    least = least_share(shares.values())
+    small = [n for n, s in shares.items() if partly and s < least]
     causes = tuple(
         PortCause(
             effect=c.name,
@@ -181,14 +160,15 @@ def _diagnosis(
                 for p in c.parameters
                 if p.name in sure.intervals
             },
-            cannot_be_told_from=_rivals(told[c.name], c.name),
+            cannot_be_told_from=rivals(told[c.name], c.name),
             explained_share=float(np.clip(shares[c.name], 0.0, 1.0)),
         )
         for c in named.causes
         if c.name not in small
     )  # fmt: skip
-    unnamed = free if verdict == "unexplained" else ()
-    best_free = max(unnamed, key=lambda f: f.share, default=None)
+    best_free = max(free, key=lambda f: f.share, default=None)
+    if verdict != "unexplained" or (best_free and best_free.share <= thresholds().partly):
+        best_free = None
     return OdeDiagnosis(
         verdict=verdict,
         causes=causes,
@@ -196,21 +176,37 @@ def _diagnosis(
         errors=tuple(
             OutputError(
                 o.column, known.base.model.structure.outputs[o.index].unit, floor,
-                _errors(root)[k], _errors(named)[k],
+                root.errors[k], named.errors[k],
             )
             for k, (o, floor) in enumerate(zip(named.fit.outputs, floors, strict=True))
         ),
         remaining=_remaining(known.view(named)),
-        notes=(*notes, *(_SMALL.format(n, max(shares[n], 0.0)) for n in small)),
+        notes=(*notes, *(SMALL_NOTE.format(n, 100 * max(shares[n], 0.0)) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
         extended_fit=named.fit,
         runs=known.runs,
         base=root.predicted,
         extended=named.predicted,
+        missed=_remaining(known.view(root)),
         unnamed=_UNNAMED.format(best_free.of, best_free.port.words, best_free.share)
-        if best_free is not None and best_free.share > thresholds().partly
+        if best_free
         else "",
+        correction=_correction(known, best_free) if best_free else None,
+    )  # fmt: skip
+
+
+def _correction(known: Known, free: Free) -> FreeFunction | None:
+    """Return what a free function adds along the records; None where it cannot be simulated."""
+    try:
+        name, along, added = curve_of(free, known.runs)
+    except PsaError:
+        return None
+    s = known.base.model.structure
+    units = {v.name: v.unit for rows in (s.states, s.inputs, s.outputs) for v in rows}
+    return FreeFunction(
+        port=free.port.words, of=free.of, evidence=free.evidence, share=free.share,
+        unit=free.port.unit, variable=name, variable_unit=units[name], along=along, added=added,
     )  # fmt: skip
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.fit import OdeFit
+from psa_casadi.any_model.hypothesis import share_removed
 from psa_casadi.any_model.runs import Run
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.model.compose import Model
-from psa_casadi.shown import frame
+from psa_casadi.shown import StillReported, frame
 
 FloatArray = npt.NDArray[np.float64]
 FORMAT = "psa_casadi.own_model_diagnosis/1"
@@ -57,13 +58,40 @@ class OutputError:
     extended: float
 
 
+@dataclass(frozen=True, eq=False)
+class FreeFunction:
+    """A function without a name `of` some variables, at a port, that would remove most of the rest.
+
+    `share` of the base's held-out error above the noise; `evidence` is ln of its Bayes factor over
+    the base. Along all records it adds `added` (n,) to the port's sum, in its `unit`; that follows
+    the `variable`, of these the one that tells most of it, with the values `along` (n,).
+    """
+
+    port: str
+    of: str
+    evidence: float
+    share: float
+    unit: str
+    variable: str
+    variable_unit: str
+    along: FloatArray
+    added: FloatArray
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry in the document, without the arrays."""
+        names = ("port", "of", "evidence", "share", "unit", "variable")
+        return {n: getattr(self, n) for n in names}
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class OdeDiagnosis:
+class OdeDiagnosis(StillReported):
     """A diagnosis of any model: verdict, causes, the extended model, errors, and what remains.
 
     The words of the verdict are those of a stack's diagnosis. `base` and `extended` (n, ny) are the
     predictions of every experiment in full, in the order of `runs`. `candidates` are all effects
-    tried. `unnamed` says where a free function would remove most of what is left, "" if nothing is.
+    tried. `missed` is what the base leaves, `remaining` what the extended model does. `unnamed`
+    says where a free function would remove most of what is left, "" if nothing is; `correction` is
+    that function.
     """
 
     verdict: Verdict
@@ -78,7 +106,16 @@ class OdeDiagnosis:
     runs: tuple[Run, ...]
     base: tuple[FloatArray, ...]
     extended: tuple[FloatArray, ...]
+    missed: Remaining
     unnamed: str = ""
+    correction: FreeFunction | None = None
+
+    @property
+    def explained_share(self) -> float:
+        """The share of the base's held-out error above the noise that all causes remove."""
+        base = [e.base for e in self.errors]
+        noise = [e.noise for e in self.errors]
+        return share_removed(noise, base, base, [e.extended for e in self.errors])
 
     def __repr__(self) -> str:
         """Return the verdict, the causes with their sizes, the errors and what remains."""
@@ -95,9 +132,10 @@ class OdeDiagnosis:
             if c.cannot_be_told_from:
                 lines.append(f"    may as well be {', '.join(c.cannot_be_told_from)}")
         for o in self.errors:
+            unit = "" if o.unit == "1" else f" {o.unit}"
             lines.append(
-                f"  {o.output}: held-out rms {o.base:.3g} {o.unit} of the base,"
-                f" {o.extended:.3g} {o.unit} of the extended model, noise {o.noise:.3g} {o.unit}"
+                f"  {o.output}: held-out rms {o.base:.3g}{unit} of the base,"
+                f" {o.extended:.3g}{unit} of the extended model, noise {o.noise:.3g}{unit}"
             )
         lines += [
             f"  {self.remaining.where}",
@@ -113,8 +151,10 @@ class OdeDiagnosis:
             "causes": [asdict(c) for c in self.causes],
             "candidates": [asdict(c) for c in self.candidates],
             "errors": [asdict(e) for e in self.errors],
+            "missed": asdict(self.missed),
             "remaining": asdict(self.remaining),
             "unnamed": self.unnamed,
+            "correction": None if self.correction is None else self.correction.to_dict(),
             "notes": list(self.notes),
             "values": dict(self.model.values),
             "records": [{"name": r.name, "sha256": r.signals.sha256} for r in self.runs],

@@ -98,9 +98,8 @@ class Known:
             before = self.found.get(h.names - {cause.name})
             if before is None:
                 continue
-            seen = self.views.get(before.names)
-            alarm = seen is None or seen.test.alarm
-            if not held_out_confirms(h, before, self.runs, self.colour, alarm=alarm):
+            gained = self.score(h) - self.score(before)
+            if not held_out_confirms(h, before, self.runs, self.colour, gained):
                 return False
             if before.causes and self._share(h, before) <= thresholds().further:
                 return False

@@ -69,25 +69,39 @@ def verdict_of(
     names away or held-out samples do not confirm them, `share` of the held-out excess the causes
     remove; `unnamed` are causes that stay in the model without a name.
     """
+    named = [s for s in steps if s.chosen is not None and s.cause.name not in unnamed]
+    alarm = bool(steps) and steps[-1].test.alarm
+    return verdict_by(
+        missing=missing,
+        withdrawn=withdrawn or not named or (alarm and share < thresholds().partly),
+        ambiguous=bool(named and told_from(named[0])),
+        more=alarm or bool(unnamed),
+    )
+
+
+def verdict_by(*, missing: bool, withdrawn: bool, ambiguous: bool, more: bool) -> Verdict:
+    """Return the verdict: is something `missing`, do no names stand, are there rivals, more left?
+
+    The first of these that is so decides.
+    """
     if not missing:
         return "adequate"
-    named = [s for s in steps if s.chosen is not None and s.cause.name not in unnamed]
-    if not named or withdrawn:
+    if withdrawn:
         return "unexplained"
-    alarm = steps[-1].test.alarm
-    if alarm and share < thresholds().partly:
-        return "unexplained"
-    if told_from(named[0]):
+    if ambiguous:
         return "ambiguous"
-    return "partly_explained" if alarm or unnamed else "cause_named"
+    return "partly_explained" if more else "cause_named"
 
 
 def told_from(step: Step) -> tuple[str, ...]:
     """Effects that may as well be a step's cause: with the chosen one, the credible set."""
-    if step.chosen is None:
-        return ()
-    within = credible_set(step.probability, thresholds().credible)
-    return tuple(name for name in within if name != step.cause.name)
+    return () if step.chosen is None else rivals(step.probability, step.cause.name)
+
+
+def rivals(probability: Mapping[str, float], cause: str) -> tuple[str, ...]:
+    """Return the other effects of the credible set that holds a cause."""
+    within = credible_set(probability, thresholds().credible)
+    return tuple(name for name in within if name != cause)
 
 
 def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
@@ -95,8 +109,13 @@ def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
 
     Each removes less of the base's excess than a form may miss. The largest is always named.
     """
-    largest = max((c.share for c in causes), default=0.0)
-    return tuple(c for c in causes if c.share < min(thresholds().form, largest))
+    least = least_share([c.share for c in causes])
+    return tuple(c for c in causes if c.share < least)
+
+
+def least_share(shares: Collection[float]) -> float:
+    """Return the share of the base's excess from which on a cause is named beside others."""
+    return min(thresholds().form, max(shares, default=0.0))
 
 
 def withdrawn_names(

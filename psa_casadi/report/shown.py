@@ -9,25 +9,38 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from psa_casadi.any_model.identify import OdeIdentification
+from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.identify import Identification
 from psa_casadi.posterior.result import Posterior
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
-from psa_casadi.report.plots.figure import diagnosis_figure, fit_figure, trajectory_figure
+from psa_casadi.report.page.own_model_page import write_own_fit_report, write_own_report
+from psa_casadi.report.plots.figure import (
+    diagnosis_figure,
+    fit_figure,
+    record_figure,
+    trajectory_figure,
+)
 from psa_casadi.report.plots.posterior_figure import posterior_figure
+from psa_casadi.report.words.own_series import own_fit_series, own_series
 from psa_casadi.report.words.phrases import number, percent, plain
 from psa_casadi.report.words.posterior_words import posterior_text
+from psa_casadi.report.words.series import most_telling
 from psa_casadi.report.words.text import identification_text, story
 from psa_casadi.simulation.simulate import Trajectory
 
-Result = Diagnosis | Identification | Trajectory | Posterior
+Own = OdeDiagnosis | OdeIdentification
+Result = Diagnosis | Identification | Trajectory | Posterior | Own
 
 _FIGURES: dict[type, Callable[[Any], Figure]] = {
     Diagnosis: diagnosis_figure,
     Identification: fit_figure,
     Trajectory: trajectory_figure,
     Posterior: posterior_figure,
+    OdeDiagnosis: lambda d: record_figure(most_telling(own_series(d))),
+    OdeIdentification: lambda found: record_figure(most_telling(own_fit_series(found))),
 }
 
 
@@ -37,19 +50,25 @@ def plot(result: Result) -> Figure:
 
 
 def page(
-    result: Diagnosis | Identification,
+    result: Diagnosis | Identification | Own,
     path: str | os.PathLike[str],
     still: bool = False,
 ) -> None:
     """Write the page of a result, one HTML file. Raises InputError when that cannot be."""
     if isinstance(result, Diagnosis):
         write_report(result, path, still=still)
+    elif isinstance(result, OdeDiagnosis):
+        write_own_report(result, path)
+    elif isinstance(result, OdeIdentification):
+        write_own_fit_report(result, path)
     else:
         write_fit_report(result, path, still=still)
 
 
 def line(result: Result) -> str:
     """Return a result in one line."""
+    if isinstance(result, Own):
+        return repr(result).partition("\n")[0]
     if isinstance(result, Diagnosis):
         return _diagnosis_line(result)
     if isinstance(result, Identification):
@@ -85,6 +104,8 @@ def cell(result: Result) -> str:
         words = identification_text(result)
     elif isinstance(result, Posterior):
         words = posterior_text(result)
+    elif isinstance(result, Own):
+        words = repr(result)
     else:
         words = line(result)
     buffer = io.BytesIO()

@@ -68,6 +68,11 @@ BENCHES: dict[str, Bench] = {
             sized=True,
         ),
         _later(
+            "own_model",
+            "own_model",
+            "models that are no stacks: hidden causes, errors before and after, and a page",
+        ),
+        _later(
             "paper_method",
             "paper",
             "the paper's identification beside the prediction-error fit, against noise and window",

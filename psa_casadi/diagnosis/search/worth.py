@@ -24,10 +24,8 @@ def held_out_confirms(
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
-    A change of prediction with the sum of squares D promises a gain of the log-likelihood of
-    p = D/2 over the noise's power, give or take sqrt(2 p). Found must be `held_out`, or, where
-    these samples can hardly show the cause, two such errors less than what is promised; and so
-    much must the fitted samples' score and what is found be together.
+    The rule is `confirmed`; a change of prediction with the sum of squares D promises D/2 over the
+    noise's power.
     """
     held = np.concatenate([e.held_out for e in experiments])
     if not np.any(held):
@@ -45,9 +43,18 @@ def held_out_confirms(
         ratio = np.hypot(old, f.straight) / max(float(np.hypot(new, f.straight)), 1e-300)
         gained += count * float(np.log(ratio))
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2
+    return confirmed(gained, promise, scale.score(of) - scale.score(before))
+
+
+def confirmed(gained: float, promise: float, score: float) -> bool:
+    """Whether a gain of the held-out log-likelihood is enough, beside that of the score [nats].
+
+    A promised gain p is found give or take sqrt(2 p). Found must be `held_out`, or, where these
+    samples can hardly show the cause, two such errors less than what is promised; and so much must
+    the fitted samples' score and what is found be together.
+    """
     least = min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
-    together = scale.score(of) - scale.score(before) + gained
-    return bool(gained > least and together > thresholds().held_out)
+    return bool(gained > least and score + gained > thresholds().held_out)
 
 
 def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:

@@ -5,6 +5,7 @@ from psa_casadi.report.documents.device_file import DeviceFile
 from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
 from psa_casadi.report.documents.identification_file import IdentificationFile
 from psa_casadi.report.documents.model_file import ModelFile
+from psa_casadi.report.documents.own_model_file import OwnModelFile
 from psa_casadi.report.documents.posterior_file import PosteriorFile
 from psa_casadi.report.documents.schema import json_schema
 from psa_casadi.strict_json import json_text
@@ -13,6 +14,7 @@ from psa_casadi.strict_json import json_text
 FILES: dict[str, type] = {
     "model": ModelFile,
     "diagnosis": DiagnosisFile,
+    "own_model": OwnModelFile,
     "identification": IdentificationFile,
     "posterior": PosteriorFile,
     "check": CheckFile,

@@ -1,5 +1,6 @@
 """The part of a page that says why a cause was named: evidence, signature beside the data."""
 
+from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.diagnosis.residual.signature import Signature, signature
 from psa_casadi.diagnosis.result import Cause, Diagnosis
@@ -23,6 +24,15 @@ _DRAWN = 3
 
 def add_evidence(page: Document, d: Diagnosis) -> None:
     """Add the evidence of every effect, and for every cause its signature beside the data."""
+    add_evidence_of_all(page, d)
+    for cause in d.causes[:_DRAWN]:
+        _signature(page, d, cause)
+
+
+def add_evidence_of_all(
+    page: Document, d: Diagnosis | OdeDiagnosis, most: int | None = None
+) -> None:
+    """Add the evidence of every effect that was tried, or of so many."""
     if d.causes:
         page.section("Why this cause" if len(d.causes) == 1 else "Why these causes")
     else:
@@ -36,9 +46,11 @@ def add_evidence(page: Document, d: Diagnosis) -> None:
         f"Figures: the evidence, and {said}. Blue: named; orange: fitted in full; grey: screened"
         " only."
     )
-    page.picture(Picture("Evidence for each effect over the base model", evidence_plot(d), note))
-    for cause in d.causes[:_DRAWN]:
-        _signature(page, d, cause)
+    if most is not None and len(d.candidates) > most:
+        note += f" {most} of {len(d.candidates)}; the table below has all."
+    page.picture(
+        Picture("Evidence for each effect over the base model", evidence_plot(d, most), note)
+    )
 
 
 def add_causes(page: Document, d: Diagnosis) -> None:

@@ -71,19 +71,23 @@ def _add(
     shaded = " Shaded: held out." if s.held_out.any() else ""
     noise = "Dashed: two standard deviations of the noise."
     if s.name == above:
-        page.paragraph("Displacement and residual over time: at the top of the page.", "note")
+        page.paragraph(f"{s.title} and residual over time: at the top of the page.", "note")
     else:
         page.picture(
             Picture(
-                f"Displacement, and residual: {origin} minus model",
+                f"{s.title}, and residual: {origin} minus model",
                 time_plot(s, origin, limit),
                 f"{noise}{shaded}",
             )
         )
+    driver = s.against.partition(" [")[0]
+    over_it = [
+        Picture(f"Loop: {s.quantity} over {driver}", loop_plot(s, origin, limit)),
+        Picture(f"Residual over {driver}", error_loop_plot(s, limit), noise),
+    ]
     page.pictures(
         [
-            Picture("Loop: displacement over voltage", loop_plot(s, origin, limit)),
-            Picture("Residual over voltage", error_loop_plot(s, limit), noise),
+            *(over_it if driver else []),
             Picture("Where the difference is easiest to see", zoom_plot(s, origin, limit)),
             Picture(
                 "Spectrum of the residual",

@@ -15,7 +15,13 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_path
 from psa_casadi.identification.identify import Identification
-from psa_casadi.report.words.phrases import length_scale, plain, share_text, verdict_sentence
+from psa_casadi.report.words.phrases import (
+    in_brackets,
+    length_scale,
+    plain,
+    share_text,
+    verdict_sentence,
+)
 from psa_casadi.report.words.series import (
     EXTENDED_COLOUR,
     HELD_OUT_COLOUR,
@@ -78,8 +84,10 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     figure = Figure(figsize=_STILL_INCHES, dpi=_STILL_DPI)
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
-    _time(figure.add_subplot(grid[0, :2]), s, slice(None), origin, None)
-    _loop(figure.add_subplot(grid[0, 2]), s, origin)
+    above = grid[0, :2] if s.against else grid[0, :]
+    _time(figure.add_subplot(above), s, slice(None), origin, None)
+    if s.against:
+        _loop(figure.add_subplot(grid[0, 2]), s, origin)
     _residual(figure.add_subplot(grid[1, :]), s, origin)
     return figure
 
@@ -179,10 +187,10 @@ def _time(axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None) -
         _shade_held_out(axes, s)
         low, high = s.time[zoom][0], s.time[zoom][-1]
         axes.axvspan(low, high, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
-    title = "Displacement" if len(time) == len(s.time) else "The part in the box"
+    title = s.title if len(time) == len(s.time) else "The part in the box"
     if zoom is not None:
-        title = "Displacement (box: the part on the right)"
-    style(axes, title, "time [s]", f"displacement [{scale.unit}]")
+        title = f"{s.title} (box: the part on the right)"
+    style(axes, title, "time [s]", s.label)
     axes.margins(x=0.01)
     if zoom is None:
         axes.legend(fontsize=FONT - 1, framealpha=0.85)
@@ -196,7 +204,7 @@ def _loop(axes: Axes, s: Series, origin: str) -> None:
     for curve in s.curves:
         values = scale.factor * curve.values
         axes.plot(s.voltage, values, color=curve.colour, linewidth=0.9, label=curve.label)
-    style(axes, "Loop", "voltage [V]", f"displacement [{scale.unit}]")
+    style(axes, "Loop", s.against, s.label)
     axes.legend(fontsize=FONT - 1, framealpha=0.85, loc="upper left")
 
 
@@ -210,7 +218,7 @@ def _residual(axes: Axes, s: Series, origin: str) -> None:
     for edge in (-band, band) if band > 0 else ():
         label = "noise (2 sigma)" if edge > 0 else None
         axes.axhline(edge, color="black", linewidth=1.3, linestyle="--", label=label)
-    style(axes, f"Residual: {origin} minus model", "time [s]", f"residual [{scale.unit}]")
+    style(axes, f"Residual: {origin} minus model", "time [s]", in_brackets("residual", scale.unit))
     axes.margins(x=0.005)
     largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves) * scale.factor or 1.0
     axes.set_ylim(-1.1 * largest, 1.45 * largest)

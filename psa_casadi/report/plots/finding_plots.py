@@ -1,6 +1,7 @@
 """Plots of the HTML pages that show a finding: evidence of effects, what is determined."""
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import plotly.graph_objects as go
@@ -18,6 +19,9 @@ from psa_casadi.report.plots.theme import (
 from psa_casadi.report.words.grades import DEGREES, WEAK_ERROR, Degree, Grade
 from psa_casadi.report.words.phrases import number, percent, plain, probability_text
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, NOISE_COLOUR, bar_colour
+
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.any_model.result import OdeDiagnosis
 
 _DEGREE_COLOURS: dict[Degree, str] = {
     "determined": EXTENDED_COLOUR,
@@ -124,9 +128,12 @@ def _correlation_text(value: float) -> str:
     return f"{value:.2f}".replace("-", "−").replace("0.", ".").replace("1.00", "1")
 
 
-def evidence_plot(d: Diagnosis) -> Plot:
-    """One bar for every effect that was tried; text says the share of the excess it explains."""
-    rows = d.candidates[::-1]
+def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Plot:
+    """One bar for every effect that was tried; text says the share of the excess it explains.
+
+    Of many, the first and most telling ones where only so many are to be drawn.
+    """
+    rows = d.candidates[:most][::-1]
     causes = {c.effect for c in d.causes}
     # asinh shows small, large and negative evidence in one picture; the labels give the figures
     values = [float(np.arcsinh(c.evidence / 10.0)) for c in rows]
@@ -154,9 +161,11 @@ def evidence_plot(d: Diagnosis) -> Plot:
     return plot.update_yaxes(showgrid=False, ticks="", automargin=True)
 
 
-def _figure(candidate: Candidate, d: Diagnosis) -> str:
+def _figure(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
     """Return the probability of an effect; where nothing is named, the share it explains."""
     if d.causes:
         return probability_text(candidate.probability)
     share = candidate.explained_share
+    if not candidate.fitted and share == 0:
+        return "screened"
     return percent(share) if share >= 0 else "fits worse"

@@ -3,10 +3,11 @@
 import numpy as np
 import plotly.graph_objects as go
 
+from psa_casadi.any_model.result import FreeFunction
 from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.plots.theme import Plot, styled
-from psa_casadi.report.words.phrases import length_scale
+from psa_casadi.report.words.phrases import in_brackets, length_scale, prefixed_scale
 from psa_casadi.report.words.series import EXTENDED_COLOUR, FloatArray, compact
 
 #: Samples that are drawn, and the height.
@@ -33,6 +34,22 @@ def patch_plot(d: Diagnosis, patch: Patch) -> tuple[str, Plot]:
     plot.update_xaxes(title_text=f"{name} [{unit}]")
     plot.update_yaxes(title_text=f"added [{scale.unit}]")
     return name, plot
+
+
+def free_plot(f: FreeFunction) -> Plot:
+    """Plot what a free function of a model's port adds, over the variable that it follows most."""
+    step = max(1, len(f.along) // _SAMPLES)
+    x, y = f.along[::step], f.added[::step]
+    seen = prefixed_scale(float(np.max(np.abs(x), initial=0.0)), f.variable_unit or "1")
+    scale = prefixed_scale(float(np.max(np.abs(y), initial=0.0)), f.unit)
+    plot = go.Figure()
+    plot.add_scatter(
+        x=compact(seen.factor * x), y=compact(scale.factor * y), mode="markers", showlegend=False,
+        marker={"color": EXTENDED_COLOUR, "size": 3},
+    )  # fmt: skip
+    styled(plot, _HEIGHT)
+    plot.update_xaxes(title_text=in_brackets(f.variable, seen.unit))
+    return plot.update_yaxes(title_text=in_brackets("added", scale.unit))
 
 
 def _coordinate(d: Diagnosis, patch: Patch, k: int) -> tuple[FloatArray, str, str]:

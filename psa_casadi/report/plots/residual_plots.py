@@ -7,6 +7,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from psa_casadi.report.plots.theme import INK, Plot, logarithmic, styled
+from psa_casadi.report.words.phrases import in_brackets
 from psa_casadi.report.words.residuals import (
     autocorrelation,
     distribution,
@@ -42,7 +43,7 @@ def _shown(s: Series, limit: int) -> IndexArray:
 
 
 def time_plot(s: Series, origin: str, limit: int) -> Plot:
-    """Displacement over time above the residual over the same time, held-out part shaded."""
+    """What was measured over time above the residual over the same time, held-out part shaded."""
     plot = make_subplots(
         rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.6, 0.4]
     )
@@ -70,14 +71,14 @@ def time_plot(s: Series, origin: str, limit: int) -> Plot:
         left, right = clock.factor * s.time[first], clock.factor * s.time[last]
         plot.add_vrect(left, right, fillcolor=HELD_OUT_COLOUR, layer="below", line_width=0)
     styled(plot, _FULL)
-    plot.update_yaxes(title_text=f"displacement [{scale.unit}]", row=1, col=1)
-    plot.update_yaxes(title_text=f"residual [{small.unit}]", row=2, col=1)
+    plot.update_yaxes(title_text=s.label, row=1, col=1)
+    plot.update_yaxes(title_text=in_brackets("residual", small.unit), row=2, col=1)
     plot.update_xaxes(title_text=f"time [{clock.unit}]", row=2, col=1)
     return plot
 
 
 def zoom_plot(s: Series, origin: str, limit: int) -> Plot:
-    """Displacement over time in the window where the curves are easiest to tell apart."""
+    """What was measured over time in the window where the curves are easiest to tell apart."""
     window = telling_window(s)
     shown = np.arange(len(s.time))[window]
     shown = shown[kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
@@ -93,11 +94,11 @@ def zoom_plot(s: Series, origin: str, limit: int) -> Plot:
             x=time, y=compact(scale.factor * curve.values[shown]), mode="lines",
             name=curve.label, line={"color": curve.colour, "width": 2.2},
         )  # fmt: skip
-    return _labelled(plot, f"time [{clock.unit}]", f"displacement [{scale.unit}]")
+    return _labelled(plot, f"time [{clock.unit}]", s.label)
 
 
 def loop_plot(s: Series, origin: str, limit: int) -> Plot:
-    """Displacement over voltage."""
+    """What was measured over what drives it, such as displacement over voltage."""
     shown = _shown(s, limit)
     scale, plot = s.scale, go.Figure()
     rows = [(s.measured, MEASURED_COLOUR, origin, 3.0)]
@@ -107,11 +108,11 @@ def loop_plot(s: Series, origin: str, limit: int) -> Plot:
             x=compact(s.voltage[shown]), y=compact(scale.factor * values[shown]),
             mode="lines", name=name, line={"color": colour, "width": width},
         )  # fmt: skip
-    return _labelled(plot, "voltage [V]", f"displacement [{scale.unit}]")
+    return _labelled(plot, s.against, s.label)
 
 
 def error_loop_plot(s: Series, limit: int) -> Plot:
-    """Residual over voltage: where in the loop the model goes wrong."""
+    """Residual over what drives the model: where in the loop the model goes wrong."""
     residuals = [s.residual(c) for c in s.curves]
     shown = _shown(s, limit)
     small, plot = s.residual_scale, go.Figure()
@@ -124,7 +125,7 @@ def error_loop_plot(s: Series, limit: int) -> Plot:
         y = edge * s.noise * small.factor
         plot.add_hline(y, line={"color": INK, "dash": "dash", "width": 1.2})
     plot.update_layout(showlegend=len(s.curves) > 1)
-    return _labelled(plot, "voltage [V]", f"residual [{small.unit}]")
+    return _labelled(plot, s.against, in_brackets("residual", small.unit))
 
 
 def spectrum_plot(s: Series, limit: int) -> Plot:
@@ -146,7 +147,7 @@ def spectrum_plot(s: Series, limit: int) -> Plot:
         x=ends, y=[floor, floor], mode="lines", name="noise floor",
         line={"color": INK, "dash": "dash", "width": 1.4},
     )  # fmt: skip
-    _labelled(plot, "frequency [Hz]", f"residual [{small.unit}/√Hz]")
+    _labelled(plot, "frequency [Hz]", f"residual [{small.unit or 1}/√Hz]")
     plot.update_xaxes(**logarithmic((ends[0], ends[1])))
     return plot.update_yaxes(**logarithmic((low, high)))
 
@@ -194,7 +195,7 @@ def distribution_plot(s: Series) -> Plot:
             x=compact(small.factor * x), y=compact(100.0 * d.width * normal), mode="lines",
             name="normal", line={"color": INK, "dash": "dash", "width": 1.4},
         )  # fmt: skip
-    return _labelled(plot, f"residual [{small.unit}]", "samples in a bin [%]")
+    return _labelled(plot, in_brackets("residual", small.unit), "samples in a bin [%]")
 
 
 def _labelled(plot: Plot, x: str, y: str) -> Plot:

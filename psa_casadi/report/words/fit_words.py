@@ -67,10 +67,11 @@ def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
 
 def residual_sentence(f: ResidualFigures, model: str, time: Scale) -> str:
     """Say whether the residual of a model is white and normal, with the figures behind it."""
-    return f"{_whiteness(f, model, time)} {_normality(f)}"
+    return f"{whiteness_sentence(f, model, time)} {_normality(f)}"
 
 
-def _whiteness(f: ResidualFigures, model: str, time: Scale) -> str:
+def whiteness_sentence(f: ResidualFigures, model: str, time: Scale) -> str:
+    """Say whether the residual of a model is white, with the figures behind it."""
     share = f"{percent(f.outside)} of the lags lie outside the 95 % band"
     if f.outside <= _WHITE_SHARE and abs(f.neighbours) <= _WHITE_NEIGHBOURS:
         return f"The residual of the {model} is as white as noise ({share}; 5 % are expected)."

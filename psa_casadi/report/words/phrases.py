@@ -6,17 +6,25 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.diagnosis.result import Alternative, Candidate, Cause, Decision, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.units import convert
 
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.any_model.result import OdeDiagnosis
+
 #: A length in a sentence.
 _LENGTH = re.compile(r"(?P<number>[+-]?\d[\d.]*(?:e[+-]?\d+)?) (?P<unit>mm|um|nm)\b")
 _METRES = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9}
 #: A length in a sentence stays in its own unit where the page's would give a larger number.
 _LARGEST = 1000.0
+
+#: Units that take prefixes, and these, the largest first.
+_PREFIXED = frozenset(("m", "s", "V", "A", "N", "Pa", "Hz", "C", "W", "J", "rad"))
+_PREFIXES = (("M", 1e6), ("k", 1e3), ("", 1.0), ("m", 1e-3), ("µ", 1e-6), ("n", 1e-9))
 
 #: What a record may be: measured on a device, or computed.
 ORIGINS = ("measured", "synthetic")
@@ -40,7 +48,7 @@ class Scale:
 
     def text(self, metres: float, digits: int = 3) -> str:
         """Return a length with its unit, such as "12.3 nm"."""
-        return f"{number(self.factor * metres, digits)} {self.unit}"
+        return f"{number(self.factor * metres, digits)} {self.unit}".rstrip()
 
 
 _PAGE: ContextVar[Scale | None] = ContextVar("unit of a page", default=None)
@@ -72,6 +80,19 @@ def handy_scale(largest: float, *, counts: bool = False) -> Scale:
         if largest >= 0.5 * size:
             return Scale("µm" if unit == "um" else unit, 1.0 / size)
     return Scale("nm", 1e9)
+
+
+def prefixed_scale(largest: float, unit: str) -> Scale:
+    """Return a unit with the prefix that makes `largest` a handy number; compounds have none."""
+    if unit in _PREFIXED and largest > 0:
+        found = next((p for p in _PREFIXES if largest >= 0.5 * p[1]), _PREFIXES[-1])
+        return Scale(found[0] + unit, 1.0 / found[1])
+    return Scale("" if unit == "1" else unit, 1.0)
+
+
+def in_brackets(what: str, unit: str) -> str:
+    """Return what an axis says: the quantity with its unit in brackets, if it has one."""
+    return f"{what} [{unit}]" if unit not in ("", "1") else what
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -131,13 +152,15 @@ def probability_text(probability: float) -> str:
 
 def share_text(candidate: Candidate) -> str:
     """Return the share of the excess that an effect explains, and whether it was only screened."""
+    if not candidate.fitted and candidate.explained_share == 0:
+        return "screened"
     if candidate.explained_share < 0:
         return "fits worse"
     share = percent(candidate.explained_share)
     return share if candidate.fitted else f"{share} (screened)"
 
 
-def rest_sentence(d: Diagnosis) -> str:
+def rest_sentence(d: "Diagnosis | OdeDiagnosis") -> str:
     """Say what remains, with the p value of the test of the rest."""
     p = d.remaining.p_value
     return f"{d.remaining.where.rstrip('.')} ({f'p = {number(p, 2)}' if p > 1e-6 else 'p < 1e-6'})."
@@ -170,10 +193,11 @@ def interval_text(low: float, high: float) -> str:
     """Return an interval; one over more than four decades says that nothing was determined."""
     if not (math.isfinite(low) and math.isfinite(high)) or (low > 0 and high > 1e4 * low):
         return "not determined"
-    return f"{number(low)} to {number(high)}"
+    digits = next((d for d in (3, 4, 5) if number(low, d) != number(high, d)), 6)
+    return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def added(d: Diagnosis) -> bool:
+def added(d: "Diagnosis | OdeDiagnosis") -> bool:
     """Say whether the extended model differs from the base."""
     return bool(d.causes)
 

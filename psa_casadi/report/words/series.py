@@ -12,7 +12,14 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.phrases import Scale, added, handy_scale, length_scale
+from psa_casadi.report.words.phrases import (
+    Scale,
+    added,
+    handy_scale,
+    in_brackets,
+    length_scale,
+    prefixed_scale,
+)
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
@@ -36,7 +43,8 @@ class Series:
     """One record with the curves to compare, arrays of shape (n,) in SI units, nan where missing.
 
     `noise` is the standard deviation of the record's noise [m]; `counts` says that lengths are in
-    counts of the sensor.
+    counts of the sensor. Of a model that is no stack, `measured` is another `quantity` in its
+    `unit`, and `voltage` what it is shown `against`, "" if there is nothing.
     """
 
     name: str
@@ -47,6 +55,9 @@ class Series:
     held_out: BoolArray
     noise: float
     counts: bool
+    quantity: str = "displacement"
+    unit: str = ""
+    against: str = "voltage [V]"
 
     def residual(self, curve: Curve) -> FloatArray:
         """Return measured minus predicted [m]."""
@@ -54,9 +65,21 @@ class Series:
 
     @property
     def scale(self) -> Scale:
-        """The unit to show displacements in."""
+        """The unit to show what was measured in."""
         span = float(np.nanmax(self.measured) - np.nanmin(self.measured))
+        if self.unit:
+            return prefixed_scale(span, self.unit)
         return handy_scale(span, counts=self.counts)
+
+    @property
+    def title(self) -> str:
+        """The measured quantity as a title has it; the name of a model's output stays as it is."""
+        return self.quantity if self.unit else self.quantity.capitalize()
+
+    @property
+    def label(self) -> str:
+        """What an axis of the measured quantity says."""
+        return in_brackets(self.quantity, self.scale.unit)
 
     @property
     def time_scale(self) -> Scale:
@@ -67,6 +90,8 @@ class Series:
     def residual_scale(self) -> Scale:
         """The unit to show residuals in."""
         largest = max(float(np.nanmax(np.abs(self.residual(c)))) for c in self.curves)
+        if self.unit:
+            return prefixed_scale(largest, self.unit)
         return length_scale(largest, counts=self.counts)
 
 

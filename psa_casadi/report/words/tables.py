@@ -1,6 +1,6 @@
 """Tables of text that the terminal and the HTML page both show."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,8 @@ from psa_casadi.report.words.residuals import ResidualFigures
 from psa_casadi.units import convert
 
 if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.any_model.result import OdeDiagnosis
+    from psa_casadi.any_model.runs import Run
     from psa_casadi.export.check.check import CheckReport, CheckRow
 
 
@@ -52,10 +54,15 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     return Table(tuple(head), tuple(tuple(row) for row in rows))
 
 
-def parameter_table(model: Model, found: Identification | None = None) -> Table:
-    """Return every parameter with value, 95 % interval, unit, how it was found, and meaning."""
+def parameter_table(
+    model: Model, found: Identification | None = None, only: Collection[str] | None = None
+) -> Table:
+    """Return every parameter with value, 95 % interval, unit, how it was found, and meaning.
+
+    Those named in `only`, where that is given.
+    """
     rows = []
-    for p in model.structure.parameters:
+    for p in (p for p in model.structure.parameters if only is None or p.name in only):
         unit, display = shown_in(model, p.name)
         interval = model.provenance.intervals.get(p.name)
         text = ""
@@ -76,7 +83,7 @@ def _status(model: Model, name: str, found: Identification | None) -> str:
     return "fit" if degree in ("determined", "fixed") else f"fit, {degree}"
 
 
-def candidate_table(d: Diagnosis) -> Table:
+def candidate_table(d: "Diagnosis | OdeDiagnosis") -> Table:
     """Return every effect tried: evidence, share of the excess, and probability if one is named."""
     head = ["effect", "evidence over the base [ln]", "explains of the excess"]
     rows = [[plain(c.effect), number(c.evidence), share_text(c)] for c in d.candidates]
@@ -144,19 +151,13 @@ def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:
     return _table(("start", "cost", f"rms [{scale.unit}]", "led to"), rows)
 
 
-def record_table(experiments: Sequence[Experiment], origin: str) -> Table:
+def record_table(experiments: "Sequence[Experiment] | Sequence[Run]", origin: str) -> Table:
     """Return the records with their size, how they were used, and their SHA-256."""
-    rows = [
-        (
-            e.record.name,
-            origin,
-            number(e.record.duration),
-            str(int(e.used.sum())),
-            str(int(e.held_out.sum())),
-            e.record.sha256,
-        )
-        for e in experiments
-    ]
+    rows = []
+    for e in experiments:
+        given = e.record if isinstance(e, Experiment) else e.signals
+        counts = (str(int(part.sum())) for part in (e.used, e.held_out))
+        rows.append((given.name, origin, number(given.duration), *counts, given.sha256))
     return _table(
         ("record", "origin", "duration [s]", "samples fitted", "samples held out", "SHA-256"), rows
     )

@@ -1,0 +1,184 @@
+"""The diagnosis of a model that is no stack, in sentences and tables."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from psa_casadi.any_model.identify import OdeIdentification
+from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
+from psa_casadi.report.words.budget_words import share_percent
+from psa_casadi.report.words.phrases import (
+    listing,
+    number,
+    percent,
+    plain,
+    prefixed_scale,
+    with_unit,
+)
+from psa_casadi.report.words.series import FloatArray, Series
+from psa_casadi.report.words.tables import Table
+
+#: Outputs that a sentence names one by one.
+_NAMED = 4
+
+
+def own_verdict_sentence(d: OdeDiagnosis) -> str:
+    """Say the verdict in one sentence, with confidence and gain."""
+    if d.verdict == "adequate":
+        return f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}."
+    if d.verdict == "unexplained" or not d.causes:
+        free = d.correction
+        words = ""
+        if free is not None:
+            share = percent(min(1.0, free.share))
+            words = (
+                f"a free function of {free.of} in {free.port} would remove {share} of the error"
+                " above the noise; "
+            )
+        return (
+            "Something is missing, and no effect in the table explains it: no cause is named;"
+            f" {words}{_base_errors(d)}."
+        )
+    causes = listing([_cause(c) for c in d.causes])
+    if d.verdict == "ambiguous":
+        first = d.causes[0]
+        rivals = listing([plain(n) for n in (first.effect, *first.cannot_be_told_from)], "or")
+        together = listing([plain(c.effect) for c in d.causes])
+        return (
+            f"Something is missing, and these data do not decide whether it is {rivals}; with"
+            f" {together}, {own_gain(d)}."
+        )
+    are = "cause is" if len(d.causes) == 1 else "causes are"
+    if d.verdict == "partly_explained":
+        of = f" ({percent(_within(d.explained_share))} of its power above the noise)"
+        return f"The closest known {are} {causes}: {own_gain(d)}{of}; more than noise remains."
+    return f"The {are} {causes}: {own_gain(d)}."
+
+
+def own_gain(d: OdeDiagnosis) -> str:
+    """Say how far the held-out error of every output falls."""
+    falls = [fall_of(e) for e in d.errors]
+    if len(falls) > _NAMED:
+        low, high = min(falls), max(falls)
+        return f"the held-out errors of {len(falls)} outputs fall by {low:.0f} to {high:.0f} %"
+    if len(falls) == 1:
+        return f"the held-out error falls by {falls[0]:.0f} %"
+    (first, own), *others = zip(d.errors, falls, strict=True)
+    each = [f"that of {e.output} by {f:.0f} %" for e, f in others]
+    return listing([f"the held-out error of {first.output} falls by {own:.0f} %", *each])
+
+
+def fall_of(e: OutputError) -> float:
+    """Return by how much an output's held-out error falls [%]."""
+    return 100.0 * (1.0 - e.extended / e.base) if e.base > 0 else 0.0
+
+
+def _base_errors(d: OdeDiagnosis) -> str:
+    spans = _spans(d)
+    each = [f"{number(100.0 * e.base / spans[e.output], 2)} %" for e in d.errors]
+    if len(each) == 1:
+        return f"the base model's held-out error is {each[0]} of the range"
+    if len(each) > _NAMED:
+        shares = [100.0 * e.base / spans[e.output] for e in d.errors]
+        low, high = number(min(shares), 2), number(max(shares), 2)
+        return f"the base model's held-out errors are {low} to {high} % of the ranges"
+    pairs = [f"{share} of {e.output}" for e, share in zip(d.errors, each, strict=True)]
+    return f"the base model's held-out errors are {listing(pairs)}, over their ranges"
+
+
+def _spans(d: OdeDiagnosis) -> dict[str, float]:
+    """Return the range of every output over all records."""
+    whole = np.vstack([r.outputs for r in d.runs])
+    spans = np.nanmax(whole, axis=0) - np.nanmin(whole, axis=0)
+    return dict(zip(d.model.output_names, map(float, spans), strict=True))
+
+
+def _cause(c: PortCause) -> str:
+    return f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
+
+
+def _within(share: float) -> float:
+    return min(max(share, 0.0), 1.0)
+
+
+def own_budget_table(d: OdeDiagnosis) -> Table:
+    """Return the shares of the base model's held-out error above the noise."""
+    rows = [(plain(c.effect), share_percent(c.explained_share)) for c in d.causes]
+    if len(rows) > 1:
+        rows.append(("all causes together", share_percent(_within(d.explained_share))))
+    if d.correction is not None:
+        free = d.correction
+        what = f"unnamed: a free function of {free.of} in {free.port}"
+        rows.append((what, share_percent(_within(free.share))))
+    rows.append(("remains above the noise", share_percent(_within(1.0 - d.explained_share))))
+    return Table(("what", "removes"), tuple(rows))
+
+
+def own_error_table(d: OdeDiagnosis) -> Table:
+    """Return noise and held-out rms of every output, of the base and of the extended model."""
+    rows = [_errors(e.output, e.unit, e.noise, e.base, e.extended, d) for e in d.errors]
+    return _error_table("output", rows, d)
+
+
+def own_record_table(d: OdeDiagnosis, series: Sequence[Series]) -> Table:
+    """Return the same of every record; rms over its used samples where none is held out."""
+    rows = []
+    for s in series:
+        rms = [_judged_rms(s, s.residual(c)) for c in s.curves]
+        rows.append(_errors(s.name, s.unit, s.noise, rms[0], rms[-1], d))
+    return _error_table("record", rows, d)
+
+
+def _errors(
+    name: str, unit: str, noise: float, base: float, extended: float, d: OdeDiagnosis
+) -> tuple[str, ...]:
+    scale = prefixed_scale(base, unit)
+    shown = [noise, base, *([extended] if d.causes else [])]
+    falls = [f"{100.0 * (1.0 - extended / base):.0f} %"] if d.causes and base > 0 else []
+    return (name, scale.unit, *(number(scale.factor * v) for v in shown), *falls)
+
+
+def _error_table(what: str, rows: Sequence[tuple[str, ...]], d: OdeDiagnosis) -> Table:
+    head = (what, "unit", "noise rms", "base, held-out rms")
+    more = ("extended, held-out rms", "falls by") if d.causes else ()
+    return Table((*head, *more), tuple(rows))
+
+
+def _judged_rms(s: Series, residual: FloatArray) -> float:
+    counted = s.held_out if s.held_out.any() else np.isfinite(residual)
+    return float(np.sqrt(np.nanmean(residual[counted] ** 2)))
+
+
+def own_fit_table(found: OdeIdentification, series: Sequence[Series]) -> Table:
+    """Return what the model leaves of every record, beside the noise."""
+    rows = []
+    for s in series:
+        scale, residual = s.residual_scale, s.residual(s.curves[0])
+        rms = float(np.sqrt(np.nanmean(residual**2)))
+        ratio = number(rms / s.noise, 2) if s.noise > 0 else ""
+        rows.append(
+            (s.name, scale.unit, number(scale.factor * rms), number(scale.factor * s.noise), ratio)
+        )
+    return Table(("record", "unit", "rms", "noise", "rms / noise"), tuple(rows))
+
+
+def own_fit_sentence(found: OdeIdentification) -> str:
+    """Say how far the model is from its records, and how many parameters these determine."""
+    parts = []
+    for name, rms in found.rms.items():
+        unit = next(o.unit for o in found.model.structure.outputs if o.name == name) or "1"
+        noise = found.noise[name]
+        ratio = f" ({number(rms / noise, 2)} times its noise)" if noise > 0 else ""
+        parts.append(f"{name} by {prefixed_scale(rms, unit).text(rms)}{ratio}")
+    count, open_ = len(found.errors), len(found.undetermined)
+    told = "all" if not open_ else f"{count - open_} of"
+    return (
+        f"The model misses {listing(parts)} rms. The records determine {told} {count} fitted"
+        f" parameter{'s' if count > 1 else ''}."
+    )
+
+
+def with_its_unit(value: float, unit: str) -> str:
+    """Return a figure of an output with its unit, with a prefix where that has one."""
+    scale = prefixed_scale(value, unit or "1")
+    return with_unit(number(scale.factor * value), scale.unit or "1")
