@@ -71,10 +71,10 @@ static int get_reals(void *c, const unsigned *which, size_t n, real *values) {
 /* w = (rates, outputs) at time t and v = (states, inputs); 0 if all is finite. */
 static int evaluate(void *c, real t, const real *v, real *w) {
     if (!c || fmu.set_time(c, t) > OK_OR_WARNING ||
-        (NX && fmu.set_states(c, v, NX) > OK_OR_WARNING) ||
-        (NU && set_reals(c, fmu.inputs, NU, v + NX) > OK_OR_WARNING) ||
-        (NX && fmu.get_rates(c, w, NX) > OK_OR_WARNING) ||
-        (PSA_NY && get_reals(c, fmu.shown + NX, PSA_NY, w + NX) > OK_OR_WARNING)) {
+        (NX > 0 && fmu.set_states(c, v, NX) > OK_OR_WARNING) ||
+        (NU > 0 && set_reals(c, fmu.inputs, NU, v + NX) > OK_OR_WARNING) ||
+        (NX > 0 && fmu.get_rates(c, w, NX) > OK_OR_WARNING) ||
+        (PSA_NY > 0 && get_reals(c, fmu.shown + NX, PSA_NY, w + NX) > OK_OR_WARNING)) {
         return 1;
     }
     for (int k = 0; k < NW; k++) {
