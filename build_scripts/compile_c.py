@@ -74,6 +74,17 @@ def write_exact(model: Model, directory: Path) -> Path:
     return directory / "exact.c"
 
 
+def write_imported(directory: Path) -> Path:
+    """Write the sources of what calls an imported FMU; return the file to compile."""
+    directory.mkdir(parents=True)
+    sizes = "".join(f"#define PSA_N{k} {n}\n" for k, n in zip("XUPY", (2, 1, 3, 1), strict=True))
+    text = f"#define PSA_IMPORTED_NAME fmu_f\n{sizes}"
+    (directory / "imported_config.h").write_text(text, encoding="utf-8")
+    for name in ("imported.c", "imported.h"):
+        shutil.copy(ROOT / "fmu_src" / name, directory)
+    return directory / "imported.c"
+
+
 def page_work(
     model: Model, directory: Path
 ) -> list[tuple[Path, tuple[Path, ...], tuple[str, ...]]]:
@@ -105,6 +116,7 @@ def main() -> int:
             write_exact(model, sources / f"exact{k}")
             for k, model in enumerate((compose(BASE), compose((*BASE, EFFECTS["load_stiffness"]))))
         ]
+        files.append(write_imported(sources / "imported"))
         missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")}
         missing -= {f.name for f in (*files, *exact)}
         complaints = [f"{name}: not among the written sources." for name in sorted(missing)]

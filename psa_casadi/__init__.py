@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport, check_fmu
     from psa_casadi.export.fixed_step.export import CodeExport, export_c
     from psa_casadi.export.fmu.archive import export_fmu
+    from psa_casadi.export.importer.fmu_model import fmu_model
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
     from psa_casadi.identification.identify import Identification
@@ -147,6 +148,7 @@ _HOMES = {
     ),
     "psa_casadi.model.system.nanopositioner": ("nanopositioner",),
     "psa_casadi.model.from_casadi.ode_model": ("ode_model",),
+    "psa_casadi.export.importer.fmu_model": ("fmu_model",),
     "psa_casadi.variables": (
         "Input",
         "Output",
@@ -233,6 +235,7 @@ __all__ = [
     "connect",
     "nanopositioner",
     "ode_model",
+    "fmu_model",
     "Input",
     "Output",
     "Parameter",

@@ -90,6 +90,18 @@ class Symbols:
 
 
 @dataclass(frozen=True, eq=False)
+class Foreign:
+    """A compiled function `name` that equations call, and its derivative: an imported FMU.
+
+    It has no formula, so that nothing is printed of it. `addresses` returns where the two are in
+    this process; what is compiled of a model calls them there.
+    """
+
+    name: str
+    addresses: Callable[[], tuple[int, int]]
+
+
+@dataclass(frozen=True, eq=False)
 class Component:
     """One piece of physics, declared once and symbolically.
 
@@ -114,7 +126,8 @@ class Component:
     period.
 
     `home` is the module of a component that is not of this package (`own_effects`). `balances` are
-    sums of its own that others may add to, beside those of every model.
+    sums of its own that others may add to, beside those of every model. `foreign` is what its
+    equations call that is no formula.
     """
 
     name: str
@@ -143,6 +156,7 @@ class Component:
     sample_period: str | None = None
     home: str = ""
     balances: tuple[Balance, ...] = ()
+    foreign: Foreign | None = None
 
     @property
     def from_residual(self) -> bool:

@@ -20,6 +20,7 @@ from psa_casadi.model.from_casadi.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
 from tests import own_plants as plants
 from tests.browser import DARK, find_browser
+from tests.fmu_models import model_named
 from tests.html_page import Page, figures, numbers
 from tests.modelica_runs import load
 from tests.own_models import motor, oscillator, pair, tanks
@@ -221,6 +222,13 @@ def _quiet(model: psa.Model) -> Signals:
 def test_a_rate_that_is_another_state_is_no_port() -> None:
     places = {(p.kind, p.variable) for p in ports_of(oscillator())}
     assert places == {("input", "force"), ("rate", "v"), ("output", "position")}
+
+
+def test_the_stiffness_of_an_own_model_is_not_that_of_a_stack() -> None:
+    assert "of the stack" not in modelica_text(oscillator(), name="Oscillator")
+    assert "static stiffness of the stack" in modelica_text(
+        model_named("single_mass"), name="Stack"
+    )
 
 
 def test_records_that_do_not_fit_are_refused_in_sentences(tmp_path: Path) -> None:

@@ -103,4 +103,5 @@ def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model 
 
 
 def _is_stack(model: Model) -> bool:
-    return "voltage" in model.input_names and output_of(model) is not None
+    own = "voltage" in model.input_names and output_of(model) is not None
+    return own and not model.structure.foreign

@@ -76,5 +76,5 @@ def _rest(structure: Structure) -> ca.Function:
     return ca.Function(
         "rest",
         [structure.time, structure.x, structure.u, structure.p],
-        [rates, *(ca.densify(ca.jacobian(rates, by)) for by in (structure.x, structure.p))],
+        [rates, *(ca.densify(structure.jacobian(rates, by)) for by in (structure.x, structure.p))],
     )

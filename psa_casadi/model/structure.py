@@ -6,7 +6,15 @@ from functools import cache, cached_property
 
 import casadi as ca
 
-from psa_casadi.component import BALANCES, Balance, Component, Equations, Expression, Symbols
+from psa_casadi.component import (
+    BALANCES,
+    Balance,
+    Component,
+    Equations,
+    Expression,
+    Foreign,
+    Symbols,
+)
 from psa_casadi.errors import InputError
 from psa_casadi.model.declarations import (
     check_declarations,
@@ -64,6 +72,20 @@ class Structure:
         """The sums that components may add to, by name: those of every model, then its own."""
         return balances_of(self.components)
 
+    @cached_property
+    def foreign(self) -> tuple[Foreign, ...]:
+        """The compiled functions that the equations call: of imported FMUs."""
+        found = {c.foreign.name: c.foreign for c in self.components if c.foreign}
+        return tuple(found.values())
+
+    def jacobian(self, of: Expression, by: Expression) -> Expression:
+        """Return casadi's Jacobian, by columns where equations call what has forward derivatives.
+
+        Casadi takes rows where there are fewer, and those of such a function are zeros.
+        """
+        columns = {"helper_options": {"ad_weight": 0.0}} if self.foreign else {}
+        return ca.jacobian(of, by, columns)
+
     @property
     def arguments(self) -> list[Expression]:
         """The symbols that the equations are functions of: time, x, u, p, and z if there is one."""
@@ -88,7 +110,7 @@ class Structure:
 
         Shapes (nx, nx), (nx, nu), (ny, nx), (ny, nu).
         """
-        blocks = [ca.jacobian(of, by) for of in (self.xdot, self.y) for by in (self.x, self.u)]
+        blocks = [self.jacobian(of, by) for of in (self.xdot, self.y) for by in (self.x, self.u)]
         return ca.Function("slopes", self.arguments, blocks)
 
     @cached_property

@@ -19,6 +19,29 @@ PRAGMAS = """\
 #endif
 #define CASADI_SYMBOL_EXPORT
 """
+#: How a library reaches a function that is in another one; see `Foreign`.
+FOREIGN = """\
+#include "trajectory.h"
+
+typedef int function(const double **, double **, long long int *, double *, int);
+static function *value, *slope;
+
+PSA_API void connect_{name}(function *v, function *s);
+function {name}, fwd1_{name};
+
+void connect_{name}(function *v, function *s) {{
+    value = v;
+    slope = s;
+}}
+
+int {name}(const double **arg, double **res, long long int *iw, double *w, int mem) {{
+    return value(arg, res, iw, w, mem);
+}}
+
+int fwd1_{name}(const double **arg, double **res, long long int *iw, double *w, int mem) {{
+    return slope(arg, res, iw, w, mem);
+}}
+"""
 
 
 def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.Function]:
@@ -32,7 +55,7 @@ def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.F
     s = structure
     arguments = c_arguments(s)
     x, xdot = arguments[1], c_slopes(s)
-    jacobian = ca.densify(ca.jacobian(xdot, x))
+    jacobian = ca.densify(s.jacobian(xdot, x))
     switches: Expression = ca.vertcat(ca.SX(0, 1), *s.switches.values())
     table = {
         "psa_ode": [ca.densify(xdot)],
@@ -43,10 +66,10 @@ def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.F
     if s.sampled:
         table["psa_sample"] = [ca.densify(s.znext)]
     if sensitivities:
-        table["psa_sensitivity"] = [jacobian, ca.densify(ca.jacobian(xdot, s.p))]
+        table["psa_sensitivity"] = [jacobian, ca.densify(s.jacobian(xdot, s.p))]
         table["psa_output_sensitivity"] = [
-            ca.densify(ca.jacobian(s.y, x)),
-            ca.densify(ca.jacobian(s.y, s.p)),
+            ca.densify(s.jacobian(s.y, x)),
+            ca.densify(s.jacobian(s.y, s.p)),
         ]
     return {
         name: ca.Function(name, arguments, ca.cse(outputs), {"cse": True})
@@ -81,6 +104,7 @@ def generate_c(structure: Structure, *, sensitivities: bool) -> dict[str, str]:
     if not body.endswith("#endif\n"):  # CasADi does not look whether its writing succeeded
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     return {
+        **{f"{f.name}.c": FOREIGN.format(name=f.name) for f in structure.foreign},
         "model.c": PRAGMAS + body,
         "model_config.h": _config(structure, list(functions.values()), sensitivities),
     }

@@ -83,6 +83,10 @@ def _library(structure: Structure) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     library.psa_run.argtypes = [ctypes.POINTER(_Run)]
     library.psa_run.restype = ctypes.c_int
+    for foreign in structure.foreign:
+        connect = getattr(library, f"connect_{foreign.name}")
+        connect.restype = None
+        connect(*(_POINTER(address) for address in foreign.addresses()))
     return library
 
 

@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from psa_casadi.export.common.foreign import refuse_foreign
 from psa_casadi.export.fixed_step.planning import fixed_step
 from psa_casadi.export.fixed_step.probe import VoltageError
 from psa_casadi.files import atomic_write
@@ -46,6 +47,7 @@ def export_c(
     Raises InputError for bad arguments, a model that does not fit (with the effect and the reason)
     or a step that is too long, and MachineError if the compiler fails.
     """
+    refuse_foreign(model.structure, "C")
     exported = model if include_sensor else model.plant()
     identifier = name or model.name
     found = fixed_step(

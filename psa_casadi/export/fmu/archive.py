@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.common.foreign import refuse_foreign
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
 from psa_casadi.export.common.posterior import SAMPLES
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
@@ -62,6 +63,7 @@ def export_fmu(
     Raises InputError for an impossible name, an unknown platform or version, a model without
     states, or one that does not fit a fixed step, and MachineError if a compiler fails.
     """
+    refuse_foreign(model.structure, "an FMU")
     identifier = name or model.name
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
         raise InputError(

@@ -111,6 +111,11 @@ class Archive:
         return tuple(kind for kind, announced in said if announced is not None)
 
     @property
+    def resources(self) -> Path:
+        """The folder of the FMU's own files, absolute; it need not exist."""
+        return self.directory.absolute() / "resources"
+
+    @property
     def prefix(self) -> str:
         """What the names of all C functions start with."""
         return f"fmi{self.version}"

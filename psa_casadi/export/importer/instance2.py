@@ -1,8 +1,10 @@
 """Instances of an FMI 2.0 FMU."""
 
 import ctypes
+import platform
 from collections.abc import Mapping
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_void_p
+from functools import cache
 
 from psa_casadi.export.importer.calls import Instance
 from psa_casadi.export.importer.library import Library
@@ -28,6 +30,14 @@ class _EventInfo(ctypes.Structure):
     )  # fmt: skip
 
 
+@cache
+def _memory() -> tuple[int | None, int | None]:
+    """Return where the C library's calloc and free are: FMUs may ask for memory by these only."""
+    library = ctypes.CDLL("msvcrt" if platform.system() == "Windows" else None)
+    allocate, release = (ctypes.cast(f, c_void_p) for f in (library.calloc, library.free))
+    return allocate.value, release.value
+
+
 class Instance2(Instance):
     """One instance; `logger` is "own", "empty" (callbacks that are all NULL) or "none" (NULL)."""
 
@@ -43,11 +53,12 @@ class Instance2(Instance):
         self.fmu, self.interface = fmu, interface
         self.messages: list[str] = []
         self._logger = _LOGGER(self._log)
-        self._callbacks = Callbacks(self._logger) if logger == "own" else Callbacks()
+        own = logger == "own"
+        self._callbacks = Callbacks(self._logger, *_memory()) if own else Callbacks()
         pointer = None if logger == "none" else ctypes.byref(self._callbacks)
         proof = (fmu.token if token is None else token).encode()
         self.component: int | None = fmu.library.fmi2Instantiate(
-            name.encode(), interface, proof, b"", pointer, 0, 0
+            name.encode(), interface, proof, fmu.resources.as_uri().encode(), pointer, 0, 0
         )
 
     def _log(self, _env: int, _name: bytes, _status: int, _category: bytes, message: bytes) -> None:

@@ -1,6 +1,7 @@
 """Instances of an FMI 3.0 FMU."""
 
 import ctypes
+import os
 from collections.abc import Callable, Mapping, Sequence
 from ctypes import c_bool, c_char_p, c_double, c_int, c_size_t, c_void_p
 from typing import NamedTuple
@@ -61,7 +62,8 @@ class Instance3(Instance):
         self._logger = _LOGGER(self._log) if logger == "own" else None
         self._update = _UPDATE(self._look) if watcher else None
         proof = (fmu.token if token is None else token).encode()
-        head = (None if name is None else name.encode(), proof, None, c_bool(False), c_bool(False))
+        files = f"{fmu.resources}{os.sep}".encode()
+        head = (None if name is None else name.encode(), proof, files, c_bool(False), c_bool(False))
         if interface == CO_SIMULATION:
             allowed = (c_bool(events), c_bool(early), None, c_size_t(0))
             made = fmu.library.fmi3InstantiateCoSimulation(

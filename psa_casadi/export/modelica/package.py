@@ -5,6 +5,7 @@ from pathlib import Path
 
 from psa_casadi.characters import check_text
 from psa_casadi.errors import Problems
+from psa_casadi.export.common.foreign import refuse_foreign
 from psa_casadi.export.common.icon import drawing_of
 from psa_casadi.export.modelica.acausal import acausal_lines, has_ports
 from psa_casadi.export.modelica.annotations import about, documentation, equations_table, icon
@@ -48,6 +49,7 @@ def export_modelica(
 def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: bool = False) -> str:
     """Return the text that `export_modelica` writes; raises what it raises."""
     check_identifier(name, "a Modelica package")
+    refuse_foreign(model.structure, "Modelica")
     exported = model if include_sensor else model.plant()
     _refuse(exported)
     lines = [f"package {name} {string('model of a device, written by psa_casadi')}"]

@@ -30,6 +30,12 @@ def _ratio(s: Symbols) -> Expression:
     return s.f_H / s.h_ref
 
 
+def _stiffness(s: Symbols) -> Expression:
+    """Only a stack has a stroke; the k of another model may be anything."""
+    stroke(s)  # raises AttributeError in a model that is no stack
+    return static_stiffness(s)
+
+
 PARTS: tuple[Part, ...] = (
     Part("voltage_direction", "1", "smooth sign of the voltage rate", direction),
     Part("voltage_speed", "V/s", "magnitude of the voltage rate", rate_magnitude),
@@ -46,7 +52,7 @@ PARTS: tuple[Part, ...] = (
         "the same with the sign of the ratio",
         lambda s: signed_power(_ratio(s), s.n),
     ),
-    Part("static_stiffness", "N/m", "static stiffness of the stack", static_stiffness),
+    Part("static_stiffness", "N/m", "static stiffness of the stack", _stiffness),
     Part("stroke", "m", "linear free stroke at rated voltage", stroke),
     Part("elastic_force", "N", "force of the wafers' spring and damper", _elastic),
     Part("bonding_force", "N", "force of the bonding layers' spring and damper", _pull),

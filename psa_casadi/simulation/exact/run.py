@@ -85,6 +85,8 @@ def why_not(structure: Structure, output: str) -> str | None:
     """Return why a model's output cannot be had by exact steps; None if it can."""
     if output not in (o.name for o in structure.outputs):
         return f"it has no output {output}"
+    if structure.foreign:
+        return "it calls an FMU, which has no formula"
     found = _compiled(structure, output, 1)
     return found if isinstance(found, str) else None
 

@@ -1,0 +1,189 @@
+"""An FMU of model exchange as compiled functions that equations can call.
+
+    w = (x', y) = F(t, v, p),  v = (x, u)
+
+and its derivative along a change of v and p. By v it is the FMU's own directional derivative where
+it has one, else a central difference; by p, whose values an FMU takes before its initialization
+only, a central difference of instances that were initialised with other values.
+"""
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from ctypes import c_double, c_int, c_size_t, c_uint, c_void_p
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Foreign
+from psa_casadi.errors import PsaError
+from psa_casadi.export.importer.calls import FmuError, Instance
+from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu
+from psa_casadi.simulation.compiler import shared_library
+
+FloatArray = npt.NDArray[np.float64]
+
+_PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))
+#: As often an FMU may ask for another update of its discrete states after initialization.
+_UPDATES = 100
+#: Functions of `psa_imported` in its order: name of a field, version, name in the standard.
+_FUNCTIONS = (
+    ("set_time", 0, "SetTime"),
+    ("set_states", 0, "SetContinuousStates"),
+    ("get_rates", 2, "GetDerivatives"),
+    ("get_rates", 3, "GetContinuousStateDerivatives"),
+    ("set_real2", 2, "SetReal"),
+    ("set_real3", 3, "SetFloat64"),
+    ("get_real2", 2, "GetReal"),
+    ("get_real3", 3, "GetFloat64"),
+)
+
+
+class _Given(ctypes.Structure):
+    """Mirror of `psa_imported` in imported.h."""
+
+    _fields_ = (
+        ("version", c_int), ("set_time", c_void_p), ("set_states", c_void_p),
+        ("get_rates", c_void_p), ("set_real2", c_void_p), ("set_real3", c_void_p),
+        ("get_real2", c_void_p), ("get_real3", c_void_p), ("slope2", c_void_p),
+        ("slope3", c_void_p), ("prepare", _PREPARE), ("inputs", c_void_p), ("shown", c_void_p),
+        ("known", c_void_p), ("sizes", c_void_p),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Selected:
+    """The variables of an FMU that its function has, by their names in there.
+
+    `rates` are the derivatives of the `states`; `fixed` are values of further parameters.
+    """
+
+    states: tuple[str, ...]
+    rates: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    fixed: tuple[tuple[str, float], ...]
+
+
+@dataclass(eq=False)
+class Imported:
+    """The function of one FMU with some of its variables; it lives as long as the process.
+
+    `sizes` are the usual sizes of states, inputs and parameters, `name` is that of the function.
+    """
+
+    fmu: Fmu
+    name: str
+    selected: Selected
+    sizes: Sequence[float]
+    instances: dict[tuple[int, int], Instance] = field(default_factory=dict)
+    #: What the FMU said when it could not be initialised.
+    refused: str = ""
+
+    @cached_property
+    def path(self) -> str:
+        """Where the compiled functions are."""
+        s = self.selected
+        sizes = {"NX": s.states, "NU": s.inputs, "NP": s.parameters, "NY": s.outputs}
+        config = "".join(f"#define PSA_{k} {len(v)}\n" for k, v in sizes.items())
+        text = f"#define PSA_IMPORTED_NAME {self.name}\n{config}"
+        return str(shared_library({"imported_config.h": text}, ("imported.c",)))
+
+    @cached_property
+    def library(self) -> ctypes.CDLL:
+        """The compiled functions, loaded, and given what they need of the FMU."""
+        library = ctypes.CDLL(self.path)
+        self._kept = self._references()  # C points to these
+        self._prepare = _PREPARE(self._prepared)
+        library.psa_import(ctypes.byref(self._given()))
+        return library
+
+    @property
+    def foreign(self) -> Foreign:
+        """What a component declares of it."""
+        return Foreign(self.name, self._addresses)
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """Casadi function (t, v, p) -> w; its derivatives are forward ones only."""
+        self.library  # noqa: B018  CasADi finds it loaded
+        return ca.external(self.name, self.path, {"enable_reverse": False})
+
+    def initialised(self, parameters: Mapping[str, float], old: Instance | None = None) -> Instance:
+        """Return an instance in continuous-time mode with values of parameters.
+
+        Raises FmuError where the FMU refuses, or has events from the beginning.
+        """
+        instance = old or self.fmu.open(MODEL_EXCHANGE)
+        if old:
+            old.require("Reset")
+        instance.setup(values={**dict(self.selected.fixed), **parameters})
+        for _ in range(_UPDATES):
+            again, end, *_ = instance.update_discrete_states()
+            if end:
+                raise FmuError("the FMU ends the simulation at its start")
+            if not again:
+                break
+        if instance.next_event_time is not None:
+            raise FmuError("the FMU announces an event at a time of its own")
+        instance.require("EnterContinuousTimeMode")
+        return instance
+
+    def _prepared(self, slot: int, place: int, p: "ctypes._Pointer[c_double]") -> int | None:
+        names = self.selected.parameters
+        values = {n: float(p[k]) for k, n in enumerate(names)}
+        old = self.instances.pop((slot, place), None)
+        try:
+            found = self.initialised(values, old)
+        except PsaError as error:
+            self.refused = str(error)
+            if old:
+                old.free()
+            return None
+        self.instances[slot, place] = found
+        return found.component
+
+    def _addresses(self) -> tuple[int, int]:
+        value, slope = self.library[self.name], self.library[f"fwd1_{self.name}"]
+        return _address(value), _address(slope)
+
+    def _references(self) -> dict[str, ctypes.Array[c_uint] | ctypes.Array[c_double]]:
+        """Return the arrays that `psa_imported` points to; they must outlive it."""
+        s, of = self.selected, self.fmu.references
+
+        def array(names: Sequence[str]) -> ctypes.Array[c_uint]:
+            return (c_uint * len(names))(*(of[n] for n in names))
+
+        return {
+            "inputs": array(s.inputs),
+            "shown": array((*s.rates, *s.outputs)),
+            "known": array((*s.states, *s.inputs)),
+            "sizes": (c_double * len(self.sizes))(*self.sizes),
+        }
+
+    def _given(self) -> _Given:
+        version, library = self.fmu.version, self.fmu.library
+        own = [(f, n) for f, v, n in _FUNCTIONS if v in (0, version)]
+        if self.fmu.description.modelExchange.providesDirectionalDerivative:
+            own.append((f"slope{version}", "GetDirectionalDerivative"))
+        called = {
+            field: ctypes.cast(getattr(library, self.fmu.prefix + name), c_void_p)
+            for field, name in own
+        }
+        arrays = {k: ctypes.cast(a, c_void_p) for k, a in self._kept.items()}
+        return _Given(version=version, prepare=self._prepare, **called, **arrays)
+
+
+def _address(function: Any) -> int:
+    return ctypes.cast(function, c_void_p).value or 0
+
+
+def states_of(instance: Instance, count: int) -> FloatArray:
+    """Return the continuous states (nx,) of an instance that has just been initialised."""
+    values = (c_double * count)()
+    instance.require("GetContinuousStates", values, c_size_t(count))
+    return np.array(values)
