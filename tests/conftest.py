@@ -1,4 +1,5 @@
 import os
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,6 +8,10 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
     os.environ.setdefault("PSA_CASADI_THREADS", "1")
+# a model runs for a few hundredths of a second here, and compiles in half the time with this; the
+# bits are the same (`test_exact_bits`). zig's -Og means other checks in the code.
+if shutil.which("cc") and "CC" not in os.environ:
+    os.environ.setdefault("PSA_CASADI_CFLAGS", "-Og")
 # hundreds of Python processes are started, and each would compile the package again
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

@@ -195,9 +195,10 @@ def test_diagnose_writes_only_what_is_asked_for_and_can_be_quiet(
             },
         )
     events = tmp_path / "e.jsonl"
+    left_out = set(EFFECTS) - {"charge_leakage", "hysteresis_memory", "offset_drift", "sensor_lag"}
     result = done(
         "diagnose", paths[0], "--holdout", paths[1], "--json", tmp_path / "d.json", "--quiet",
-        "--events", events, "--leave-out", "slow_creep",
+        "--events", events, *(word for name in left_out for word in ("--leave-out", name)),
     )  # fmt: skip
     assert result.output == ""
     assert {p.name for p in tmp_path.iterdir()} == {"a.csv", "b.csv", "d.json", "e.jsonl"}
@@ -207,7 +208,8 @@ def test_diagnose_writes_only_what_is_asked_for_and_can_be_quiet(
     assert tried[0]["causes"] == []
     assert [t["state"] for t in tried].count("best") == 1
     assert {c["effect"] for c in d["causes"]} <= set(tried[-1]["causes"])
-    assert all("slow_creep" not in t["causes"] for t in tried)
+    assert any(t["causes"] for t in tried)
+    assert not [t for t in tried if left_out & set(t["causes"])]
     assert "slow_creep" in d["notes"][-1]
 
 

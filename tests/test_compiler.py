@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,31 @@ def test_the_systems_compiler_comes_before_zig(monkeypatch: pytest.MonkeyPatch) 
     assert compiler.compiler_command() == ZIG
     monkeypatch.setenv("CC", "clang -m64")
     assert compiler.compiler_command() == ["clang", "-m64"]
+
+
+def test_flags_of_the_environment_come_last(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    commands: list[Sequence[str]] = []
+    run_it = compiler.run_compiler
+
+    def told(command: Sequence[str], directory: Path) -> None:
+        commands.append(command)
+        run_it(command, directory)
+
+    monkeypatch.setattr(compiler, "run_compiler", told)
+    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
+    made = []
+    for flags in ("", "-O0 '-DWORDS=a b'"):
+        monkeypatch.setenv("PSA_CASADI_CFLAGS", flags)
+        made.append(compiler.shared_library({"a.c": "int a;"}, (), ("-O1",)))
+    assert made[0] != made[1]
+    at = commands[1].index("-O1")
+    assert commands[1][at + 1 : at + 3] == ["-O0", "-DWORDS=a b"]
+    assert "-O0" not in commands[0]
+    monkeypatch.setenv("PSA_CASADI_CFLAGS", "'-O0")
+    with pytest.raises(MachineError, match=r"PSA_CASADI_CFLAGS is .*no row of flags.*-Og"):
+        compiler.shared_library({"a.c": "int a;"}, ())
 
 
 @pytest.mark.parametrize("installed", [True, False])

@@ -69,7 +69,7 @@ def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
 @slow
 def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
     make_record(None, 3, tmp_path / "record.csv")
-    record = psa.read_record(tmp_path / "record.csv").slice(0, 3000)
+    record = psa.read_record(tmp_path / "record.csv").slice(0, 1500)
     found = psa.identify(record, hysteresis="best")
     assert "bouc_wen" in [c.name for c in found.model.components]
     assert any(s.startswith("hysteresis: Bouc-Wen") for s in found.sentences)

@@ -28,6 +28,9 @@ from psa_casadi.errors import MachineError
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
+#: Environment variable with further flags for the models that are run here; FMUs have none of them.
+#: `-Og` compiles in half the time and runs 1.2 to 1.3 times as long, to the same bits.
+FLAGS_VARIABLE = "PSA_CASADI_CFLAGS"
 #: The command that installs a C compiler where the system has none.
 INSTALL_ZIG = "pip install 'psa-casadi[compiler]'"
 _CURE = f"set CC to a working C99 compiler, or unset it and run {INSTALL_ZIG}."
@@ -156,6 +159,7 @@ def generated_library(
     """
     folder = sources_directory()
     command = compiler_command()
+    flags = (*flags, *_wanted_flags())
     digest = hashlib.sha256(
         repr((command, OPTIMISE, flags, platform.machine(), sys.platform)).encode()
     )
@@ -196,6 +200,18 @@ def _load(path: Path) -> None:
         ctypes.CDLL(str(path))
     except OSError as error:
         raise OSError(errno.ENOEXEC, str(error), str(path.parent)) from error
+
+
+def _wanted_flags() -> list[str]:
+    """Return the user's own flags; raise MachineError where their quotes have no end."""
+    wanted = os.environ.get(FLAGS_VARIABLE, "")
+    try:
+        return shlex.split(wanted)
+    except ValueError as error:
+        raise MachineError(
+            f"{FLAGS_VARIABLE} is {wanted!r}, which is no row of flags ({error}); set it to flags"
+            " of the C compiler, such as -Og, or unset it."
+        ) from error
 
 
 def _compile(
