@@ -152,12 +152,13 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     following = {k: v for e in parts for k, v in e.next.items()}
     full = _substitute_in_order(balances, sums)
 
-    def resolved(expressions: Iterable[Expression]) -> list[Expression]:
-        given = [ca.SX(e) for e in expressions]
-        return list(ca.substitute(given, list(sums.values()), full))
+    by, instead = _column(sums.values()), _column(full)
+
+    def resolved(expressions: Iterable[Expression]) -> Expression:
+        return ca.substitute(_column(expressions), by, instead)
 
     x = _column(table[s.name] for s in states)
-    xdot = _column(resolved(der[s.name] for s in states))
+    xdot = resolved(der[s.name] for s in states)
     if "displacement" in balances:
         shown = full[list(sums).index("displacement")]
         out["velocity"] = _time_derivative(shown, x, xdot, table["time"])
@@ -177,13 +178,13 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
         der=der,
         out=out,
         xdot=xdot,
-        y=_column(resolved(out[o.name] for o in outputs)),
-        switches=dict(zip(switches, resolved(switches.values()), strict=True)),
+        y=resolved(out[o.name] for o in outputs),
+        switches=dict(zip(switches, ca.vertsplit(resolved(switches.values())), strict=True)),
         sampled=sampled,
         period=period,
         z=_column(table[s.name] for s in sampled),
         next=following,
-        znext=_column(resolved(following[s.name] for s in sampled)),
+        znext=resolved(following[s.name] for s in sampled),
     )
 
 
@@ -241,9 +242,11 @@ def _substitute_in_order(
             )
         for name in ready:
             known = [k for k in resolved if k in needed[name]]
-            resolved[name] = ca.substitute(
-                [waiting.pop(name)], [symbols[k] for k in known], [resolved[k] for k in known]
-            )[0]
+            expression = waiting.pop(name)
+            if known:
+                by, instead = (_column(of[k] for k in known) for of in (symbols, resolved))
+                expression = ca.substitute(expression, by, instead)
+            resolved[name] = expression
     return [resolved[name] for name in symbols]
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -118,7 +119,7 @@ class Record:
         """Time from the first to the last sample [s]."""
         return float(self.time[-1] - self.time[0])
 
-    @property
+    @cached_property
     def sample_time(self) -> float:
         """Median distance between samples [s]."""
         return float(np.median(np.diff(self.time)))

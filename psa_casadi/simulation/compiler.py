@@ -164,8 +164,7 @@ def generated_library(
         repr((command, OPTIMISE, flags, platform.machine(), sys.platform)).encode()
     )
     digest.update(fingerprint.encode())
-    for path in sorted(folder.glob("*.[ch]")):
-        digest.update(path.name.encode() + path.read_bytes())
+    digest.update(_sources(folder))
     suffix = {"Windows": ".dll", "Darwin": ".dylib"}.get(platform.system(), ".so")
     name = digest.hexdigest()[:32] + suffix
     files = [str(folder / s) for s in sources]
@@ -182,6 +181,13 @@ def generated_library(
                 f" from which no program may run (noexec), or a CC for another machine, is the"
                 f" likely cause; set {VARIABLE} to a folder of another disk, or unset CC."
             ) from error
+
+
+@cache
+def _sources(folder: Path) -> bytes:
+    """Return names and text of the C sources."""
+    paths = sorted(folder.glob("*.[ch]"))
+    return b"".join(path.name.encode() + path.read_bytes() for path in paths)
 
 
 _TURNS: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)

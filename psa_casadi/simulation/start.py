@@ -173,15 +173,21 @@ def _functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Funct
     deviation = ca.SX.sym("deviation", len(memory))
     known = ca.SX.sym("settled", len(s.states))
     where = [s.time, s.x, s.u, s.p, deviation]
-    newton = _newton(s, settling, _placed(s, s.x, memory, deviation))
+    slopes = _slopes(s)
+    by_x, by_u = ca.jacobian(slopes, s.x), ca.jacobian(slopes, s.u)
+    newton = _newton(s, (slopes, by_x), settling, _placed(s, s.x, memory, deviation))
     settle = ca.Function("settle", where, [ca.densify(newton)])
     settled = ca.substitute([newton], [s.x], [known])[0]
-    start = _newton(s, fast, _placed(s, s.x, memory, deviation, settled))
+    start = _newton(s, (slopes, by_x), fast, _placed(s, s.x, memory, deviation, settled))
     rest = ca.Function("rest", [*where, known], [ca.densify(start)])
     rate = ca.SX.sym("rate", len(s.inputs))
     moving: Expression = start
+    jacobian, by_input = _at(s, by_x, start), _at(s, by_u, start)
     for _ in range(2):
-        moving = _in_motion(s, start, moving, fast, memory, rate)
+        drive = by_input[fast, :] @ rate
+        if memory:
+            drive += jacobian[fast, memory] @ _at(s, slopes, moving)[memory]
+        moving = _in_motion(start, fast, jacobian[fast, fast], drive)
     derivatives: list[Expression] = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
     return (
         settle,
@@ -216,7 +222,7 @@ def _placed(
 
     Without `settled` those that have such a value stay as they are.
     """
-    parts = [x[i] for i in range(len(s.states))]
+    parts: list[Expression] = ca.vertsplit(x)
     for column, i in enumerate(memory):
         if not s.states[i].settles:
             parts[i] = deviation[column]
@@ -225,11 +231,16 @@ def _placed(
     return ca.vertcat(*parts)
 
 
-def _newton(s: Structure, rows: list[int], x: Expression) -> Expression:
-    """One Newton step for the rows' derivatives to vanish; its derivative is the implicit one."""
-    jacobian = ca.jacobian(_slopes(s), s.x)[rows, rows]
-    step = ca.solve(_at(s, jacobian, x), _at(s, _slopes(s), x)[rows])
-    parts = [x[i] for i in range(len(s.states))]
+def _newton(
+    s: Structure, of: tuple[Expression, Expression], rows: list[int], x: Expression
+) -> Expression:
+    """One Newton step for the rows' derivatives to vanish; its derivative is the implicit one.
+
+    `of` are the slopes and their Jacobian by x.
+    """
+    slopes, by_x = of
+    step = ca.solve(_at(s, by_x[rows, rows], x), _at(s, slopes, x)[rows])
+    parts: list[Expression] = ca.vertsplit(x)
     for k, i in enumerate(rows):
         parts[i] = parts[i] - step[k]
     return ca.vertcat(*parts)
@@ -246,22 +257,16 @@ def _solved(matrix: Expression, right: Expression) -> Expression:
 
 
 def _in_motion(
-    s: Structure,
-    rest: Expression,
-    x: Expression,
-    fast: list[int],
-    memory: list[int],
-    rate: Expression,
+    rest: Expression, fast: list[int], jacobian: Expression, drive: Expression
 ) -> Expression:
-    """Move the fast states from rest to a steady motion at the rate of inputs and memories."""
-    jacobian = _at(s, ca.jacobian(_slopes(s), s.x), rest)
-    by_input = _at(s, ca.jacobian(_slopes(s), s.u), rest)
-    drive = by_input[fast, :] @ rate
-    if memory:
-        drive += jacobian[fast, memory] @ _at(s, _slopes(s), x)[memory]
-    steady = -_solved(jacobian[fast, fast], drive)
-    lag = _solved(jacobian[fast, fast], steady)
-    parts = [rest[i] for i in range(len(s.states))]
+    """Move the fast states from rest to a steady motion.
+
+    `jacobian` is that of their slopes by themselves, `drive` the rate of these slopes that the
+    rates of inputs and memories cause.
+    """
+    steady = -_solved(jacobian, drive)
+    lag = _solved(jacobian, steady)
+    parts: list[Expression] = ca.vertsplit(rest)
     for k, i in enumerate(fast):
         parts[i] = parts[i] + lag[k]
     return ca.vertcat(*parts)

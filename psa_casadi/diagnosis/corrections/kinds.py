@@ -148,11 +148,12 @@ def _gain_in_time(s: Signals, k: int) -> FloatArray:
 
 def _plays(q: FloatArray, radii: FloatArray) -> FloatArray:
     """Return play operators (n, k) of a signal; they begin where the signal does."""
-    found = np.empty((len(q), len(radii)))
+    low, high = q[:, None] - radii, q[:, None] + radii
+    found = np.empty_like(low)
     state = np.full(len(radii), q[0])
-    for i, value in enumerate(q):
-        state = np.clip(state, value - radii, value + radii)
-        found[i] = state
+    for least, most, row in zip(low, high, found, strict=True):  # `clip` takes 20 times as long
+        np.maximum(state, least, out=row)
+        state = np.minimum(row, most, out=row)
     return found
 
 

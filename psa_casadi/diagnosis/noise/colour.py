@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -41,14 +42,18 @@ class Colour:
         The noise's density at frequency 0 over its mean density: (1 + r)/(1 - r) of a first-order
         autoregression.
         """
-        each = [_at_rest(a) / _power(a) for a in self.autoregression]
+        each = [_at_rest(a) / p for a, p in zip(self.autoregression, self._powers, strict=True)]
         return max(1.0, float(np.average(each, weights=self.lengths)))
 
     @property
     def rms(self) -> float:
         """Rms of the noise over all records [m]."""
-        powers = [_power(a) for a in self.autoregression]
-        return self.level * float(np.sqrt(np.average(powers, weights=self.lengths)))
+        return self.level * float(np.sqrt(np.average(self._powers, weights=self.lengths)))
+
+    @cached_property
+    def _powers(self) -> tuple[float, ...]:
+        """Variance of every record's noise over that of w."""
+        return tuple(_power(a) for a in self.autoregression)
 
     def whiten(self, signal: FloatArray) -> FloatArray:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
@@ -56,12 +61,13 @@ class Colour:
             return signal
         white = signal.copy()
         first = 0
-        for a, length in zip(self.autoregression, self.lengths, strict=True):
+        records = zip(self.autoregression, self._powers, self.lengths, strict=True)
+        for a, power, length in records:
             part = signal[first : first + length]
             if a.size and length > a.size:
                 own = white[first : first + length]
                 own[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
-                own[: a.size] = part[: a.size] / np.sqrt(_power(a))
+                own[: a.size] = part[: a.size] / np.sqrt(power)
             first += length
         return white
 
