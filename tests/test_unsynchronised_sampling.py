@@ -71,8 +71,8 @@ def test_two_clocks_are_named(run: Run) -> None:
     found = diagnose([record], effects=TABLE)
     assert [c.effect for c in found.causes] == ["unsynchronised_sampling"]
     assert found.causes[0].cannot_be_told_from == ()
-    age = found.causes[0].parameters["sampling_age"].value
-    assert age == pytest.approx(STEP / RENEWALS, rel=0.08)
+    low, high = found.causes[0].parameters["sampling_age"].interval
+    assert low < STEP / RENEWALS < high < 1.3 * STEP / RENEWALS
     assert found.extended_errors.holdout_rms_m < 1.05 * found.noise_floor_rms_m
     clean = replace(record, displacement=run.displacement + noise(run, 1e-3))
     assert diagnose([clean], effects=TABLE).causes == ()

@@ -4,6 +4,9 @@ A sensor that renews its value every T seconds, read by another clock, gives at 
 value that it had up to T ago. Where the two clocks differ by a few parts in 10^5, this age grows or
 falls by T during one beat of the two, and jumps back. Phase and rate of the beat are each record's
 own: clocks start anew and warm up.
+
+The age counts on the displacement, as the terms of other sensor effects do. Beside a bent sensor,
+whose slope is in no reading but its own, what saws is the age over that slope.
 """
 
 from math import exp, pi
