@@ -40,6 +40,12 @@ BENCHES: dict[str, Bench] = {
             "exact steps against the stepper: error against time, lanes, effects, whole diagnoses",
         ),
         _later(
+            "ensembles",
+            "ensembles",
+            "many sets of parameters beside LSODA, CVODES and diffrax at equal error (--size)",
+            sized=True,
+        ),
+        _later(
             "batch",
             "batch",
             "many devices with hidden defects: which are told, cost, a run again (--size)",
