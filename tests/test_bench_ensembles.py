@@ -25,10 +25,10 @@ def test_the_loosest_tolerance_is_the_first_that_is_accurate() -> None:
     """The first set errs by 10 times the tolerance over its range, the second by 50 times."""
     truth = np.array([[0.0, 1.0], [0.0, 2.0]])
 
-    def prepare(tolerance: float) -> Solve:
+    def at(tolerance: float) -> Solve:
         return lambda: np.array([[0.0, 1.0 + 10.0 * tolerance], [0.0, 2.0 + 100.0 * tolerance]])
 
-    found = loosest(prepare, truth)
+    found = loosest(at, truth)
     assert found.tolerance == pytest.approx(1e-7)
     assert found.error == pytest.approx(5e-6, rel=1e-6)
     never = loosest(lambda _: lambda: np.array([[0.0, 1.0], [0.0, np.nan]]), truth)
@@ -52,7 +52,7 @@ def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPa
 def test_a_way_that_is_never_accurate_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensembles, "_REPEATS", 1)
     monkeypatch.setattr(Work, "reference", lambda self, rtol: np.tile(self.voltage, (3, 1)))
-    none = Peer("none", lambda work, _: lambda: np.zeros((3, len(work.times))), 3)
+    none = Peer("none", lambda work: lambda _: lambda: np.zeros((3, len(work.times))), 3)
     row = measured(told, [short()], 8, 40, [none]).tables[1].table.rows[1]
     assert row[4] == "1.0 (missed)"
 

@@ -25,6 +25,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Runs all sets of a work: displacements (sets, n) [m]; not finite where one cannot be integrated.
 Solve = Callable[[], FloatArray]
+#: Makes the run at a tolerance.
+At = Callable[[float], Solve]
 
 
 @dataclass(frozen=True)
@@ -72,13 +74,13 @@ class Work:
 
 @dataclass(frozen=True)
 class Peer:
-    """A way by name: `prepare(work, tolerance)` builds and compiles, what it returns is timed.
+    """A way by name: `prepare(work)` and what it returns build and compile, a `Solve` is timed.
 
     It runs `sets` sets at a time.
     """
 
     name: str
-    prepare: Callable[[Work, float], Solve]
+    prepare: Callable[[Work], At]
     sets: int
 
 
@@ -105,12 +107,12 @@ def rates(p: Mapping[str, Any], v: Any, state: Sequence[Any], m: Any) -> tuple[A
     )
 
 
-def _scipy(work: Work, tolerance: float) -> Solve:
+def _scipy(work: Work) -> At:
     """LSODA on plain numbers, one set after the other."""
     t, h, scale = work.times, work.step, work.scale
     v, slope = work.voltage.tolist(), (np.diff(work.voltage) / h).tolist()
 
-    def one(model: Model, x0: FloatArray) -> FloatArray:
+    def one(model: Model, x0: FloatArray, tolerance: float) -> FloatArray:
         p, last = model.values, len(slope) - 1
 
         def slopes(now: float, x: FloatArray) -> tuple[float, ...]:
@@ -122,11 +124,11 @@ def _scipy(work: Work, tolerance: float) -> Solve:
         )
         return found.y[5] if found.success else np.full(len(t), np.nan)
 
-    starts = work.starts
-    return lambda: np.array([one(m, x) for m, x in zip(work.models, starts, strict=True)])
+    pairs = list(zip(work.models, work.starts, strict=True))
+    return lambda tolerance: lambda: np.array([one(m, x, tolerance) for m, x in pairs])
 
 
-def _cvodes(work: Work, tolerance: float) -> Solve:
+def _cvodes(work: Work) -> At:
     """CVODES with CasADi's exact derivatives, built once for all sets, which are its parameters."""
     s, scale, t = work.models[0].structure, work.scale, ca.MX.sym("t")
     z, p = ca.MX.sym("z", len(scale)), ca.MX.sym("p", s.p.numel())
@@ -134,22 +136,23 @@ def _cvodes(work: Work, tolerance: float) -> Solve:
     line = ca.interpolant("line", "linear", [work.times], work.voltage, {"lookup_mode": ["exact"]})
     given = ca.vertcat(line(t), 0.0)
     dae = {"x": z, "p": p, "t": t, "ode": slopes(t, z * scale, given, p) / scale}
-    options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 1_000_000}
-    solver = ca.integrator("solver", "cvodes", dae, 0.0, work.times[1:], options)
     values = [m.parameter_vector() for m in work.models]
     starts, place = work.starts / scale, work.models[0].state_names.index("x")
 
-    def solve() -> FloatArray:
-        rows = []
-        for x0, one in zip(starts, values, strict=True):
-            found = solver(x0=x0, p=one)["xf"].full()[place]
-            rows.append(scale[place] * np.concatenate([x0[place : place + 1], found]))
-        return np.array(rows)
+    def at(tolerance: float) -> Solve:
+        options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 1_000_000}
+        solver = ca.integrator("solver", "cvodes", dae, 0.0, work.times[1:], options)
 
-    return solve
+        def one(x0: FloatArray, p: FloatArray) -> FloatArray:
+            found = solver(x0=x0, p=p)["xf"].full()[place]
+            return np.asarray(scale[place] * np.concatenate([x0[place : place + 1], found]))
+
+        return lambda: np.array([one(x0, p) for x0, p in zip(starts, values, strict=True)])
+
+    return at
 
 
-def _diffrax(work: Work, tolerance: float) -> Solve:
+def _diffrax(work: Work) -> At:
     """Kvaerno5 (implicit: the mechanics are stiff), all sets in one `vmap`, compiled by XLA."""
     jax: Any = import_module("jax")
     dfx: Any = import_module("diffrax")
@@ -162,7 +165,7 @@ def _diffrax(work: Work, tolerance: float) -> Solve:
         k = jnp.clip((now / h).astype(int), 0, last)
         return jnp.stack(rates(p, v[k] + (now - k * h) * slope[k], z * scale, jnp)) / scale
 
-    def one(x0: Any, p: Any) -> Any:
+    def one(x0: Any, p: Any, tolerance: Any) -> Any:
         return dfx.diffeqsolve(
             dfx.ODETerm(field), dfx.Kvaerno5(), 0.0, times[-1], h, x0 / scale, p,
             saveat=dfx.SaveAt(ts=times, fn=lambda _, z, __: z[5] * scale[5]),
@@ -172,8 +175,8 @@ def _diffrax(work: Work, tolerance: float) -> Solve:
 
     every = {n: jnp.array([m.values[n] for m in work.models]) for n in work.models[0].values}
     starts = jnp.asarray(work.starts)
-    compiled = jax.jit(jax.vmap(one)).lower(starts, every).compile()
-    return lambda: np.asarray(compiled(starts, every))
+    many = jax.jit(jax.vmap(one, (0, 0, None))).lower(starts, every, 1.0).compile()
+    return lambda tolerance: lambda: np.asarray(many(starts, every, tolerance))
 
 
 def peers() -> tuple[tuple[Peer, ...], str]:
