@@ -157,12 +157,7 @@ def _histories(
 def _read_off(
     fit: Fit, experiments: Sequence[Experiment], known: Sequence[dict[str, float]]
 ) -> list[tuple[dict[str, float], ...]]:
-    """The beat of each record's residual, at rest where a record has none; nothing if none has.
-
-    Nothing either where a record is held out as a whole: it may not tell its own beat.
-    """
-    if any(e.held_out_whole for e in experiments):
-        return []
+    """The beat of each record's residual, at rest where a record has none; nothing if none has."""
     beats = residual_beats(fit, experiments)
     if not any(beats):
         return []
