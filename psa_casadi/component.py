@@ -20,8 +20,6 @@ SPECTRAL_PEAKS = "spectral_peaks"
 DISPLACEMENT_PEAKS = "displacement_peaks"
 #: The same for the places at which the residual jumps over the displacement, in m.
 DISPLACEMENT_STEPS = "displacement_steps"
-#: Starts that are read off a residual: phase and rate of a sawtooth in its local delay.
-DELAY_BEATS = "delay_beats"
 #: Probe value that stands for the duration of the longest record, in s.
 RECORD_DURATION = "record_duration"
 #: Those that are read off a residual.
@@ -152,7 +150,6 @@ class Component:
     curve: str | None = None
     measured_by: str | None = None
     needs_column: tuple[str, ...] = ()
-    starts_from: str = ""
     more_of: str | None = None
     count: int = 1
     sampled: tuple[State, ...] = ()
@@ -164,15 +161,7 @@ class Component:
     @property
     def from_residual(self) -> bool:
         """Whether trial values are read off a residual, so that another one has other ones."""
-        return bool(self.starts_from) or any(g in READ_OFF for g in self.probe.values())
-
-    @property
-    def is_no_form(self) -> bool:
-        """Whether it cannot stand for what the form of another effect misses.
-
-        It jumps at times at which the voltage does nothing, and is tried only where that is clear.
-        """
-        return self.starts_from == DELAY_BEATS
+        return any(grid in READ_OFF for grid in self.probe.values())
 
     @property
     def in_plant(self) -> bool:

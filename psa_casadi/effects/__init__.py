@@ -27,7 +27,6 @@ from psa_casadi.effects.sensor_ripple import SENSOR_RIPPLE
 from psa_casadi.effects.slow_creep import SLOW_CREEP
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.effects.temperature import TEMPERATURE
-from psa_casadi.effects.unsynchronised_sampling import UNSYNCHRONISED_SAMPLING
 from psa_casadi.effects.voltage_saturation import VOLTAGE_SATURATION
 
 EFFECTS: dict[str, Component] = {
@@ -57,7 +56,6 @@ EFFECTS: dict[str, Component] = {
         SENSOR_NONLINEARITY,
         SENSOR_RIPPLE,
         SENSOR_JUMP,
-        UNSYNCHRONISED_SAMPLING,
         OFFSET_DRIFT,
         MAINS_HUM,
         TEMPERATURE,

@@ -14,7 +14,6 @@ from psa_casadi.component import (
     SPECTRAL_PEAKS,
     Component,
 )
-from psa_casadi.diagnosis.screening.beats import residual_beats
 from psa_casadi.diagnosis.screening.peaks import (
     residual_jumps,
     residual_peaks,
@@ -139,8 +138,6 @@ def _histories(
 ) -> list[tuple[dict[str, float], ...]]:
     """The effect's memories at rest, and for settling ones also as after long cycling."""
     known = fit.starts()
-    if effect.starts_from:
-        return _read_off(fit, experiments, known)
     settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
     variants = [tuple(known)]
     if settling:
@@ -152,20 +149,6 @@ def _histories(
     if effect.trial_starts:
         return [tuple({**k, **trial} for k in known) for trial in effect.trial_starts]
     return variants
-
-
-def _read_off(
-    fit: Fit, experiments: Sequence[Experiment], known: Sequence[dict[str, float]]
-) -> list[tuple[dict[str, float], ...]]:
-    """The beat of each record's residual, at rest where a record has none; nothing if none has."""
-    beats = residual_beats(fit, experiments)
-    if not any(beats):
-        return []
-    seen = [
-        {"beat_phase": b.phase, "beat_rate": b.rate} if b else {"beat_phase": 0.0, "beat_rate": 0.0}
-        for b in beats
-    ]
-    return [tuple({**k, **beat} for k, beat in zip(known, seen, strict=True))]
 
 
 @dataclass(frozen=True, eq=False)

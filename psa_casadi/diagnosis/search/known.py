@@ -236,7 +236,6 @@ class Known:
                 return False
             if (
                 before.causes
-                and not cause.is_no_form
                 and "form" not in out
                 and h.share(before, root) <= thresholds().further
             ):
