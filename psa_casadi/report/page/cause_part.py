@@ -1,6 +1,6 @@
 """The part of a page that says why a cause was named: evidence, signature beside the data."""
 
-from psa_casadi.any_model.result import OdeDiagnosis
+from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.diagnosis.residual.signature import Signature, signature
 from psa_casadi.diagnosis.result import Cause, Diagnosis
@@ -53,6 +53,13 @@ def add_evidence_of_all(
     )
 
 
+def add_rivals(page: Document, cause: Cause | PortCause) -> None:
+    """Say what a named cause cannot be told from, if there is anything."""
+    if cause.cannot_be_told_from:
+        rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
+        page.paragraph(f"These data cannot distinguish it from {rivals}.")
+
+
 def add_causes(page: Document, d: Diagnosis) -> None:
     """Add the named causes with confidence, size, and what each cannot be told from."""
     if not d.causes:
@@ -64,9 +71,7 @@ def add_causes(page: Document, d: Diagnosis) -> None:
             f"Confidence {percent(cause.confidence)}. "
             f"Found, with 95 % intervals of parameters: {cause_size(d, cause)}."
         )
-        if cause.cannot_be_told_from:
-            rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
-            page.paragraph(f"These data cannot distinguish it from {rivals}.")
+        add_rivals(page, cause)
         for a in d.alternatives:
             if a.cause == cause.effect:
                 said = alternative_sentence(d, a)

@@ -10,9 +10,7 @@ from psa_casadi.report.page.cause_part import add_causes, add_evidence
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import add_live, live_diagnosis
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
-from psa_casadi.report.page.packed import Picture
-from psa_casadi.report.page.record_part import add_records, add_still, points_each
-from psa_casadi.report.plots.residual_plots import time_plot
+from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.words.phrases import (
     OWN_VOLTAGES,
     VERDICTS,
@@ -60,8 +58,7 @@ def write_report(
     counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
     with one_unit(length_scale(d.base_errors.holdout_rms_m, counts=counts)):
         page.paragraph(verdict_sentence(d), "verdict")
-        add_still(page, most_telling(series), origin)
-        _picture(page, series, origin)
+        add_worst(page, series, origin)
         page.tiles(_tiles(d))
         add_budget(page, d)
         if live is not None:
@@ -82,16 +79,6 @@ def _badges(d: Diagnosis, origin: str) -> list[str]:
     sure = d.causes[:1] if d.verdict != "ambiguous" else ()
     badges = [f"confidence {percent(c.confidence)}" for c in sure]
     return [*badges, f"{origin} data", f"{count} record{'s' if count > 1 else ''}"]
-
-
-def _picture(page: Document, series: Sequence[Series], origin: str) -> None:
-    """Add the record that the base model misses most: curves above, residual below."""
-    s = most_telling(series)
-    curves = listing([origin, *(c.label for c in s.curves)])
-    noise = "Below: the residual; dashed: two standard deviations of the noise."
-    shaded = " Shaded: held out." if s.held_out.any() else ""
-    plot = time_plot(s, origin, points_each(len(series)))
-    page.picture(Picture(f"{s.name}: {curves}", plot, f"{noise}{shaded}"))
 
 
 def _tiles(d: Diagnosis) -> list[tuple[str, str, str]]:

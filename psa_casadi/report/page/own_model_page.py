@@ -7,12 +7,11 @@ from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.component import Component
 from psa_casadi.files import atomic_write
-from psa_casadi.report.page.cause_part import add_evidence_of_all
+from psa_casadi.report.page.cause_part import add_evidence_of_all, add_rivals
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
-from psa_casadi.report.page.record_part import add_records, add_still, points_each
+from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.plots.patch_plot import free_plot
-from psa_casadi.report.plots.residual_plots import time_plot
 from psa_casadi.report.words.fit_words import whiteness_sentence
 from psa_casadi.report.words.own_series import own_fit_series, own_series
 from psa_casadi.report.words.own_words import (
@@ -28,7 +27,6 @@ from psa_casadi.report.words.own_words import (
 from psa_casadi.report.words.phrases import (
     VERDICTS,
     added,
-    listing,
     percent,
     plain,
     rest_sentence,
@@ -66,7 +64,7 @@ def _page(d: OdeDiagnosis) -> str:
         f"Diagnosis of {plain(d.model.name)}: {VERDICTS[d.verdict]}", [*badges, *_badges(d.runs)]
     )
     page.paragraph(own_verdict_sentence(d), "verdict")
-    _picture(page, series)
+    add_worst(page, series, _ORIGIN)
     page.tiles(_tiles(d))
     _budget(page, d)
     _missed(page, d, series)
@@ -94,17 +92,6 @@ def _page(d: OdeDiagnosis) -> str:
 
 def _badges(runs: Sequence[object]) -> list[str]:
     return [f"{_ORIGIN} data", f"{len(runs)} record{'s' if len(runs) > 1 else ''}"]
-
-
-def _picture(page: Document, series: Sequence[Series]) -> None:
-    """Add the output that the first model misses most: curves above, residual below."""
-    s = most_telling(series)
-    add_still(page, s, _ORIGIN)
-    curves = listing([_ORIGIN, *(c.label for c in s.curves)])
-    noise = "Below: the residual; dashed: two standard deviations of the noise."
-    shaded = " Shaded: held out." if s.held_out.any() else ""
-    plot = time_plot(s, _ORIGIN, points_each(len(series)))
-    page.picture(Picture(f"{s.name}: {curves}", plot, f"{noise}{shaded}"))
 
 
 def _tiles(d: OdeDiagnosis) -> list[tuple[str, str, str]]:
@@ -167,9 +154,7 @@ def _causes(page: Document, d: OdeDiagnosis) -> None:
         )
         _law(page, d, cause)
         page.table(parameter_table(d.model, only=cause.parameters))
-        if cause.cannot_be_told_from:
-            rivals = listing([plain(n) for n in cause.cannot_be_told_from], "or")
-            page.paragraph(f"These data cannot distinguish it from {rivals}.")
+        add_rivals(page, cause)
 
 
 def _law(page: Document, d: OdeDiagnosis, cause: PortCause) -> None:
@@ -182,7 +167,7 @@ def _fit_page(found: OdeIdentification) -> str:
     series = own_fit_series(found)
     page = Document(f"Identification of {plain(found.model.name)}", _badges(found.runs))
     page.paragraph(own_fit_sentence(found), "verdict")
-    _picture(page, series)
+    add_worst(page, series, _ORIGIN)
     page.warnings(found.warnings)
     page.section("Parameters")
     page.table(parameter_table(found.model))

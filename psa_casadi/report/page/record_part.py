@@ -15,8 +15,9 @@ from psa_casadi.report.plots.residual_plots import (
     zoom_plot,
 )
 from psa_casadi.report.words.fit_words import residual_sentence
+from psa_casadi.report.words.phrases import listing
 from psa_casadi.report.words.residuals import ResidualFigures
-from psa_casadi.report.words.series import Series
+from psa_casadi.report.words.series import Series, most_telling
 
 #: Samples of all records that may be drawn together: with all their curves about 0.5 MB of text.
 _MOST_POINTS = 13_000
@@ -46,6 +47,17 @@ def add_records(
         )
     for k in shown:
         _add(page, series[k], figures[k], origin, points_each(len(shown)), above)
+
+
+def add_worst(page: Document, series: Sequence[Series], origin: str) -> None:
+    """Add the record that the first model misses most: curves above, residual below."""
+    s = most_telling(series)
+    add_still(page, s, origin)
+    curves = listing([origin, *(c.label for c in s.curves)])
+    noise = "Below: the residual; dashed: two standard deviations of the noise."
+    shaded = " Shaded: held out." if s.held_out.any() else ""
+    plot = time_plot(s, origin, points_each(len(series)))
+    page.picture(Picture(f"{s.name}: {curves}", plot, f"{noise}{shaded}"))
 
 
 def add_still(page: Document, shown: Series, origin: str) -> None:

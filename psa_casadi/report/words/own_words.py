@@ -9,11 +9,13 @@ from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
 from psa_casadi.report.words.budget_words import share_percent
 from psa_casadi.report.words.phrases import (
     listing,
+    naming_sentence,
     number,
     percent,
     plain,
     prefixed_scale,
     with_unit,
+    within,
 )
 from psa_casadi.report.words.series import FloatArray, Series
 from psa_casadi.report.words.tables import Table
@@ -30,7 +32,7 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
         free = d.correction
         words = ""
         if free is not None:
-            share = percent(min(1.0, free.share))
+            share = percent(within(free.share))
             words = (
                 f"a free function of {free.of} in {free.port} would remove {share} of the error"
                 " above the noise; "
@@ -39,20 +41,7 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
             "Something is missing, and no effect in the table explains it: no cause is named;"
             f" {words}{_base_errors(d)}."
         )
-    causes = listing([_cause(c) for c in d.causes])
-    if d.verdict == "ambiguous":
-        first = d.causes[0]
-        rivals = listing([plain(n) for n in (first.effect, *first.cannot_be_told_from)], "or")
-        together = listing([plain(c.effect) for c in d.causes])
-        return (
-            f"Something is missing, and these data do not decide whether it is {rivals}; with"
-            f" {together}, {own_gain(d)}."
-        )
-    are = "cause is" if len(d.causes) == 1 else "causes are"
-    if d.verdict == "partly_explained":
-        of = f" ({percent(_within(d.explained_share))} of its power above the noise)"
-        return f"The closest known {are} {causes}: {own_gain(d)}{of}; more than noise remains."
-    return f"The {are} {causes}: {own_gain(d)}."
+    return naming_sentence(d, [_cause(c) for c in d.causes], own_gain(d), d.explained_share)
 
 
 def own_gain(d: OdeDiagnosis) -> str:
@@ -97,20 +86,16 @@ def _cause(c: PortCause) -> str:
     return f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
 
 
-def _within(share: float) -> float:
-    return min(max(share, 0.0), 1.0)
-
-
 def own_budget_table(d: OdeDiagnosis) -> Table:
     """Return the shares of the base model's held-out error above the noise."""
     rows = [(plain(c.effect), share_percent(c.explained_share)) for c in d.causes]
     if len(rows) > 1:
-        rows.append(("all causes together", share_percent(_within(d.explained_share))))
+        rows.append(("all causes together", share_percent(within(d.explained_share))))
     if d.correction is not None:
         free = d.correction
         what = f"unnamed: a free function of {free.of} in {free.port}"
-        rows.append((what, share_percent(_within(free.share))))
-    rows.append(("remains above the noise", share_percent(_within(1.0 - d.explained_share))))
+        rows.append((what, share_percent(within(free.share))))
+    rows.append(("remains above the noise", share_percent(within(1.0 - d.explained_share))))
     return Table(("what", "removes"), tuple(rows))
 
 

@@ -244,28 +244,42 @@ def verdict_sentence(d: Diagnosis) -> str:
             "Something is missing, and no effect in the table explains it: no cause is named; "
             f"{_unnamed(d)}{error}."
         )
-    causes = listing([_cause(c) for c in d.causes])
+    share = None if d.budget is None else d.budget.together.share
+    return naming_sentence(d, [_cause(c) for c in d.causes], gain_sentence(d), share)
+
+
+def naming_sentence(
+    d: "Diagnosis | OdeDiagnosis", causes: Sequence[str], gain: str, share: float | None
+) -> str:
+    """Say the verdict of a diagnosis that names: its `causes` in words, and what they remove.
+
+    `gain` is what they do to the error, `share` what they remove of its power above the noise.
+    """
     if d.verdict == "ambiguous":
         first = d.causes[0]
-        rivals = [plain(n) for n in (first.effect, *first.cannot_be_told_from)]
+        rivals = listing([plain(n) for n in (first.effect, *first.cannot_be_told_from)], "or")
         together = listing([plain(c.effect) for c in d.causes])
         return (
-            f"Something is missing, and these data do not decide whether it is"
-            f" {listing(rivals, 'or')}; with {together}, {gain_sentence(d)}."
+            f"Something is missing, and these data do not decide whether it is {rivals}; with"
+            f" {together}, {gain}."
         )
-    are = "cause is" if len(d.causes) == 1 else "causes are"
+    are = f"{'cause is' if len(causes) == 1 else 'causes are'} {listing(causes)}"
     if d.verdict == "partly_explained":
-        share = "" if d.budget is None else percent(max(0.0, min(1.0, d.budget.together.share)))
-        of = f" ({share} of its power above the noise)" if share else ""
-        return f"The closest known {are} {causes}: {gain_sentence(d)}{of}; more than noise remains."
-    return f"The {are} {causes}: {gain_sentence(d)}."
+        of = "" if share is None else f" ({percent(within(share))} of its power above the noise)"
+        return f"The closest known {are}: {gain}{of}; more than noise remains."
+    return f"The {are}: {gain}."
+
+
+def within(share: float) -> float:
+    """Return a share as it is shown, from 0 to 1."""
+    return max(0.0, min(1.0, share))
 
 
 def _unnamed(d: Diagnosis) -> str:
     """Say what the unnamed correction would remove, "" without one."""
     if d.patch is None or d.budget is None or d.budget.unnamed is None:
         return ""
-    share = percent(max(0.0, min(1.0, d.budget.unnamed.share)))
+    share = percent(within(d.budget.unnamed.share))
     return f"{d.patch.sentence} would remove {share} of the error above the noise; "
 
 
