@@ -7,6 +7,7 @@ side; what a command says is shown when it has ended. A comment on its own line 
 changes that:
 
     <!-- run: skip -->        the block is not run (installation, for example)
+    <!-- run: in-tests -->    the block is run by a test, which looks at what it leaves besides
     <!-- run: needs-data -->  the block runs where the measured records are, in $PSA_CASADI_DATA
     <!-- run: continue -->    the block runs in the directory of the block before it
     <!-- run: python -->      the block is marked `python` and runs as a program
@@ -26,7 +27,7 @@ from pathlib import Path
 
 from build_scripts.measured_data import ROOT, measured_data_directory, must_be_present
 
-MARKS = ("skip", "needs-data", "continue", "python")
+MARKS = ("skip", "in-tests", "needs-data", "continue", "python")
 LIMIT_S = 900
 #: Blocks that run side by side; those that need the measured records are the longest by far.
 AT_ONCE = 2
@@ -138,7 +139,7 @@ def chains_of(blocks: Sequence[Block]) -> list[list[Block]]:
     """Return the blocks to run, those together that share a directory."""
     chains: list[list[Block]] = []
     for block in blocks:
-        if "skip" in block.marks or not block.commands:
+        if block.marks & {"skip", "in-tests"} or not block.commands:
             continue
         if "continue" in block.marks and chains:
             chains[-1].append(block)
@@ -174,15 +175,20 @@ def pages() -> list[Path]:
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
+def blocks_of(page: Path) -> tuple[Block, ...]:
+    """Return the blocks of a page of the project."""
+    return find_blocks(page.read_text(encoding="utf-8"), page.relative_to(ROOT).as_posix())
+
+
+def block_in_tests(page: str) -> Block:
+    """Return the one block of a page that a test runs; raises ValueError without one, or of two."""
+    (block,) = (b for b in blocks_of(ROOT / page) if "in-tests" in b.marks)
+    return block
+
+
 def main() -> int:
     """Run the commands of all pages; return 1 if any failed or README.md has none."""
-    blocks = [
-        block
-        for page in pages()
-        for block in find_blocks(
-            page.read_text(encoding="utf-8"), page.relative_to(ROOT).as_posix()
-        )
-    ]
+    blocks = [block for page in pages() for block in blocks_of(page)]
     if not any(block.commands for block in blocks if block.page == "README.md"):
         print("README.md shows no command: mark blocks of commands as ```console.")
         return 1

@@ -58,6 +58,12 @@ def code_runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("psa_casadi.export.check.check.started", started_here)
 
 
+@pytest.fixture
+def without_binary(monkeypatch: pytest.MonkeyPatch) -> None:
+    """FMUs are written without their binary, for tests that read the files beside it."""
+    monkeypatch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
+
+
 @pytest.fixture(scope="session")
 def measured_data() -> Path:
     """Directory of the measured records; without them the test is skipped, in CI it fails."""

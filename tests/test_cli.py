@@ -1,6 +1,7 @@
 import json
 import re
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import fmpy
@@ -9,16 +10,20 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import psa_casadi
+from build_scripts.page_commands import block_in_tests, run_block
 from psa_casadi.cli.app import app
 from psa_casadi.cli.demo import FILES
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import load_model, save_model
 from psa_casadi.records import multisine, read_record, time_grid, write_record
+from psa_casadi.records.split import whole
 from psa_casadi.report.words.text import identification_text
 from psa_casadi.simulation.simulate import simulate_record
 from tests.html_page import Page, figures
+from tests.identified_plants import same_as_the_named_stack
 from tests.test_report import png_size
 from tests.test_schemas import valid
 
@@ -158,6 +163,22 @@ def test_the_demos_fmu_is_valid_and_can_be_checked_again(demo: Demo) -> None:
     assert "did not pass" in other.stdout
 
 
+def test_the_commands_of_the_page_go_on_from_the_demo(demo: Demo) -> None:
+    block = block_in_tests("docs/fmu.md")
+    begin, *rest = block.commands
+    assert shlex.split(begin) == ["psa", "demo"]
+    assert demo.directory.name == "psa_demo"
+    assert run_block(replace(block, commands=tuple(rest)), demo.directory.parent) is None
+
+
+def test_the_demos_stack_is_what_its_record_gives(demo: Demo) -> None:
+    record = read_record(demo.directory / "synthetic_record.csv")
+    found = load_model(demo.directory / "model.json")
+    sigma = [1e-3 * record.range_m]
+    rms = fit(found, [whole(record)], [], sigma=sigma).rms
+    same_as_the_named_stack(rms, record, "demo")
+
+
 def test_identify_starts_from_a_model_and_writes_its_page(demo: Demo, tmp_path: Path) -> None:
     model, page = tmp_path / "m.json", tmp_path / "fit.html"
     record = demo.directory / "synthetic_record.csv"
@@ -231,6 +252,7 @@ def test_simulate_writes_every_output_with_its_unit(
     np.testing.assert_allclose(values[:, names.index("displacement")], 1e6 * expected, rtol=1e-12)
 
 
+@pytest.mark.usefixtures("without_binary")
 def test_export_leaves_the_sensor_out_unless_asked(
     planned: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -25,7 +25,7 @@ from psa_casadi.model.model_file import loads
 from psa_casadi.simulation.compiler import run_compiler, zig_command
 from psa_casadi.variables import Output
 from tests.fmu_models import exported, model_named
-from tests.tiers import slow, slow_but
+from tests.tiers import slow_but
 
 STACK = "P-885.51"
 
@@ -50,7 +50,7 @@ def test_token_follows_the_model() -> None:
 COMPILERS = {"gcc": ["gcc"], "zig": [*zig_command(), "-target", "x86_64-linux-gnu.2.17"]}
 
 
-@pytest.mark.parametrize("compiler", slow_but(["zig"], COMPILERS))
+@pytest.mark.parametrize("compiler", slow_but(["gcc"], COMPILERS))
 @pytest.mark.parametrize("name", slow_but(["flexure"], ["slow_creep", "flexure"]))
 def test_sources_compile_alone_without_warnings(compiler: str, name: str, tmp_path: Path) -> None:
     if not shutil.which(COMPILERS[compiler][0]):
@@ -87,7 +87,7 @@ def test_model_is_inside() -> None:
     assert inside.output_names == plant.output_names
 
 
-@slow
+@pytest.mark.usefixtures("without_binary")
 def test_sensor_stays_out_unless_wanted(tmp_path: Path) -> None:
     model = compose((*BASE, EFFECTS["sensor_delay"], EFFECTS["offset_drift"]))
     plain = fmpy.read_model_description(str(export_fmu(model, tmp_path / "plant.fmu")))

@@ -7,36 +7,29 @@ import pytest
 
 from psa_casadi import reference
 from psa_casadi.components import BASE
-from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.search import refitting
 from psa_casadi.identification.search.refitting import refit_or_keep
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, multisine, read_record, time_grid
-from psa_casadi.records.split import whole
 from psa_casadi.simulation.stepper import SimulationError
 from tests.identified_plants import (
-    FloatArray,
     combinations,
     identified,
     noise,
     plant,
+    same_as_the_named_stack,
     standard_errors,
     values_of,
 )
 from tests.tiers import slow, slow_but
 
 SEEDS = (2, 3, 4, 5)
-DEMO = Path(__file__).parent.parent / "psa_casadi" / "data" / "demo.csv"
 #: Largest relative error of each combination; the asymmetry is a small part of these loops.
 TOLERANCE = {"slope": 2e-3, "width": 5e-3, "asymmetry": 0.5, "n": 1e-2, "lag": 1e-2}
 
 pytestmark = pytest.mark.xdist_group("identification")
-
-#: What `psa identify` finds for a named stack with a record of its own.
-IDENTIFIED = ("k_L", "A", "beta", "gamma", "n", "tau", "delta", "R_s", "c_P", "c_B")
 
 
 @pytest.mark.parametrize("seed", slow_but(SEEDS[:1], SEEDS))
@@ -209,27 +202,3 @@ def test_the_micromanipulator_is_met_within_its_floors(
     assert 100.0 * found.fit.rms / r.range_m <= limit
     if record == "minor_loops":
         same_as_the_named_stack(found.fit.rms, r, "micromanipulator")
-
-
-@slow
-def test_the_stack_of_the_demonstration_is_what_its_record_gives() -> None:
-    record = read_record(DEMO)
-    same_as_the_named_stack(identify([record]).fit.rms, record, "demo")
-
-
-def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
-    """The named stack meets its record as well as any values of what was identified for it.
-
-    A search from nothing is at least as good. It may be better: it frees masses besides, and in the
-    demonstration's record, half as far off, it takes the hidden creep for a lag of the wafers, with
-    c_P on its bound, which it says. Offset and memory are fitted.
-    """
-    model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
-    y: FloatArray = np.asarray(record.displacement)
-    found = fit(model, [whole(record)], [], sigma=[rms])
-    again = fit(model, [whole(record)], IDENTIFIED, sigma=[rms])
-    assert found.rms == pytest.approx(again.rms, rel=1e-3)
-    assert rms < 1.001 * found.rms
-    x, _, _ = predict_record(model, record, found.start(0), [],
-                             stop=record.n, rtol=1e-8)  # fmt: skip
-    assert np.std(x - y) == pytest.approx(found.rms, rel=2e-3)

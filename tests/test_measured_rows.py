@@ -1,18 +1,21 @@
 """The rows of docs/measured.md on the measured micromanipulator are what a diagnosis says of it."""
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from build_scripts.page_commands import block_in_tests, run_block
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.records import read_record
 
 PAGE = Path(__file__).parent.parent / "docs" / "measured.md"
 JUDGED = "`minor_loops.csv`, judged on `sine_1hz.csv` (`--holdout`)"
-FILES = {"`sine_1hz.csv`": ("sine_1hz",), "`minor_loops.csv`": ("minor_loops",),
-         "both files": ("sine_1hz", "minor_loops"), JUDGED: ("minor_loops",)}  # fmt: skip
+FILES = {"`sine_1hz.csv`": ("sine_1hz",), "both files": ("sine_1hz", "minor_loops"),
+         JUDGED: ("minor_loops",)}  # fmt: skip
 HELD_OUT = {JUDGED: ("sine_1hz",)}
 
 
@@ -35,25 +38,38 @@ def within(value: float, cell: str) -> bool:
     return low - 0.01 <= value <= high + 0.01
 
 
+def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
+    """Hold a diagnosis, as its JSON has it, against a row of the page."""
+    base, extended, said = rows()[given]
+    assert said.startswith(f"`{d['verdict']}`")
+    named = {n for c in d["causes"] for n in (c["effect"], *c["cannot_be_told_from"])}
+    written = set(re.findall(r"`([a-z_]+)`", said)) & set(EFFECTS)
+    assert written <= named
+    if "third effect" not in said:
+        assert {c["effect"] for c in d["causes"]} <= written
+    assert not named & {b["effect"] for b in d["blind_to"]}
+    withdrawn = [n for n in d["notes"] if "not named, because" in n]
+    assert bool(withdrawn) == (d["verdict"] == "unexplained")
+    errors = [d["errors"][model]["holdout_nrmse_percent"] for model in ("base", "extended")]
+    assert within(errors[0], base)
+    assert within(errors[1], base if extended == "the same" else extended)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("given", FILES)
 def test_the_measured_row_is_played_again(given: str, measured_data: Path) -> None:
-    base, extended, said = rows()[given]
     records, held_out = (
         [read_record(measured_data / "micromanipulator" / f"{name}.csv") for name in names]
         for names in (FILES[given], HELD_OUT.get(given, ()))
     )
-    d = diagnose(records, holdout=held_out)
-    assert said.startswith(f"`{d.verdict}`")
-    named = {n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)}
-    written = set(re.findall(r"`([a-z_]+)`", said)) & set(EFFECTS)
-    assert written <= named
-    if "third effect" not in said:
-        assert {c.effect for c in d.causes} <= written
-    assert not named & {b.effect for b in d.blind_to}
-    withdrawn = [n for n in d.notes if "not named, because" in n]
-    assert bool(withdrawn) == (d.verdict == "unexplained")
-    assert within(d.base_errors.holdout_nrmse_percent, base)
-    assert within(
-        d.extended_errors.holdout_nrmse_percent, base if extended == "the same" else extended
-    )
+    is_what_the_row_says(json.loads(diagnose(records, holdout=held_out).to_json()), given)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("measured_data")
+def test_the_commands_of_the_readme_give_the_row_of_their_record(tmp_path: Path) -> None:
+    block = block_in_tests("README.md")
+    assert any("records/minor_loops.csv" in command for command in block.commands)
+    assert run_block(block, tmp_path) is None
+    told = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
+    is_what_the_row_says(told, "`minor_loops.csv`")

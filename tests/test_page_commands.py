@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from build_scripts.measured_data import ROOT
-from build_scripts.page_commands import Block, find_blocks, pages, run_blocks
+from build_scripts.page_commands import Block, blocks_of, find_blocks, pages, run_blocks
 from psa_casadi.effects import EFFECTS
 
 TEXT = """
@@ -37,6 +37,10 @@ $ grep one file
 """
 
 
+#: The pages whose one block a test runs: `tests/test_measured_rows.py` and `tests/test_cli.py`.
+IN_TESTS = ["README.md", "docs/fmu.md"]
+
+
 def run_text(text: str) -> list[str]:
     return run_blocks(find_blocks(text))
 
@@ -63,6 +67,15 @@ def test_a_program_runs_where_it_is_marked() -> None:
     (failure,) = run_text(text.format(marks, 4))
     assert "line 6" in failure
     assert "ended with exit code 1" in failure
+
+
+def test_a_block_that_a_test_runs_is_left_to_it() -> None:
+    assert run_text(TEXT.replace("run: skip", "run: in-tests")) == []
+    assert [b.page for p in pages() for b in blocks_of(p) if "in-tests" in b.marks] == IN_TESTS
+    used = "".join(
+        (ROOT / "tests" / f"{n}.py").read_text() for n in ("test_cli", "test_measured_rows")
+    )
+    assert all(f'block_in_tests("{page}")' in used for page in IN_TESTS)
 
 
 def test_a_command_that_fails_is_named_with_its_line() -> None:

@@ -102,9 +102,9 @@ def test_a_modelica_package_states_them() -> None:
     assert "author: A. Author; version: 1.2; copyright: (c) 2026 A. Author &amp; sons" in text
 
 
-def test_a_system_and_its_parts_state_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("without_binary")
+def test_a_system_and_its_parts_state_them(tmp_path: Path) -> None:
     """A part that states its own keeps it."""
-    monkeypatch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
     own = replace(model_named("flexure"), publication=Publication(author="another"))
     system = System("pair", {"one": own, "two": model_named("flexure")}, (),
                     {"push": "one.tip_position"}, {"out": "two.stage_position"})  # fmt: skip
