@@ -19,6 +19,9 @@ EXTRAS = {
     extra: [Requirement(text) for text in texts]
     for extra, texts in PROJECT["optional-dependencies"].items()
 }
+#: The package is parsed once: with pytest-xdist by one process.
+pytestmark = pytest.mark.xdist_group("dependencies")
+
 #: The parts of a statement that hold statements.
 _PARTS = ("body", "orelse", "finalbody", "handlers", "cases")
 #: The extras that a file format needs.

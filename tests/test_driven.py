@@ -1,6 +1,7 @@
 """Records whose displacement does not follow the voltage, with another sign or unit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,15 @@ from scipy.signal import lfilter
 
 from psa_casadi.cli.diagnose import _write_patch
 from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.driven import filtered
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import write_record
 from psa_casadi.records.record import Record
+from psa_casadi.records.split import split
 from psa_casadi.report.words.text import story
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
@@ -75,7 +79,7 @@ def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArr
         )
 
 
-def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
+def _modes() -> Record:
     """Five light modes of either sign behind a delay, sampled too slowly for a stack's own."""
     time: FloatArray = np.arange(2000) / 500.0
     voltage = 50.0 + 20.0 * np.sin(2 * np.pi * (2.0 * time + 18.5 * time**2))
@@ -86,7 +90,20 @@ def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
         y += lfilter([size * (1.0 - abs(pole))], [1.0, -2 * pole.real, abs(pole) ** 2], late)
     y *= 1e-5 / np.std(y)
     y += 1e-7 * np.random.default_rng(3).standard_normal(time.size)
-    found = diagnose([Record(name="r", time=time, voltage=voltage, displacement=y)], effects=TABLE)
+    return Record(name="r", time=time, voltage=voltage, displacement=y)
+
+
+def test_a_linear_filter_of_the_voltage_is_told_from_what_has_nothing_to_do_with_it() -> None:
+    modes = _modes()
+    noise = np.random.default_rng(4).standard_normal(modes.n)
+    shares = [filtered([split(r)]) for r in (modes, replace(modes, displacement=noise))]
+    assert shares[0] > thresholds().follows
+    assert abs(shares[1]) < 0.1
+
+
+@slow
+def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
+    found = diagnose([_modes()], effects=TABLE)
     assert found.verdict == "unexplained"
     assert any("A linear filter of the voltage explains" in n for n in found.notes)
     assert not any("of the same device" in n for n in found.notes)

@@ -24,6 +24,7 @@ from psa_casadi.records.split import Experiment, divided, whole
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
@@ -90,7 +91,9 @@ def test_without_the_whole_loop_free_each_parameter_is_its_own_coordinate() -> N
     np.testing.assert_allclose(unknowns.coordinates(values), theta[:3], rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("effects", [(), ("slow_creep", "rate_independent_asymmetry")])
+@pytest.mark.parametrize(
+    "effects", [(), pytest.param(("slow_creep", "rate_independent_asymmetry"), marks=slow)]
+)
 def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, ...]) -> None:
     """Two runs differ by up to 4e-7 of the range beside the step, for they step differently."""
     model = model_with(*effects)

@@ -22,6 +22,9 @@ from tests.fmu_models import assert_valid, model_named
 from tests.ssp_systems import archive_of, closed_loop, pushed_stage
 from tests.test_fmu_system import STACK
 
+#: Each archive is exported once: with pytest-xdist by one process.
+pytestmark = pytest.mark.xdist_group("ssp")
+
 _SCHEMAS = {
     ".ssd": "SystemStructureDescription.xsd",
     ".ssv": "SystemStructureParameterValues.xsd",
