@@ -1,7 +1,9 @@
 """Stacks that ring within a record's band, or just above it: the base must find that itself."""
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -129,16 +131,30 @@ def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     assert found is None or found.rms < 1.001 * lag.fit.rms
 
 
+@cache
+def _missed(seed: int, noise: NoiseKind) -> tuple[Truth, str, tuple[Experiment, ...], Fit]:
+    """A clean stack's truth, its file's text, its record and a base fit that misses a resonance."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "a.csv")
+        truth = make_record(None, seed, path, noise=noise)
+        record, text = read_record(path), path.read_text()
+    experiments = (split(record),)
+    return truth, text, experiments, fit_base(starting_model([record], None), experiments)
+
+
+#: Tests that share a fit run in one process.
+shares_missed = pytest.mark.xdist_group("missed resonance")
+
+
 @slow
+@shares_missed
 @pytest.mark.parametrize(("noise", "seed"), [("white", 112316), ("ar", 112437)])
 def test_ringing_above_the_band_shows_which_resonance_was_missed(
-    noise: NoiseKind, seed: int, tmp_path: Path
+    noise: NoiseKind, seed: int
 ) -> None:
     """1.26 kHz sampled at 0.5 kHz and 1.11 kHz at 0.8 kHz, both with a damping ratio of 0.04."""
-    truth = make_record(None, seed, tmp_path / "a.csv", noise=noise)
-    record = read_record(tmp_path / "a.csv")
-    experiments = (split(record),)
-    base = fit_base(starting_model([record], None), experiments)
+    truth, _, experiments, base = _missed(seed, noise)
+    record = experiments[0].record
     seen = ringing(base, experiments)
     assert seen is not None
     assert seen.decrease > 80.0
@@ -176,13 +192,11 @@ def test_a_missed_resonance_is_sought_before_a_second_cause(tmp_path: Path) -> N
 
 
 @slow
+@shares_missed
 def test_ringing_is_seen_across_missing_rows(tmp_path: Path) -> None:
-    make_record(None, 112437, tmp_path / "a.csv", noise="ar")
-    whole = read_record(tmp_path / "a.csv")
-    experiments = (split(whole),)
-    base = fit_base(starting_model([whole], None), experiments)
+    _, text, experiments, base = _missed(112437, "ar")
     seen = ringing(base, experiments)
-    rows = (tmp_path / "a.csv").read_text().splitlines()
+    rows = text.splitlines()
     (tmp_path / "b.csv").write_text("\n".join(rows[:1500] + rows[1503:4000] + rows[4001:]) + "\n")
     gaps = (split(read_record(tmp_path / "b.csv")),)
     again = fit_base(base.model, gaps)

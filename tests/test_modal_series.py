@@ -144,7 +144,8 @@ def test_several_modes_are_found_together_and_again_from_what_was_found() -> Non
     tones = np.array([v for n, v in values.items() if n.startswith("series_frequency")])
     for frequency, _, _ in HIDDEN:
         assert np.min(np.abs(tones / frequency - 1.0)) < 2e-3
-    again = psa.diagnose([shaken_stack(11)], model=found.model)
+    like = [psa.EFFECTS[n] for n in ("structural_mode", "drive_lag", "sensor_delay")]
+    again = psa.diagnose([shaken_stack(11)], model=found.model, effects=like)
     assert again.base_errors.holdout_nrmse_percent > 1.0
     assert [c.effect.startswith("modal_series") for c in again.causes] == [True]
 
