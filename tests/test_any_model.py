@@ -5,12 +5,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
 import psa_casadi as psa
+from build_scripts.page_commands import block_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.table import effects_of
 from psa_casadi.any_model.runs import runs_of
@@ -147,8 +149,17 @@ def test_the_extended_model_is_exported_like_any_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_dry_friction_of_a_motor_is_found_at_its_shaft() -> None:
-    d = psa.diagnose(motor(), plants.motor(1))
+def test_dry_friction_of_a_motor_is_found_at_its_shaft(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program of the page, whose plant has its own equations."""
+    monkeypatch.chdir(tmp_path)
+    (program,) = block_in_tests("docs/howto/own_model.md").commands
+    names: dict[str, Any] = {}
+    exec("\n".join(program.split("\n")[1:-1]), names)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["motor.html", "motor_with_friction.fmu"]
+    d = names["result"]
+    assert isinstance(d, psa.OdeDiagnosis)
     assert _only(d, "friction_in_speed")
     assert d.model.values["friction_in_speed_size"] == pytest.approx(0.012 / 3e-5, rel=0.02)
     for error, noise in zip(d.errors, (0.3, 0.005), strict=True):

@@ -37,8 +37,8 @@ $ grep one file
 """
 
 
-#: The pages whose one block a test runs: `tests/test_measured_rows.py` and `tests/test_cli.py`.
-IN_TESTS = ["README.md", "docs/fmu.md"]
+#: The pages whose one block a test runs.
+IN_TESTS = ["README.md", "docs/fmu.md", "docs/howto/own_model.md"]
 
 
 def run_text(text: str) -> list[str]:
@@ -72,9 +72,8 @@ def test_a_program_runs_where_it_is_marked() -> None:
 def test_a_block_that_a_test_runs_is_left_to_it() -> None:
     assert run_text(TEXT.replace("run: skip", "run: in-tests")) == []
     assert [b.page for p in pages() for b in blocks_of(p) if "in-tests" in b.marks] == IN_TESTS
-    used = "".join(
-        (ROOT / "tests" / f"{n}.py").read_text() for n in ("test_cli", "test_measured_rows")
-    )
+    files = ("test_any_model", "test_cli", "test_measured_rows")
+    used = "".join((ROOT / "tests" / f"{n}.py").read_text("utf-8") for n in files)
     assert all(f'block_in_tests("{page}")' in used for page in IN_TESTS)
 
 
