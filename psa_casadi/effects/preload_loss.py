@@ -3,7 +3,8 @@
 With a positive gain the output meets the spring at x_c and beyond, and below there is a gap. With a
 negative one the spring, which elsewhere stiffens k_B and scales k_L unseen, leaves it there: beyond
 x_c its stiffness is missing, -k max(0, x_c - x) being -k (x_c - x) - k max(0, x - x_c). The spring
-that is lost was part of the stack's stiffness, so that the gain stays above -1.
+that is lost was part of the stack's stiffness, so that the gain stays above -1. A guide that is
+stiffer on one side of a displacement than on the other bends the curve there in the same way.
 """
 
 import casadi as ca
@@ -25,7 +26,7 @@ def _equations(s: Symbols) -> Equations:
 
 PRELOAD_LOSS = Component(
     name="preload_loss",
-    description="a spring touches on one side of a certain displacement only",
+    description="a spring touches, or a guide changes its stiffness, at one displacement",
     source="unilateral contact (Signorini) with an elastic load: Johnson, Contact Mechanics, 1985",
     gain="contact_gain",
     equation_text=(
