@@ -48,11 +48,6 @@ class Budget:
     remains_rms_m: float
     remains_percent: float
 
-    @property
-    def remains_share(self) -> float:
-        """What the named causes leave above the noise, as a share of the base's excess power."""
-        return self.remains_rms_m**2 / max(self.excess_rms_m**2, 1e-300)
-
 
 @dataclass(frozen=True, eq=False)
 class Removed:

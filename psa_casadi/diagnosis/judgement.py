@@ -104,15 +104,13 @@ def rivals(probability: Mapping[str, float], cause: str) -> tuple[str, ...]:
     return tuple(name for name in within if name != cause)
 
 
-def too_small(causes: Sequence[Share], remains: float) -> tuple[Share, ...]:
+def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
     """Return causes that are not named where structure remains: the form of the others is wrong.
 
-    Each removes less of the base's excess than a form may miss, and its interval does not lie above
-    the share that `remains`: what only corrects a form leaves much of that. The largest is always
-    named.
+    Each removes less of the base's excess than a form may miss. The largest is always named.
     """
     least = least_share([c.share for c in causes])
-    return tuple(c for c in causes if c.share < least and c.interval[0] <= remains)
+    return tuple(c for c in causes if c.share < least)
 
 
 def least_share(shares: Collection[float]) -> float:

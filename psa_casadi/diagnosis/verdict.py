@@ -131,8 +131,7 @@ def conclude(
         stiffness_given,
         evidence=diagnosis_evidence(final.fit, found, experiments, final.predicted, spent),
     )
-    told = [c for c in spent.causes if c.what not in vague]
-    small = too_small(told, spent.remains_share) if partly else ()
+    small = too_small([c for c in spent.causes if c.what not in vague]) if partly else ()
     unnamed = {*vague, *(c.what for c in small)}
     causes = tuple(_cause(s, last.fit, found, spent) for s in named if s.cause.name not in unnamed)
     return Diagnosis(
