@@ -10,6 +10,7 @@ from tests.plants.hide import effect_called
 from tests.plants.make import Truth, write_csv
 from tests.plants.noise import disturb
 from tests.plants.same_device import in_terms_of
+from tests.plants.several import added_by
 from tests.plants.stack import FloatArray
 
 
@@ -30,10 +31,9 @@ def play_again(
     times, command = played or draw_excitation(rng, truth.excitation, truth.stack.u_rated)
     truth = in_terms_of(truth, times, command)
     run = simulate_base(truth.stack, times, command)
-    clean, temperature = run.displacement, None
-    for name, parameters, gain in truth.hidden:
-        effect = effect_called(name)
-        clean = clean + effect.contribution(run, parameters, gain)
+    effects = [(effect_called(name), p, gain) for name, p, gain in truth.hidden]
+    clean, temperature = run.displacement + added_by(run, effects), None
+    for effect, parameters, _ in effects:
         if effect.room is not None:
             temperature = effect.room(times, parameters)
     read, _ = disturb(rng, truth.noise, clean)

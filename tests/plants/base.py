@@ -50,13 +50,15 @@ class DrivePath:
 class Run:
     """One simulation of the base: all an effect needs to add itself.
 
-    times, command, displacement: (N,) at the samples [s, V, m]; path: the drive; force: (M,) f_L +
-    f_H [N]; fine_displacement: (M,) [m]; sub_intervals: m.
+    times, command, displacement: (N,) at the samples [s, V, m]; fine_command: (M,) what drives the
+    stack [V]; path: the drive; force: (M,) f_L + f_H [N]; fine_displacement: (M,) [m];
+    sub_intervals: m.
     """
 
     stack: Stack
     times: FloatArray
     command: FloatArray
+    fine_command: FloatArray
     path: DrivePath
     force: FloatArray
     fine_displacement: FloatArray
@@ -84,7 +86,7 @@ def simulate_base(
     displacement = elastic_displacement(stack, fine_command, step)
     displacement = displacement + force_to_displacement(stack, hysteresis, step)
     force = stack.k_l * path.voltage + hysteresis
-    return Run(stack, times, command, path, force, displacement, sub_intervals)
+    return Run(stack, times, command, fine_command, path, force, displacement, sub_intervals)
 
 
 def refine(

@@ -16,7 +16,7 @@ import numpy as np
 
 from tests.plants.base import Run, first_order
 from tests.plants.effect import HiddenEffect, Parameters
-from tests.plants.rerun import fine_command, moved_by
+from tests.plants.rerun import follow, moved
 from tests.plants.stack import FloatArray
 
 
@@ -31,14 +31,15 @@ def droop(command: FloatArray, step: float, constant: float) -> FloatArray:
     return first_order(-1.0 / constant + 0j, command, step).real / constant
 
 
-def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
-    """Displacement with minus without the leak."""
-    if gain == 0.0:
-        return np.zeros_like(run.times)
-    command = fine_command(run)
-    return moved_by(run, command - gain * droop(command, run.fine_step, parameters["t"]))
+def driven(run: Run, parameters: Parameters, gain: float) -> Run:
+    """The stack behind the leak."""
+    command = run.fine_command
+    return follow(run, command - gain * droop(command, run.fine_step, parameters["t"]))
 
+
+contribution = moved(driven)
+"""Displacement with the effect minus without it, (N,) [m]."""
 
 CHARGE_LEAKAGE = HiddenEffect(
-    "charge_leakage", "g", "1", draw, contribution, plausible=(5e-4, 0.9), linear=False
+    "charge_leakage", "g", "1", draw, contribution, (5e-4, 0.9), linear=False, driven=driven
 )

@@ -37,5 +37,5 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 CONVERTER_STEP = HiddenEffect(
     "converter_step", "g", "m", draw, contribution, (1e-9, 3e-7), linear=True,
-    called="sensor_jump",
+    called="sensor_jump", of_sensor=True,
 )  # fmt: skip

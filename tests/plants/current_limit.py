@@ -9,6 +9,7 @@ Hysteresis, lag and mechanics are those of the base. Source: the data sheet of a
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from tests.plants.base import (
     Run,
     force_to_displacement,
     hysteresis_force,
-    refine,
     with_reversals,
 )
 from tests.plants.effect import HiddenEffect, Parameters
@@ -34,7 +34,7 @@ def draw(rng: np.random.Generator, run: Run) -> dict[str, float]:
 
 def limited_drive(run: Run, slew: float) -> DrivePath:
     """Voltage on the stack when |u'| is at most `slew` [V/s]."""
-    time, command = refine(run.times, run.command, run.sub_intervals)
+    time, command = run.path.time, run.fine_command
     step, constant = run.fine_step, run.stack.drive_time
     lag = 0.0
     voltage = [float(command[0])]
@@ -109,6 +109,18 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
     return fine[:: run.sub_intervals]
 
 
+def driven(run: Run, parameters: Parameters, gain: float) -> Run:
+    """The stack behind the limit; its command is what would drive it so without one."""
+    del parameters
+    path, constant = limited_drive(run, 1.0 / gain), run.stack.drive_time
+    force = hysteresis_force(run.stack, path) + run.stack.k_l * path.voltage
+    fine = force_to_displacement(run.stack, force - run.force, run.fine_step)
+    edge = constant / gain
+    command = path.voltage + np.clip(run.fine_command - path.voltage, -edge, edge)
+    moved = run.fine_displacement + fine
+    return replace(run, fine_command=command, path=path, force=force, fine_displacement=moved)
+
+
 CURRENT_LIMIT = HiddenEffect(
-    "current_limit", "1/s", "s/V", draw, contribution, plausible=(1e-5, 1e-3), linear=False
+    "current_limit", "1/s", "s/V", draw, contribution, (1e-5, 1e-3), linear=False, driven=driven
 )

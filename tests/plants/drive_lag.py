@@ -16,7 +16,7 @@ import numpy as np
 
 from tests.plants.base import Run, first_order
 from tests.plants.effect import HiddenEffect, Parameters
-from tests.plants.rerun import fine_command, moved_by
+from tests.plants.rerun import follow, moved
 from tests.plants.stack import FloatArray
 
 
@@ -33,14 +33,22 @@ def filtered(command: FloatArray, step: float, constant: float, zeta: float) -> 
     return first_order(pole, command, step).imag / (constant * damped)
 
 
-def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
-    """Displacement behind the filter minus without it; g is its time constant [s]."""
-    if gain == 0.0:
-        return np.zeros_like(run.times)
-    command = fine_command(run)
-    return moved_by(run, filtered(command, run.fine_step, gain, parameters["zeta"]))
+def driven(run: Run, parameters: Parameters, gain: float) -> Run:
+    """The stack behind the filter; g is its time constant [s]."""
+    return follow(run, filtered(run.fine_command, run.fine_step, gain, parameters["zeta"]))
 
+
+contribution = moved(driven)
+"""Displacement with the effect minus without it, (N,) [m]."""
 
 DRIVE_LAG = HiddenEffect(
-    "drive_lag", "T", "s", draw, contribution, (2e-5, 4e-3), linear=False, refit=True
+    "drive_lag",
+    "T",
+    "s",
+    draw,
+    contribution,
+    (2e-5, 4e-3),
+    linear=False,
+    refit=True,
+    driven=driven,
 )

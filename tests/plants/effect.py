@@ -23,7 +23,9 @@ class HiddenEffect:
     temperature at the samples, (N,) [degC], where the effect needs a thermometer in the record.
     refit: the base swallows it far beyond its linearisation (a lag: R_s C_p and tau take it over),
     so its visible ratio is that of a base fitted again. called: its name in the project's table,
-    where that is another one.
+    where that is another one. driven: of an effect before the stack, (run, secondary parameters,
+    gain) -> the run behind it. of_sensor: it acts on the reading. With these two, several effects
+    of one record act on each other (tests/plants/several.py).
     """
 
     name: str
@@ -37,3 +39,5 @@ class HiddenEffect:
     room: Callable[[FloatArray, Parameters], FloatArray] | None = None
     refit: bool = False
     called: str = ""
+    driven: Callable[[Run, Parameters, float], Run] | None = None
+    of_sensor: bool = False

@@ -48,5 +48,5 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 ENCODER_RIPPLE = HiddenEffect(
     "encoder_ripple", "g", "m", draw, contribution, (1e-9, 3e-7), linear=True,
-    called="sensor_ripple",
+    called="sensor_ripple", of_sensor=True,
 )  # fmt: skip

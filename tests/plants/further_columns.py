@@ -22,7 +22,7 @@ from tests.plants.base import (
 )
 from tests.plants.excitations import ExcitationKind, draw_excitation
 from tests.plants.load_stiffness import balance
-from tests.plants.rerun import fine_command, follow
+from tests.plants.rerun import follow
 from tests.plants.saturation_of_strain import bend as saturated
 from tests.plants.sensor_nonlinearity import bend as bent
 from tests.plants.stack import FloatArray, draw_stack
@@ -103,7 +103,7 @@ def stiffening_load(truth: Truth, gain: float) -> Truth:
 def soft_amplifier(truth: Truth, gain: float) -> Truth:
     """An amplifier whose output bends over as that stack's strain does, before the hysteresis."""
     run, scale = truth.run, truth.run.stack.u_rated / gain
-    moved = follow(run, scale * saturated(fine_command(run) / scale, SHARPNESS))
+    moved = follow(run, scale * saturated(run.fine_command / scale, SHARPNESS))
     x, u = moved.displacement, moved.path.voltage[:: run.sub_intervals]
     return replace(truth, displacement=x, reading=x, voltage=u, fine_charge=_charge(moved))
 
@@ -118,7 +118,7 @@ def saturating_stack(truth: Truth, gain: float) -> Truth:
 def growing_capacitance(truth: Truth, gain: float) -> Truth:
     """A capacitance C exp(g u/U): R q' = v - u, one exponential step for each sub-interval."""
     run, stack = truth.run, truth.run.stack
-    command, top = fine_command(run), stack.u_rated
+    command, top = run.fine_command, stack.u_rated
     u = np.zeros(command.size)
     for k, ahead in enumerate(command[1:].tolist()):
         time = stack.drive_time * math.exp(gain * u[k] / top)

@@ -35,4 +35,6 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
     return np.asarray(gain * (np.sin(angle + parameters["a"]) + third), dtype=np.float64)
 
 
-MAINS_HUM = HiddenEffect("mains_hum", "g", "m", draw, contribution, (1e-10, 3e-6), linear=True)
+MAINS_HUM = HiddenEffect(
+    "mains_hum", "g", "m", draw, contribution, (1e-10, 3e-6), linear=True, of_sensor=True
+)

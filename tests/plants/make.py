@@ -19,6 +19,7 @@ from tests.plants.base import Run, simulate_base
 from tests.plants.excitations import EXCITATIONS, ExcitationKind, draw_excitation
 from tests.plants.hide import RATIO, Hidden, Visible, effect_called, hide
 from tests.plants.noise import NOISES, Noise, NoiseKind, disturb, draw_noise
+from tests.plants.several import added_by
 from tests.plants.stack import FloatArray, Stack, draw_stack
 from tests.plants.table import HIDDEN_EFFECTS
 from tests.plants.visibility import base_directions
@@ -86,8 +87,8 @@ def make_record(
     effect: a name of `HIDDEN_EFFECTS` or None. strength scales the drawn visible ratio (1.5 to 4);
     0 removes the effect; `visible` (a ratio or a range) replaces it. The same seed gives the same
     stack, voltage and noise with every effect, and the same stack with every excitation. more:
-    further effects, each as visible as `more_visible` says; what they add is summed, because their
-    interaction is the product of two small shares of the stroke, far below the noise.
+    further effects, each as visible beside the base as `more_visible` says; they act on each other
+    (`added_by`).
     """
     _check(noise, excitation)
     chosen = None if effect is None else effect_called(effect)
@@ -110,9 +111,8 @@ def make_record(
         hide(one, run, rng, directions, kind.rms, 1.0, more_visible)
         for one, rng in zip(further, more_rng, strict=True)
     )
-    clean = run.displacement
-    for found in (first, *others):
-        clean = clean if found is None else clean + found.added
+    every = [found for found in (first, *others) if found is not None]
+    clean = run.displacement + added_by(run, [(h.effect, h.parameters, h.gain) for h in every])
     read, lost = disturb(noise_rng, kind, clean)
     truth = _truth(run, clean, kind, lost, excitation, first, others)
     write_csv(path, run.times, run.command, read, truth.temperature)

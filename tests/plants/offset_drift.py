@@ -36,5 +36,12 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 OFFSET_DRIFT = HiddenEffect(
-    "offset_drift", "g", "m", draw, contribution, plausible=(1e-9, 3e-6), linear=True
+    "offset_drift",
+    "g",
+    "m",
+    draw,
+    contribution,
+    plausible=(1e-9, 3e-6),
+    linear=True,
+    of_sensor=True,
 )

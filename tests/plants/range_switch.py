@@ -37,6 +37,14 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 RANGE_SWITCH = HiddenEffect(
-    "range_switch", "g", "1", draw, contribution, (1e-4, 0.03), linear=True, foreign=True
+    "range_switch",
+    "g",
+    "1",
+    draw,
+    contribution,
+    (1e-4, 0.03),
+    linear=True,
+    foreign=True,
+    of_sensor=True,
 )
 """Above 1 % only where the base absorbs most of it."""

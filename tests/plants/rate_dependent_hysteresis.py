@@ -15,7 +15,6 @@ import numpy as np
 from tests.plants.base import Run, force_to_displacement
 from tests.plants.effect import HiddenEffect, Parameters
 from tests.plants.hysteresis_memory import play
-from tests.plants.rerun import fine_command
 from tests.plants.stack import FloatArray
 
 COUNT = 3
@@ -59,7 +58,7 @@ def growth(rate: FloatArray, q: float) -> FloatArray:
 
 def drive_rate(run: Run) -> FloatArray:
     """u' = (v - u)/(R_s C_p) along the path, 0 at every reversal, [V/s]."""
-    command = np.interp(run.path.path_time, run.path.time, fine_command(run))
+    command = np.interp(run.path.path_time, run.path.time, run.fine_command)
     return (command - run.path.path_voltage) / run.stack.drive_time
 
 

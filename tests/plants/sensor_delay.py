@@ -38,5 +38,12 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 SENSOR_DELAY = HiddenEffect(
-    "sensor_delay", "d", "s", draw, contribution, plausible=(2e-5, 1e-2), linear=False
+    "sensor_delay",
+    "d",
+    "s",
+    draw,
+    contribution,
+    plausible=(2e-5, 1e-2),
+    linear=False,
+    of_sensor=True,
 )

@@ -30,6 +30,14 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 SENSOR_LAG = HiddenEffect(
-    "sensor_lag", "T", "s", draw, contribution, (2e-5, 4e-3), linear=False, refit=True
+    "sensor_lag",
+    "T",
+    "s",
+    draw,
+    contribution,
+    (2e-5, 4e-3),
+    linear=False,
+    refit=True,
+    of_sensor=True,
 )
 """A fit of R_s C_p and tau leaves 0.5 to 2 times the noise at most, at any T: often limited."""

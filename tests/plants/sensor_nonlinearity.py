@@ -40,5 +40,12 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 SENSOR_NONLINEARITY = HiddenEffect(
-    "sensor_nonlinearity", "g", "1", draw, contribution, plausible=(5e-4, 0.3), linear=True
+    "sensor_nonlinearity",
+    "g",
+    "1",
+    draw,
+    contribution,
+    plausible=(5e-4, 0.3),
+    linear=True,
+    of_sensor=True,
 )

@@ -9,7 +9,7 @@ from tests.plants.base import first_order, simulate_base
 from tests.plants.excitations import EXCITATIONS, ExcitationKind
 from tests.plants.make import HEADER, THERMOMETER, make_record
 from tests.plants.noise import coloured
-from tests.plants.rerun import fine_command, moved_by
+from tests.plants.rerun import moved_by
 from tests.plants.stack import FloatArray
 from tests.plants.visibility import base_directions, refitted_ratio, visible_ratio
 from tests.tiers import slow, slow_but
@@ -136,7 +136,7 @@ def test_a_pole_before_the_drive_vanishes_in_a_fit(tmp_path: Path) -> None:
     """Why a lag is scaled by a base that is fitted again: its linearisation cannot see this."""
     truth = make_record(None, 1, tmp_path / "a.csv")
     run = simulate_base(truth.stack, truth.times[:2000], truth.voltage[:2000], 12)
-    late = first_order(-1.0 / 2e-3 + 0j, fine_command(run), run.fine_step).real / 2e-3
+    late = first_order(-1.0 / 2e-3 + 0j, run.fine_command, run.fine_step).real / 2e-3
     added = moved_by(run, late)
     assert visible_ratio(base_directions(run), added, truth.sigma) > 1.0
     assert refitted_ratio(run, added, truth.sigma) < 0.5

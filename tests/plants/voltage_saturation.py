@@ -10,8 +10,7 @@ import numpy as np
 
 from tests.plants.base import Run
 from tests.plants.effect import HiddenEffect, Parameters
-from tests.plants.rerun import fine_command, moved_by
-from tests.plants.stack import FloatArray
+from tests.plants.rerun import follow, moved
 
 
 def draw(rng: np.random.Generator, run: Run) -> dict[str, float]:
@@ -20,15 +19,16 @@ def draw(rng: np.random.Generator, run: Run) -> dict[str, float]:
     return {}
 
 
-def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
-    """Clipped minus unclipped displacement; g is the share of the highest command that is cut."""
+def driven(run: Run, parameters: Parameters, gain: float) -> Run:
+    """The stack behind the clipped command; g is the share of the highest command that is cut."""
     del parameters
-    if gain == 0.0:
-        return np.zeros_like(run.times)
     highest = (1.0 - gain) * float(run.command.max())
-    return moved_by(run, np.minimum(fine_command(run), highest))
+    return follow(run, np.minimum(run.fine_command, highest))
 
+
+contribution = moved(driven)
+"""Displacement with the effect minus without it, (N,) [m]."""
 
 VOLTAGE_SATURATION = HiddenEffect(
-    "voltage_saturation", "g", "1", draw, contribution, plausible=(1e-3, 0.4), linear=False
+    "voltage_saturation", "g", "1", draw, contribution, (1e-3, 0.4), linear=False, driven=driven
 )
