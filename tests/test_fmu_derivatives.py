@@ -5,11 +5,13 @@ import time
 from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_size_t
 from functools import cache
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from psa_casadi.export.check.structure import transposed_error
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
@@ -306,3 +308,25 @@ def test_unknown_step_sensitivity_is_refused_with_the_reason() -> None:
         assert instance.try_step(0.0, 1e-3).status == DISCARD
         assert instance.call("GetAdjointDerivative", *vectors, *rest) == DISCARD
         assert "that step failed" in instance.messages[-1]
+
+
+class _Matrix:
+    """An instance whose directional and adjoint derivatives are given matrices."""
+
+    def __init__(self, forward: list[list[float]], backward: list[list[float]]) -> None:
+        self.forward, self.backward = np.array(forward), np.array(backward)
+
+    def directional(self, unknowns: list[str], knowns: list[str], seed: FloatArray) -> FloatArray:
+        del unknowns, knowns
+        return np.asarray(self.forward @ seed)
+
+    def adjoint(self, unknowns: list[str], knowns: list[str], seed: FloatArray) -> FloatArray:
+        del unknowns, knowns
+        return np.asarray(seed @ self.backward)
+
+
+@pytest.mark.parametrize(("entry", "wrong"), [(3e-17, False), (1e-9, True), (1e-3, True)])
+def test_a_row_of_rounding_is_no_wrong_adjoint(entry: float, wrong: bool) -> None:
+    matrix = _Matrix([[1.0, 2.0], [2e-17, 0.0]], [[1.0, 2.0], [0.0, entry]])
+    found = transposed_error(cast("Any", matrix), ["a", "b"], ["c", "d"], np.ones(2), np.ones(2))
+    assert (found > 1e-10) == wrong  # the limit of `psa check`

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 import psa_casadi as psa
 from psa_casadi.model.from_casadi.ports import ports_of
 from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.start import start_state
 from tests.plain_fmu import pendulum
 
 FloatArray = npt.NDArray[np.float64]
@@ -101,7 +102,7 @@ def test_a_torque_that_goes_no_further_is_named() -> None:
 
 
 def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
-    x, u, k = (ca.SX.sym(n) for n in ("x", "u", "k"))
+    x, u, k = (ca.SX.sym(n) for n in ("x", "voltage", "k"))
     k_ = psa.Parameter("k", 3.0, "1/s", (0.1, 30.0), "rate", log=True)
     own = psa.ode_model(
         {"x": x, "u": u, "p": k, "ode": k * (u - x**3), "y": x + u}, name="cubic", parameters=[k_]
@@ -116,6 +117,10 @@ def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
         return np.hstack([steps.y, steps.sensitivity])
 
     assert run(there) == pytest.approx(run(own), rel=1e-6, abs=1e-7)
+    simulated = psa.simulate(there, 4 * T[:300], u_[:, 0], rtol=1e-7)
+    assert simulated.outputs["y"] == pytest.approx(run(own)[:, 0], rel=1e-6, abs=1e-6)
+    with pytest.raises(psa.InputError, match="can only begin at its start values"):
+        start_state(there, [0.0])
     values = [{"k": v} for v in np.linspace(1.0, 9.0, 40)]
     models = [there.with_values(v) for v in values]
     assert np.array_equal(side_by_side(run, models), [run(m) for m in models])

@@ -9,8 +9,8 @@ from psa_casadi.any_model.start import searched_states
 from psa_casadi.identification.fitting.unknowns import (
     LINEAR_PRIOR,
     LOG_PRIOR,
-    MEMORY_PRIOR,
     Unknowns,
+    memory_prior,
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.variables import nominal_value
@@ -35,7 +35,7 @@ def coordinates_of(
     the declared starts (unless these are known) over their usual size, and the zeros of sensors
     over the output's range.
     Weak priors: `LOG_PRIOR` and `LINEAR_PRIOR` for parameters, `LINEAR_PRIOR` usual sizes for
-    states and zeros, `MEMORY_PRIOR` for memories of effects. The coordinate that a stack's fit has
+    states and zeros, `memory_prior` for memories of effects. The coordinate that a stack's fit has
     for its sensor's offset stays at 0.
     """
     s, values = model.structure, model.values
@@ -47,7 +47,7 @@ def coordinates_of(
     spans = measured_spans(runs)
     sizes = [nominal_value(q.nominal, values) for q in states]
     sizes += [float(spans[model.output_names.index(n)]) or 1.0 for n in zeros]
-    own = [MEMORY_PRIOR if q.name in memories else LINEAR_PRIOR for q in states]
+    own = [memory_prior(q) if q.name in memories else LINEAR_PRIOR for q in states]
     own += [LINEAR_PRIOR] * len(zeros)
     started = (*(q.name for q in states), *(zero_name(n) for n in zeros))
     return Unknowns(

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Expression
-from psa_casadi.errors import PsaError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model, Structure
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,8 +52,13 @@ def start_on(
 ) -> Start:
     """Return the initial state for samples u (n, nu) at times t (n,) [s].
 
-    The first inputs and the rates at which they begin put the model there (`start_state`).
+    The first inputs and the rates at which they begin put the model there (`start_state`). An
+    imported FMU begins at its start values.
     """
+    if model.structure.foreign:
+        x = np.array([s.start for s in model.structure.states])
+        none = np.zeros((len(x), len(memory_names(model.structure))))
+        return Start(x, np.zeros((len(x), len(model.parameter_names))), none)
     rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
     return start_state(model, list(u[0]), rates, memory, float(t[0]))
 
@@ -70,8 +75,15 @@ def start_state(
     Solves f_s(x_s, m) = w_s for the states without memory, where w_s is the steady rate that the
     inputs' rates cause, by Newton's method; the derivatives follow from the same linear systems.
     The memories that settle are solved for first: their deviations count from where they would be.
+
+    Raises PsaError where there is no equilibrium, InputError for an imported FMU.
     """
     structure = model.structure
+    if structure.foreign:
+        raise InputError(
+            "An imported FMU has no second derivatives, which a settled start needs; it can only"
+            " begin at its start values."
+        )
     settle, rest, moving = _functions(structure)
     names = memory_names(structure)
     deviation = np.array([(memory or {}).get(n, 0.0) for n in names])

@@ -15,13 +15,17 @@ from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.diagnosis.noise.colour import Colour, colour_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import predict_record
-from psa_casadi.identification.fitting.unknowns import MEMORY_PRIOR, Unknowns, unknowns_of
+from psa_casadi.identification.fitting.unknowns import (
+    Unknowns,
+    memory_priors,
+    memory_sizes,
+    unknowns_of,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.start import memory_names
 from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 
 #: Standard errors by which the cautious truth has less of its effect, and the most that it loses.
 _CAUTION, _LOSS = 1.0, 0.75
@@ -90,7 +94,7 @@ class Rival:
         full = np.zeros((self.size, self.size))
         full[:count, :count] = self.known
         where = np.arange(count, count + states)
-        full[where, where] = 1.0 / MEMORY_PRIOR**2
+        full[where, where] = 1.0 / np.square(memory_priors(self.model))
         return full
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -125,13 +129,6 @@ class Rival:
         sizes = np.array(list(memory_sizes(model).values()))
         columns = [by_parameter @ slopes, by_start * sizes, np.full((record.n, 1), _OFFSET)]
         return y + _OFFSET * delta[-1], np.hstack(columns)
-
-
-def memory_sizes(model: Model) -> dict[str, float]:
-    """Return the usual size of every state whose start no voltage tells."""
-    states = {s.name: s for s in model.structure.states}
-    names = memory_names(model.structure)
-    return {n: nominal_value(states[n].nominal, model.values) for n in names}
 
 
 def rival_of_fit(name: str, fit: Fit, colour: Colour, evidence: float = 0.0) -> Rival:

@@ -17,6 +17,8 @@ _POINTS = 3
 _MOST = 24
 #: Difference that rounding may make, as a share of the nominal value.
 _ROUNDING = 1e-12
+#: A row whose entries are below this share of its unknown's value moves nothing; it is rounding.
+_NOTHING = 1e-6
 
 
 def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
@@ -117,7 +119,8 @@ def adjoint_error(fmu: Fmu) -> float:
     Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step,
     there for at most `_MOST` knowns and unknowns: the step is made again for each column, and for
     every few knowns of a row. Each row is in nominal units of the knowns, relative to its largest
-    entry. Sampled states are held; a step into which an instant falls is not differentiated.
+    entry, or to what its unknown's value says is no more than rounding. Sampled states are held; a
+    step into which an instant falls is not differentiated.
     """
     generator = np.random.default_rng(4)
     unknowns = [*fmu.names("output"), *(u.variable.name for u in fmu.description.derivatives)]
@@ -126,25 +129,29 @@ def adjoint_error(fmu: Fmu) -> float:
     knowns = [k for k in point if k != "time"]
     size = np.array([fmu.nominals[k] for k in knowns])
     with fmu.start3(MODEL_EXCHANGE) as instance:
-        evaluate(instance, point, unknowns)
-        worst = _transposed(instance, unknowns, knowns, size)
+        here = evaluate(instance, point, unknowns)
+        worst = transposed_error(instance, unknowns, knowns, size, here)
     with fmu.start3(CO_SIMULATION) as instance:
         instance.set({n: point[n] for n in fmu.names("input")})
         instance.step(0.0, fmu.step_size)
         through = [] if fmu.sampled() else fmu.states()
         few, among = _some([*unknowns, *through]), _some(knowns)
         size = np.array([fmu.nominals[k] for k in among])
-        return max(worst, _transposed(instance, few, among, size))
+        here = np.array(instance.get(few))
+        return max(worst, transposed_error(instance, few, among, size, here))
 
 
-def _transposed(
-    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray
+def transposed_error(
+    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray, here: FloatArray
 ) -> float:
-    """Return the largest difference of the matrix by rows from the one by columns."""
+    """Return the largest difference of the matrix by rows from the one by columns.
+
+    `here` are the values of the unknowns: entries that are nothing beside them are rounding.
+    """
     columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))]
     rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))]
     forward, backward = np.array(columns).T * size, np.array(rows) * size
-    largest = np.max(np.abs(backward), axis=1, initial=1e-300)
+    largest = np.maximum(np.max(np.abs(backward), axis=1, initial=1e-300), _NOTHING * np.abs(here))
     return float(np.max(np.abs(forward - backward) / largest[:, None]))
 
 

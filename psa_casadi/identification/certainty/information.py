@@ -7,11 +7,14 @@ import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import FIT_RTOL
 from psa_casadi.identification.fitting.prediction import predict_record
-from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR, LOG_PRIOR, MEMORY_PRIOR
+from psa_casadi.identification.fitting.unknowns import (
+    LINEAR_PRIOR,
+    LOG_PRIOR,
+    memory_prior,
+    memory_sizes,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.simulation.start import memory_names
-from psa_casadi.variables import nominal_value
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -53,9 +56,10 @@ def record_information(
     a large derivative look like a direction of their own. Raises SimulationError.
     """
     if start is None or start_sizes is None:
-        states = {s.name: s for s in model.structure.states}
-        start = dict.fromkeys(memory_names(model.structure), 0.0)
-        start_sizes = [nominal_value(states[n].nominal, model.values) for n in start]
+        start, start_sizes = (
+            dict.fromkeys(memory_sizes(model), 0.0),
+            [*memory_sizes(model).values()],
+        )
     _, by_parameter, by_start = predict_record(
         model, record, start, names, stop=record.n, rtol=rtol
     )
@@ -63,7 +67,8 @@ def record_information(
     wanted = by_parameter[chosen] * sizes_of(model, names) / sigma
     nuisance = by_start[chosen] * np.array(start_sizes) / sigma
     count = len(start)
-    held = np.vstack([nuisance, np.eye(count) / MEMORY_PRIOR])
+    priors = {s.name: memory_prior(s) for s in model.structure.states}
+    held = np.vstack([nuisance, np.diag([1.0 / priors[n] for n in start])])
     offset = np.append(np.ones(len(wanted)), np.zeros(count))
     basis, _ = np.linalg.qr(np.column_stack([offset, held]))
     padded = np.vstack([wanted, np.zeros((count, len(names)))])

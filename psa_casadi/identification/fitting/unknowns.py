@@ -8,15 +8,16 @@ import numpy.typing as npt
 
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.start import memory_names
-from psa_casadi.variables import nominal_value
+from psa_casadi.variables import State, nominal_value
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Standard deviations of the weak priors: in natural logarithms, and in ordinary changes.
 LOG_PRIOR = 3.0
 LINEAR_PRIOR = 10.0
-MEMORY_PRIOR = 3.0
+#: Initial states with a memory, in usual sizes. One that settles is a mean of its past, and so lies
+#: within its usual range: wider, it would stand for a relaxation of each record's own.
+MEMORY_PRIOR, SETTLING_PRIOR = 3.0, 1.0
 #: Initial states other than memories, in what a steady motion at the record's rates would change.
 MOTION_PRIOR = 30.0
 #: Lags beside the creep lag are alike in most records: each stays near its start unless told.
@@ -246,8 +247,8 @@ def unknowns_of(
         loop = tuple(list(free).index(n) for n in _LOOP)
         log[list(loop)] = False
         prior[list(loop)] = [LOG_PRIOR, LOG_PRIOR, LINEAR_PRIOR, LINEAR_PRIOR]
-    sizes = _memory_sizes(model)
-    each = [[MEMORY_PRIOR] * len(sizes) + [MOTION_PRIOR] * len(m) + [np.inf] for m in motions]
+    sizes, own = memory_sizes(model), list(memory_priors(model))
+    each = [own + [MOTION_PRIOR] * len(m) + [np.inf] for m in motions]
     return Unknowns(
         names=tuple(free),
         started=tuple((*sizes, *motion) for motion in motions),
@@ -272,8 +273,17 @@ def static_compliance(values: Mapping[str, float]) -> float:
     return 1.0 / values["k"]
 
 
-def _memory_sizes(model: Model) -> dict[str, float]:
-    """Return the nominal size of every state with a memory."""
-    states = {s.name: s for s in model.structure.states}
-    names = memory_names(model.structure)
-    return {n: nominal_value(states[n].nominal, model.values) for n in names}
+def memory_sizes(model: Model) -> dict[str, float]:
+    """Return the usual size of every state whose start no voltage tells."""
+    states = model.structure.states
+    return {s.name: nominal_value(s.nominal, model.values) for s in states if s.memory}
+
+
+def memory_priors(model: Model) -> tuple[float, ...]:
+    """Return the standard deviations of the weak priors of these starts, in usual sizes."""
+    return tuple(memory_prior(s) for s in model.structure.states if s.memory)
+
+
+def memory_prior(state: State) -> float:
+    """Return the standard deviation of the weak prior of a state's start, in usual sizes."""
+    return SETTLING_PRIOR if state.memory and state.settles else MEMORY_PRIOR
