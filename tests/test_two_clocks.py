@@ -1,13 +1,14 @@
 """Two clocks: their saw tooth is found in plain NumPy records, undone, and seen nowhere else."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from psa_casadi import two_clocks
 from psa_casadi.identification.prepare import prepared
-from psa_casadi.records import Record
+from psa_casadi.records import Record, read_record
 from psa_casadi.units import FloatArray
 from tests.plants.base import Run, simulate_base
 from tests.plants.stack import draw_stack
@@ -79,6 +80,21 @@ def test_the_finding_is_told_and_repeats(run: Run) -> None:
     assert with_gaps is not None
     assert with_gaps.period == pytest.approx(found.period, rel=0.01)
     assert np.isnan(with_gaps.moved[100:110]).all()
+
+
+def test_the_measured_sine_has_two_clocks(measured_data: Path) -> None:
+    """As docs/measured.md states it; the minor loops show too little of it to be told."""
+    sine, loops = (
+        read_record(measured_data / "micromanipulator" / f"{name}.csv")
+        for name in ("sine_1hz", "minor_loops")
+    )
+    found = two_clocks(sine)
+    assert found is not None
+    told = found.sentence(sine).split(": ", 1)[1].split(". ")[0]
+    page = (Path(__file__).parent.parent / "docs" / "measured.md").read_text(encoding="utf-8")
+    said = " ".join(page.split())
+    assert told.split(": ")[1] in said
+    assert two_clocks(loops) is None
 
 
 def test_nothing_else_is_taken_for_two_clocks(run: Run) -> None:
