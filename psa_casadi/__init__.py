@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
     from psa_casadi.identification.identify import Identification
+    from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
     from psa_casadi.model.from_casadi.ode_model import ode_model
     from psa_casadi.model.model_file import load_model, save_model
@@ -109,6 +110,7 @@ _HOMES = {
         "Equations",
         "Symbols",
     ),
+    "psa_casadi.identification.start.two_clocks": ("two_clocks",),
     "psa_casadi.model.own_effects": ("own_effects",),
     "psa_casadi.model.stacks": (
         "STACKS",
@@ -213,6 +215,7 @@ __all__ = [
     "read_records",
     "record_from",
     "write_record",
+    "two_clocks",
     "BASE",
     "SIMPLIFIED",
     "COMPONENTS",

@@ -24,6 +24,7 @@ from psa_casadi.identification.start.form import Hysteresis, forms_of
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.identification.start.other_quantities import refuse_wrapped
 from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
+from psa_casadi.identification.start.two_clocks import clocks_said
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
@@ -83,7 +84,9 @@ def diagnose(
             ordered, apart = in_one_order(whole), in_one_order(held)
             clean, said, hidden = _cleaned(ordered)
             said += [*cut, *cut_too]
-            experiments = divided(clean, [cleaned(r) for r in apart])
+            judged = [cleaned(r) for r in apart]
+            said += [s for r in (*clean, *judged) for s in clocks_said(r)]
+            experiments = divided(clean, judged)
             start, scale_given = chosen_start(clean, model, stiffness)
             columns = columns_of(start, [e.record for e in experiments])
             experiments = with_levels(experiments, columns.fitted)

@@ -4,6 +4,7 @@ import numpy as np
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
+from psa_casadi.identification.start.two_clocks import clocks_said
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.quality.fast_noise import fast_noise
 from psa_casadi.records.quality.suspects import masked, suspects
@@ -17,7 +18,8 @@ def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
     averages lose nothing, they take the samples' place.
     """
     found = suspects(record)
-    said, clean = list(found.sentences(record.name)), masked(record, found)
+    clean = masked(record, found)
+    said = [*found.sentences(record.name), *clocks_said(clean)]
     y = measured(clean)
     noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([clean])
     if noise <= 0 or slope == 0:

@@ -1,0 +1,224 @@
+"""Voltage and displacement that were sampled by two clocks: found from a record alone, undone.
+
+Two devices that sample with clocks of their own, one of which renews its value every P seconds,
+differ by a delay that grows or falls evenly by P while the clocks pass each other, and jumps back:
+
+    y(t) = x(t - d(t)),    d(t) = P (saw(t) - 1/2),    y = x - d x' to first order.
+
+P is at most the record's sampling interval. x and x' come from a fit without any model: functions
+linear in their weights, of the voltage, its plays and its relaxations. What it leaves, over x', is
+the delay. Only the saw tooth is undone, about its mean: a delay that is constant or drifts may be
+the stack's or the sensor's, and stays. Source: the beat of two free-running quartz clocks, which
+differ by 10 to 100 parts in a million.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.identification.start.beats import FEWEST, Delays
+from psa_casadi.identification.start.linear_response import orthonormal, plays
+from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.records.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Intervals whose delays are compared, readings that each has at least, the most of a record.
+_INTERVALS, _EACH, _LONGEST = 256, 4, 50_000
+#: Thresholds of the plays, with their powers; relaxations over the record's decades.
+_PLAYS, _POWERS, _RELAXATIONS = 13, 3, 12
+#: Reversals that a beat must hold, else it may be a form of the loops.
+_REVERSALS = 8
+#: An interval counts at most so many times as much as the median one.
+_HEAVIEST = 4.0
+#: Times that fit and saw tooth are found beside each other.
+_ROUNDS = 4
+#: Largest relative difference of time steps of one clock, beside its rounding.
+_EVEN = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class TwoClocks:
+    """What two clocks did to a record: `period` [s] and `height` [s] of the delay's saw tooth.
+
+    `falling` says that the delay falls evenly and jumps up; `moved` (n,) [m] is what each reading
+    was off by about the mean delay, nan where there is none.
+    """
+
+    period: float
+    height: float
+    falling: bool
+    moved: FloatArray
+
+    def undone(self, record: Record) -> Record:
+        """Return the record with its readings where one clock would have taken them.
+
+        It is another record: it has no `source`, and a `sha256` of its own.
+        """
+        if record.displacement is None:
+            return record
+        there = record.displacement - self.moved
+        return replace(record, displacement=there, sha256="", source="")
+
+    def sentence(self, record: Record) -> str:
+        """Say what was found in the record, and what can be done about it."""
+        scale, unit = (1e9, "nm") if record.displacement_unit == "m" else (1.0, "counts")
+        off = scale * float(np.sqrt(np.nanmean(self.moved**2)))
+        return (
+            f"{record.name}: voltage and displacement were sampled by two clocks: the delay between"
+            f" them {'falls' if self.falling else 'grows'} evenly by {1e3 * self.height:.3g} ms and"
+            f" jumps back every {self.period:.3g} s, which moves the readings by {off:.2g} {unit}"
+            " rms. Read both from one device, or put the readings on one clock with"
+            " psa.two_clocks(record).undone(record)."
+        )
+
+
+def clocks_said(record: Record) -> tuple[str, ...]:
+    """Return the sentence on two clocks in a record, none where there is no doubt of one."""
+    found = two_clocks(record)
+    return () if found is None else (found.sentence(record),)
+
+
+def two_clocks(record: Record) -> TwoClocks | None:
+    """Return the saw tooth in the delay between the columns, None where none is beyond doubt.
+
+        found = psa.two_clocks(record)
+        if found is not None:
+            record = found.undone(record)
+
+    It must show in both halves of the record and at two jumps at least, and must be no higher than
+    one sampling interval. Records with uneven time steps, or with a beat that holds fewer than
+    eight reversals of the voltage, are not judged.
+    """
+    y, most = record.displacement, _most_beats(record)
+    if y is None or most < FEWEST:
+        return None
+    along = (record.time - record.time[0]) / record.duration
+    smooth, valid = _Smooth.of(record), record.mask
+    rate, left = smooth.rate_and_left(y)
+    intervals = _Samples(along, rate, left, valid).intervals()
+    beat = intervals.best(most) if intervals else None
+    if intervals is None or beat is None or not intervals.shows(beat):
+        return None
+    for _ in range(_ROUNDS):
+        moved = -beat.height * (beat.saw(along) - 0.5) * rate
+        rate, left = smooth.rate_and_left(y - moved)
+        samples = _Samples(along, rate, np.where(valid, left + moved, 0.0), valid)
+        beat = samples.delays().refined(beat)
+    intervals = samples.intervals()
+    if intervals is None or not intervals.shows(beat) or abs(beat.height) > record.sample_time:
+        return None
+    moved = np.where(valid, -beat.height * (beat.saw(along) - 0.5) * rate, np.nan)
+    return TwoClocks(record.duration / beat.beats, abs(beat.height), beat.height < 0.0, moved)
+
+
+def _most_beats(record: Record) -> float:
+    """Return how many beats a record could show at most, 0 where it is not to be judged."""
+    readings, step = np.count_nonzero(record.mask), np.diff(record.time)
+    if not _INTERVALS * _EACH <= readings <= record.n <= _LONGEST:
+        return 0.0
+    if np.ptp(step) > _EVEN * record.sample_time:
+        return 0.0
+    turns = np.diff(record.voltage)
+    return float(np.count_nonzero(np.diff(np.sign(turns[turns != 0.0])))) / _REVERSALS
+
+
+@dataclass(frozen=True, eq=False)
+class _Smooth:
+    """Orthonormal functions of a record's voltage and time, at its readings and at all instants."""
+
+    time: FloatArray
+    valid: npt.NDArray[np.bool_]
+    functions: FloatArray
+    at_readings: FloatArray
+
+    @classmethod
+    def of(cls, record: Record) -> "_Smooth":
+        """Return the functions of a record."""
+        columns, valid = np.column_stack(_functions(record)), record.mask
+        basis, transform = orthonormal(columns[valid])
+        return cls(record.time, valid, columns @ transform, basis)
+
+    def rate_and_left(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the rate [m/s] of the best fit to readings (n,) [m], and what it leaves [m].
+
+        Where there is no reading that is 0.
+        """
+        fitted = self.functions @ (self.at_readings.T @ y[self.valid])
+        rate: FloatArray = np.gradient(fitted, self.time).astype(np.float64)
+        return rate, np.where(self.valid, y - fitted, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Times along a record, 0 to 1, rates [m/s], what a smooth fit leaves [m], and where it is."""
+
+    along: FloatArray
+    rate: FloatArray
+    left: FloatArray
+    valid: npt.NDArray[np.bool_]
+
+    @property
+    def place(self) -> npt.NDArray[np.int64]:
+        """Interval of each sample."""
+        return np.minimum((_INTERVALS * self.along).astype(np.int64), _INTERVALS - 1)
+
+    def intervals(self) -> Delays | None:
+        """Return the delays of intervals, None where the stack hardly ever moves."""
+        found, weight = self._of_intervals()
+        on = weight > 1e-3 * np.mean(weight)
+        if np.count_nonzero(on) < _INTERVALS // 2:
+            return None
+        middle = (np.arange(_INTERVALS) + 0.5) / _INTERVALS
+        return Delays(middle[on], found[on], weight[on])
+
+    def delays(self) -> Delays:
+        """Return the delays of single readings, weighted as their intervals are."""
+        power, weight = self._sums(self.rate**2 * self.valid), self._of_intervals()[1]
+        scale = (weight / np.maximum(power, 1e-300))[self.place]
+        on = self.valid & (self.rate != 0.0) & (scale > 0.0)
+        rate = self.rate[on]
+        return Delays(self.along[on], -self.left[on] / rate, rate**2 * scale[on])
+
+    def _of_intervals(self) -> tuple[FloatArray, FloatArray]:
+        """Return the delay of each interval, and its weight by what scatters in it."""
+        power, count = self._sums(self.rate**2 * self.valid), self._sums(self.valid.astype(float))
+        delay = self._sums(-self.left * self.rate) / np.maximum(power, 1e-300)
+        scattered = (self.left + delay[self.place] * self.rate) ** 2 * self.valid
+        variance = self._sums(scattered) / np.maximum(count - 1.0, 1.0)
+        known = (count > 1.0) & (power > 0.0)
+        usual = float(np.median(variance[known])) if known.any() else 0.0
+        weight = np.where(known, power / np.maximum(variance, max(usual, 1e-300)), 0.0)
+        most = _HEAVIEST * float(np.median(weight[known])) if known.any() else 0.0
+        return delay, np.minimum(weight, most)
+
+    def _sums(self, values: FloatArray) -> FloatArray:
+        return np.bincount(self.place, values, _INTERVALS).astype(np.float64)
+
+
+def _functions(record: Record) -> list[FloatArray]:
+    """Return columns (n, ...) that make any smooth answer of a stack: what no clock's beat is."""
+    n, span = record.n, float(np.ptp(record.voltage))
+    v = 2.0 * (record.voltage - np.mean(record.voltage)) / max(span, 1e-300)
+    along = 2.0 * (record.time - record.time[0]) / record.duration - 1.0
+    h = record.duration / (n - 1)
+    rate = np.gradient(v)
+    rate /= max(float(np.std(rate)), 1e-300)
+    play = plays(v, np.arange(1, _PLAYS + 1) / (_PLAYS + 1.0))
+    taus = np.geomspace(2.0 * h, record.duration, _RELAXATIONS)
+    return [
+        *(along**k for k in range(4)),
+        *(v**k for k in range(1, 6)),
+        *(rate, rate * v, rate * along),
+        *(play**k for k in range(1, _POWERS + 1)),
+        *(_behind(tau / h, v) for tau in taus),
+        *(np.exp(-(along + 1.0) * record.duration / (2.0 * tau)) for tau in taus[4:]),
+    ]
+
+
+def _behind(steps: float, x: FloatArray) -> FloatArray:
+    """Return x (n,) behind a lag of so many samples, from 0; x is linear between them."""
+    a = float(np.exp(-1.0 / steps))
+    b = (1.0 - a) * steps
+    return filtered([1.0 - b, b - a], [1.0, -a], x - x[0])
