@@ -104,7 +104,12 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert np.max(np.abs(numbers(below["y"]))) == pytest.approx(np.max(np.abs(miss)), rel=1e-5)
     assert len(numbers(above["y"])) == len(numbers(below["y"])) > 1000
     assert path.stat().st_size < 1_500_000
-    assert valid("own_model", d.to_json())["causes"][0]["port"] == "the rate of v"
+    told = valid("own_model", d.to_json())
+    assert told["causes"][0]["port"] == "the rate of v"
+    low, high = told["budget"]["causes"][0]["interval"]
+    assert 0.9 < low < d.explained_share < high
+    shown = rf"hysteresis of x in v {d.explained_share:.0%}"[:-1] + rf" % {100 * low:.0f} to 100 %"
+    assert shown in page.text  # cut, as no share is above 100 %
     assert find_browser(tmp_path).serious_faults(path, DARK) == []
 
 
@@ -165,6 +170,13 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     for error, noise in zip(d.errors, (0.3, 0.005), strict=True):
         assert error.base > 5.0 * noise
         assert error.extended == pytest.approx(noise, rel=0.06)
+    (share,) = d.budget.causes
+    base, left = (
+        sum((getattr(e, of) / e.noise) ** 2 for e in d.errors) for of in ("base", "extended")
+    )
+    assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
+    assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
+    assert f"{share.shown[0]:.0%} ({share.shown[1]:.0%} to " in repr(d)
 
 
 @pytest.mark.slow
@@ -196,6 +208,9 @@ def test_a_cause_that_no_effect_has_is_unexplained() -> None:
     free = d.correction
     assert free is not None
     assert f"{free.share:.0%}" in d.unnamed
+    told = d.budget.unnamed
+    assert told is not None
+    assert told.interval[0] < told.share == free.share < told.interval[1]
     x = d.runs[0].outputs[:, 0]  # the state that it follows is what was measured
     assert free.variable == "x"
     assert len(free.along) == len(free.added) == len(x)

@@ -6,9 +6,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.budget import Share
 from psa_casadi.diagnosis.corrections.correct import Correction
 from psa_casadi.diagnosis.corrections.kinds import KINDS
+from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.judgement import (
     Weighed,
     too_small,

@@ -76,6 +76,10 @@ function knob(name) { return Array.prototype.find.call(box.querySelectorAll('.kn
   return k.querySelector('label').textContent === name; }); }
 found.first = text(); found.picture = drawn();
 found.fitted = row();
+var apart = document.createElement('div');
+psaLive.budget(apart, [['worse', 1e-9], ['better', 2e-6]], 1e-6, 0, String);
+found.cut = Array.prototype.map.call(apart.querySelectorAll('tr td:last-child'), function (c) {
+  return c.textContent; });
 var range = knob('k_L').querySelector('input[type=range]');
 range.value = '620'; range.dispatchEvent(new Event('input'));
 setTimeout(function () {
@@ -148,7 +152,9 @@ def test_the_error_budget_follows(moved: dict[str, Any], shown: Diagnosis) -> No
     number, unit = size.split()
     assert name == "slow creep"
     assert float(number) * (1e3 if unit == "µm" else 1.0) == pytest.approx(without**0.5, rel=6e-3)
-    assert float(share.split("\u00a0")[0]) == pytest.approx(100 * (1 - now / without), abs=0.6)
+    removes = max(0.0, 100 * (1 - now / without))  # cut: at these values it adds error
+    assert float(share.split("\u00a0")[0]) == pytest.approx(removes, abs=0.6)
+    assert moved["cut"] == ["0\u00a0%", "75\u00a0%"]  # an effect that adds error removes nothing
 
 
 @slow

@@ -15,15 +15,17 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.any_model.budget import removed_from
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.any_model.fit import OdeFit, fit_ode
-from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of, share_removed
+from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of
 from psa_casadi.any_model.predict import shown_by, states_of, traced
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
 from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.any_model.start import start_of
 from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.noise.colour import noise_rms
 from psa_casadi.diagnosis.screening.screen import independent, whitened_jacobian, without
 from psa_casadi.errors import PsaError
@@ -55,15 +57,21 @@ class _Law:
 class Free:
     """A free function: of what, at which port, its evidence over the base, and what it removes.
 
-    `law` are its monomials in the variables over their `scales`, `fit` the base with it.
+    `removes` is that with its interval, `law` are its monomials in the variables over their
+    `scales`, `fit` the base with it.
     """
 
     port: Port
     of: str
     evidence: float
-    share: float
+    removes: Share
     law: _Law
     fit: OdeFit
+
+    @property
+    def share(self) -> float:
+        """What it removes of the base's held-out error above the noise."""
+        return self.removes.share
 
 
 def curve_of(free: Free, runs: Sequence[Run]) -> tuple[str, FloatArray, FloatArray]:
@@ -126,17 +134,18 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
         known.progress(f"a free function in {attached.port.words}")
         h = hypothesis_of((attached.component,), _fitted(known, root, attached), known.runs)
         if h is not None:
-            share = _share(root, h, view)
             of = " and ".join(law.names)
-            found.append(Free(attached.port, of, known.evidence(h), share, law, h.fit))
+            removes = _removes(f"{of} in {attached.port.words}", known, h, view)
+            found.append(Free(attached.port, of, known.evidence(h), removes, law, h.fit))
     return tuple(sorted(found, key=lambda f: -f.evidence))
 
 
-def _share(root: OdeHypothesis, h: OdeHypothesis, view: OdeView) -> float:
-    """Return what it removes of the held-out error above the noise."""
+def _removes(what: str, known: Known, h: OdeHypothesis, view: OdeView) -> Share:
+    """Return what it removes of the base's held-out error above the noise that it leaves."""
     colours = (view.screening.colour, *view.screening.colour.further)
     noise = [noise_rms(o.residuals, c) for o, c in zip(h.fit.outputs, colours, strict=True)]
-    return share_removed(noise, root.errors, root.errors, h.errors)
+    base = view.of.predicted
+    return removed_from(known.runs, h.fit.places, base, noise).share(what, base, h.predicted)
 
 
 def _fitted(known: Known, root: OdeHypothesis, attached: Attached) -> OdeFit | None:

@@ -69,22 +69,6 @@ def hypothesis_of(
     return OdeHypothesis(tuple(causes), fit, predicted, held, train, final)
 
 
-def share_removed(
-    noise: Sequence[float], root: Sequence[float], before: Sequence[float], after: Sequence[float]
-) -> float:
-    """Return the share of the root's error above the noise that one model removes of another's.
-
-    rms errors of every output; their powers are taken over that of their noise and added.
-    """
-    floors = [max(n, 1e-300) for n in noise]
-    base, old, new = (
-        sum((e / n) ** 2 for e, n in zip(errors, floors, strict=True))
-        for errors in (root, before, after)
-    )
-    above = base - len(floors)
-    return float((old - new) / above) if above > 0 else 0.0
-
-
 def errors_at(
     runs: Sequence[Run],
     predicted: Sequence[FloatArray],

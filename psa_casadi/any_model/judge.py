@@ -4,13 +4,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from psa_casadi.any_model.budget import OdeBudget, removed_from
 from psa_casadi.any_model.certainty import certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
-from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, share_removed
+from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView
 from psa_casadi.any_model.identify import with_told
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
 from psa_casadi.any_model.search import Known, with_cause, without
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.held_out.shares import Removed, Share
 from psa_casadi.diagnosis.judgement import SMALL_NOTE, least_share, rivals, verdict_by
 from psa_casadi.diagnosis.noise.colour import noise_rms
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
@@ -46,7 +48,8 @@ def judged(known: Known) -> OdeDiagnosis:
             best.fit.outputs, (last.screening.colour, *last.screening.colour.further), strict=True
         )
     ]
-    share = removed(root, root, best, floors)
+    removed = removed_from(known.runs, root.fit.places, root.predicted, floors)
+    share = removed.from_base(best.predicted)
     held = sum(int(r.held_out.sum()) for r in known.runs)
     few = held < FEWEST_SAMPLES
     free = free_functions(known, first) if first.test.alarm or best.causes else ()
@@ -62,14 +65,7 @@ def judged(known: Known) -> OdeDiagnosis:
             if beaten
             else _LITTLE.format(names, share, _ENOUGH)
         )
-    return _diagnosis(known, verdict, named, floors, told, notes, free)
-
-
-def removed(
-    root: OdeHypothesis, before: OdeHypothesis, after: OdeHypothesis, floors: Sequence[float]
-) -> float:
-    """Return what one removes of another's held-out error: the share of the root's above noise."""
-    return share_removed(floors, root.errors, before.errors, after.errors)
+    return _diagnosis(known, verdict, named, removed, told, notes, free)
 
 
 def _verdict(
@@ -134,7 +130,7 @@ def _diagnosis(
     known: Known,
     verdict: Verdict,
     named: OdeHypothesis,
-    floors: Sequence[float],
+    removed: Removed,
     told: Mapping[str, Mapping[str, float]],
     notes: list[str],
     free: Sequence[Free],
@@ -142,9 +138,9 @@ def _diagnosis(
     root = known.found[frozenset()]
     sure = certainty(named.fit)
     partly = known.view(named).test.alarm
-    shares = {c.name: _own_share(known, named, c, floors) for c in named.causes}
-    least = least_share(shares.values())
-    small = [n for n, s in shares.items() if partly and s < least]
+    shares = {c.name: _own_share(known, named, c, removed) for c in named.causes}
+    least = least_share([s.share for s in shares.values()])
+    small = [n for n, s in shares.items() if partly and s.share < least]
     causes = tuple(
         PortCause(
             effect=c.name,
@@ -161,7 +157,7 @@ def _diagnosis(
                 if p.name in sure.intervals
             },
             cannot_be_told_from=rivals(told[c.name], c.name),
-            explained_share=float(np.clip(shares[c.name], 0.0, 1.0)),
+            explained_share=shares[c.name].shown[0],
         )
         for c in named.causes
         if c.name not in small
@@ -172,16 +168,16 @@ def _diagnosis(
     return OdeDiagnosis(
         verdict=verdict,
         causes=causes,
-        candidates=_candidates(known, floors, told, named),
+        candidates=_candidates(known, removed, told, named),
         errors=tuple(
             OutputError(
                 o.column, known.base.model.structure.outputs[o.index].unit, floor,
                 root.errors[k], named.errors[k],
             )
-            for k, (o, floor) in enumerate(zip(named.fit.outputs, floors, strict=True))
+            for k, (o, floor) in enumerate(zip(named.fit.outputs, removed.noise, strict=True))
         ),
         remaining=_remaining(known.view(named)),
-        notes=(*notes, *(SMALL_NOTE.format(n, 100 * max(shares[n], 0.0)) for n in small)),
+        notes=(*notes, *(SMALL_NOTE.format(n, 100 * shares[n].shown[0]) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
         extended_fit=named.fit,
@@ -189,6 +185,11 @@ def _diagnosis(
         base=root.predicted,
         extended=named.predicted,
         missed=_remaining(known.view(root)),
+        budget=OdeBudget(
+            removed.share("together", root.predicted, named.predicted),
+            tuple(shares[c.effect] for c in causes),
+            best_free.removes if best_free else None,
+        ),
         unnamed=_UNNAMED.format(best_free.of, best_free.port.words, best_free.share)
         if best_free
         else "",
@@ -210,14 +211,16 @@ def _correction(known: Known, free: Free) -> FreeFunction | None:
     )  # fmt: skip
 
 
-def _own_share(known: Known, h: OdeHypothesis, cause: Component, floors: Sequence[float]) -> float:
+def _own_share(known: Known, h: OdeHypothesis, cause: Component, removed: Removed) -> Share:
     less = known.found.get(h.names - {cause.name})
-    return 0.0 if less is None else removed(known.found[frozenset()], less, h, floors)
+    if less is None:
+        return Share(cause.name, 0.0, (0.0, 0.0))
+    return removed.share(cause.name, less.predicted, h.predicted)
 
 
 def _candidates(
     known: Known,
-    floors: Sequence[float],
+    removed: Removed,
     told: Mapping[str, Mapping[str, float]],
     named: OdeHypothesis,
 ) -> tuple[Candidate, ...]:
@@ -232,7 +235,7 @@ def _candidates(
                 effect=name,
                 explained_share=0.0
                 if own is None
-                else float(np.clip(removed(root, root, own, floors), 0.0, 1.0)),
+                else float(np.clip(removed.from_base(own.predicted), 0.0, 1.0)),
                 evidence=evidence if own is None else known.evidence(own),
                 fitted=own is not None,
                 probability=first.get(name, 0.0),

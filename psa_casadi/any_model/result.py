@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.any_model.budget import OdeBudget
 from psa_casadi.any_model.fit import OdeFit
-from psa_casadi.any_model.hypothesis import share_removed
 from psa_casadi.any_model.runs import Run
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.model.compose import Model
@@ -89,9 +89,9 @@ class OdeDiagnosis(StillReported):
 
     The words of the verdict are those of a stack's diagnosis. `base` and `extended` (n, ny) are the
     predictions of every experiment in full, in the order of `runs`. `candidates` are all effects
-    tried. `missed` is what the base leaves, `remaining` what the extended model does. `unnamed`
-    says where a free function would remove most of what is left, "" if nothing is; `correction` is
-    that function.
+    tried. `budget` says where the base's held-out error goes, with 95 % intervals. `missed` is what
+    the base leaves, `remaining` what the extended model does. `unnamed` says where a free function
+    would remove most of what is left, "" if nothing is; `correction` is that function.
     """
 
     verdict: Verdict
@@ -107,23 +107,23 @@ class OdeDiagnosis(StillReported):
     base: tuple[FloatArray, ...]
     extended: tuple[FloatArray, ...]
     missed: Remaining
+    budget: OdeBudget
     unnamed: str = ""
     correction: FreeFunction | None = None
 
     @property
     def explained_share(self) -> float:
         """The share of the base's held-out error above the noise that all causes remove."""
-        base = [e.base for e in self.errors]
-        noise = [e.noise for e in self.errors]
-        return share_removed(noise, base, base, [e.extended for e in self.errors])
+        return self.budget.together.share
 
     def __repr__(self) -> str:
         """Return the verdict, the causes with their sizes, the errors and what remains."""
         lines = [f"{self.verdict}: {_SAID[self.verdict]}"]
-        for c in self.causes:
+        for c, removed in zip(self.causes, self.budget.causes, strict=True):
+            share, low, high = removed.shown
             lines.append(
                 f"  {c.effect} ({c.confidence:.0%} sure), {c.description}; it removes"
-                f" {c.explained_share:.0%} of the held-out error above the noise"
+                f" {share:.0%} ({low:.0%} to {high:.0%}) of the held-out error above the noise"
             )
             lines += [
                 f"    {n} = {e.value:.4g} ({e.interval[0]:.4g} to {e.interval[1]:.4g}) {e.unit}"
@@ -155,6 +155,7 @@ class OdeDiagnosis(StillReported):
             "remaining": asdict(self.remaining),
             "unnamed": self.unnamed,
             "correction": None if self.correction is None else self.correction.to_dict(),
+            "budget": asdict(self.budget),
             "notes": list(self.notes),
             "values": dict(self.model.values),
             "records": [{"name": r.name, "sha256": r.signals.sha256} for r in self.runs],

@@ -3,8 +3,8 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from psa_casadi.diagnosis.budget import Share
 from psa_casadi.diagnosis.corrections.correct import Correction
+from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.screening.evidence import credible_set, temperature
 from psa_casadi.diagnosis.search.steps import Step

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from psa_casadi.diagnosis.budget import Removed
+from psa_casadi.diagnosis.budget import removed_from
 from psa_casadi.diagnosis.corrections.correct import Correction, corrections
 from psa_casadi.diagnosis.judgement import Weighed
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
@@ -29,7 +29,7 @@ class Balance:
             if beside
             else ()
         )
-        removed = Removed(self.experiments, before.predicted, self.noise)
+        removed = removed_from(self.experiments, before.predicted, self.noise)
         whole = self.scale.evidence(after)
         return Weighed(
             evidence=whole - self.scale.evidence(before),

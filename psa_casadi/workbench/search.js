@@ -73,12 +73,15 @@ desk.search = (function () {
     return [make('div', {className: 'budget'}, bar(parts, text.join(', ')), legend)];
   }
 
+  // A share as it is shown, from 0 to 1.
+  function cut(share) { return Math.min(1, Math.max(0, share)); }
+
   function current(tree) {
     var node = tree.known[tree.best || ''], e = node.last, all = removes(e), shares = [];
     if (!isFinite(all)) { return [make('p', {className: 'note'}, 'The base model leaves no more than noise in held-out samples.')]; }
     node.causes.forEach(function (c) {
       var less = tree.known[named(node.causes.filter(function (o) { return o !== c; }))];
-      shares.push({name: desk.words(c), share: Math.max(0, less ? all - removes(less.last) : all / node.causes.length)});
+      shares.push({name: desk.words(c), share: cut(less ? all - removes(less.last) : all / node.causes.length)});
     });
     var said = 'Base model ' + desk.length(e.base_rms_m) + ', best so far ' + desk.length(e.holdout_rms_m) + ', noise ' + desk.length(e.noise_rms_m) +
       '. Of the power above the noise:';
@@ -87,10 +90,10 @@ desk.search = (function () {
 
   function final(found) {
     var shares = found.causes.map(function (c) {
-      return {name: desk.words(c.what), share: c.share, more: ' (' + c.interval.map(function (v) { return (100 * v).toFixed(0); }).join(' to ') + ')'};
+      return {name: desk.words(c.what), share: cut(c.share), more: ' (' + c.interval.map(function (v) { return (100 * cut(v)).toFixed(0); }).join(' to ') + ')'};
     });
-    if (found.unnamed) { shares.push({name: 'an unnamed correction would remove', share: found.unnamed.share}); }
-    var left = 1 - found.together.share - (found.unnamed ? found.unnamed.share : 0);
+    if (found.unnamed) { shares.push({name: 'an unnamed correction would remove', share: cut(found.unnamed.share)}); }
+    var left = 1 - cut(found.together.share) - (found.unnamed ? cut(found.unnamed.share) : 0);
     return budget(shares, left, 'Of ' + desk.length(found.excess_rms_m) + ' rms above the noise of ' + desk.length(found.noise_rms_m) + ':');
   }
 

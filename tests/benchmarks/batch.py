@@ -1,11 +1,16 @@
-"""`psa batch` on a population with hidden defects: what is found, what it costs, what is kept."""
+"""`psa batch` on a population with hidden defects: what is found, what it costs, what is kept.
+
+All devices are worked on by four workers of Dask, one of which is killed after a third of them.
+"""
 
 import os
 import resource
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +19,14 @@ from psa_casadi.devices.batch import BatchRun, batch
 from psa_casadi.population.population import Population, population
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
+from tests.benchmarks.batch_dask import on_dask
 from tests.benchmarks.batch_devices import DEFECTS, Device, write_devices
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
 
-#: Devices, of which one in twenty has a defect; devices of the runs with one and two processes.
-DEVICES, QUICK, PART = 100, 24, 40
+#: Devices, of which one in twenty has a defect; devices of the runs with one, two and four workers.
+DEVICES, QUICK, PART = 100, 24, 24
+#: Workers of Dask; without Dask all devices are worked on by this machine's processes.
+WORKERS = 4
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -38,33 +46,60 @@ def run_sized(progress: Progress, count: int) -> Outcome:
         part.mkdir()
         write_devices(part, PART, 0, seed=21)
         batch(part, folder / "warm", progress=progress)  # compiles
-        costs = [_measured(part, folder / f"with{n}", n, progress) for n in (1, 2)]
-        whole = _measured(records, folder / "results", None, progress)
-        again = _measured(records, folder / "results", None, progress)
-    found = population(whole.run.findings)
-    return Outcome((_roc(devices, found), _cost([*costs, whole, again])))
+        own = partial(_own, progress=progress)
+        costs = [
+            _measured(_processes(n), partial(own, part, folder / f"with{n}", n))
+            for n in (1, 2, WORKERS)
+        ]
+        results = folder / "results"
+        if find_spec("distributed") is None:
+            many = os.cpu_count() or 1
+            costs.append(_measured(_processes(many), partial(own, records, results, many)))
+        else:
+            by = f"{WORKERS} workers of Dask"
+            dask = partial(on_dask, workers=WORKERS, progress=progress)
+            costs.append(_measured(by, partial(dask, part, folder / "dask")))
+            costs.append(_measured(by, partial(dask, records, results, kill=True)))
+        whole = costs[-1].run
+        costs.append(_measured("all kept", partial(own, records, results, 1)))
+    found = population(whole.findings)
+    return Outcome((_roc(devices, found), _cost(costs)))
 
 
 @dataclass(frozen=True)
 class _Cost:
-    """A run with its wall and processor times [s] and the largest memory of a process [MiB]."""
+    """A run with its wall and processor times [s] and the largest memory of processes [MiB].
+
+    `memory` is that of a worker, `own` that of the process that hands out the work. Each is the
+    largest so far.
+    """
 
     what: str
     run: BatchRun
     wall: float
     processor: float
     memory: float
+    own: float
 
 
-def _measured(records: Path, output: Path, workers: int | None, progress: Progress) -> _Cost:
+def _own(records: Path, output: Path, workers: int, progress: Progress) -> tuple[BatchRun, str]:
+    return batch(records, output, workers=workers, progress=progress), ""
+
+
+def _processes(count: int) -> str:
+    return f"{count} process{'es' if count > 1 else ''}"
+
+
+def _measured(by: str, work: Callable[[], tuple[BatchRun, str]]) -> _Cost:
     before, began = _processor(), time.perf_counter()
-    found = batch(records, output, workers=workers, progress=progress)
+    found, remark = work()
     wall, spent = time.perf_counter() - began, _processor() - before
-    count = workers or os.cpu_count() or 1
-    what = f"{len(found.devices)} devices, {count} process{'es' if count > 1 else ''}"
-    what += ", again" if found.kept == len(found.devices) else ""
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0
-    return _Cost(what, found, wall, spent, memory)
+    what = f"{len(found.devices)} devices, {by}{f', {remark}' if remark else ''}"
+    own, children = (
+        resource.getrusage(who).ru_maxrss / 1024.0
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    return _Cost(what, found, wall, spent, children, own)
 
 
 def _processor() -> float:
@@ -74,32 +109,41 @@ def _processor() -> float:
 
 
 def _cost(costs: Sequence[_Cost]) -> TitledTable:
-    one, two = costs[:2]
+    one = costs[0]
     rows = tuple(
         (
             c.what,
             number(c.wall),
             number(c.processor),
             number(c.processor / len(c.run.devices), 2),
+            number(_per_device(c) / _per_device(one), 2),
             ", ".join(f"{n} {status}" for status, n in c.run.counts.items()),
             number(c.memory),
+            number(c.own),
         )
         for c in costs
     )
     note = (
-        f"Processor time with one process over that with two: {one.processor / two.processor:.2f}"
-        " (1: two processes do no more work than one). Wall times are of a machine that others use"
-        f" too: {one.wall / two.wall:.2f} times faster with two. Both with the start of processes."
+        "Processor times are of all processes, their start included, and do not depend on what else"
+        " the machine does, as wall times do. Over one process: what a device costs more with more"
+        " workers; its inverse bounds the parallel efficiency where every worker has a core of its"
+        f" own (here {os.cpu_count()} cores). Memory is the largest so far."
     )
     head = (
         "run",
         "wall [s]",
         "processor [s]",
         "for a device [s]",
+        "over one process",
         "ended",
-        "largest process [MiB]",
+        "largest worker [MiB]",
+        "own process [MiB]",
     )
     return TitledTable("Cost", Table(head, rows), note)
+
+
+def _per_device(c: _Cost) -> float:
+    return c.processor / len(c.run.devices)
 
 
 def _roc(devices: Sequence[Device], found: Population) -> TitledTable:

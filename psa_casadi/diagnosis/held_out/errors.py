@@ -1,12 +1,12 @@
 """Errors of base and extended model in training and held-out samples, and the gain between them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
 
+from psa_casadi.diagnosis.held_out.parts import FEWEST_RECORDS, jackknife, parts_of
 from psa_casadi.diagnosis.noise.colour import rms
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import predicted_further
@@ -15,9 +15,6 @@ from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
-
-#: Held-out records from which on they give the gain's interval; else so many blocks of them do.
-_FEWEST, _BLOCKS = 4, 8
 
 
 @dataclass(frozen=True)
@@ -113,35 +110,17 @@ def held_out_parts(
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Return sums of squares (parts, models) [m^2] and sample counts (parts,) of held-out parts.
 
-    The parts are the held-out records where there are at least four, else eight blocks of each.
+    The parts are those of `psa_casadi.diagnosis.held_out.parts`.
     """
-    residuals = [held_out_residuals(experiments, p) for p in predicted]
-    rows = [own for own in zip(*residuals, strict=True) if len(own[0])]
-    if len(rows) < _FEWEST:
-        rows = [
-            block
-            for own in rows
-            for block in zip(*(np.array_split(r, _BLOCKS) for r in own), strict=True)
-            if len(block[0])
-        ]
-    sums = np.array([[float(r @ r) for r in row] for row in rows]).reshape(-1, len(predicted))
-    return sums, np.array([len(row[0]) for row in rows], dtype=np.int64)
+    sums, counts = parts_of(*(held_out_columns(experiments, p) for p in predicted))
+    return sums[:, :, 0], counts[:, 0]
 
 
-def jackknife(
-    of: Callable[[npt.NDArray[np.bool_]], float], every: npt.NDArray[np.bool_]
-) -> tuple[float, float]:
-    """Return a figure over all parts, and the half width of its 95 % interval.
-
-    With L the figure over all of k parts and L_i that without part i it is
-    L +- t_(k-1) sqrt((k-1)/k sum (L_i - mean)^2) (Efron and Tibshirani 1993, chapter 11).
-    """
-    k = len(every)
-    if k < 2:
-        return of(every), 0.0
-    without = [of(every & (np.arange(k) != i)) for i in range(k)]
-    spread = float(np.sqrt((k - 1) * np.var(without)))
-    return of(every), float(special.stdtrit(k - 1, 0.975)) * spread
+def held_out_columns(
+    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return `held_out_residuals` as columns (n, 1): the displacement is the one output."""
+    return [r[:, None] for r in held_out_residuals(experiments, predicted)]
 
 
 def gain_of(
@@ -161,7 +140,7 @@ def gain_of(
 
     centre, half = jackknife(of, np.ones(len(counts), dtype=bool))
     low, high = (100.0 * (1.0 - float(np.exp(centre + side * half))) for side in (1.0, -1.0))
-    told = len(counts) if records >= _FEWEST else 0
+    told = len(counts) if records >= FEWEST_RECORDS else 0
     return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), told)
 
 

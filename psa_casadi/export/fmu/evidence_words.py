@@ -99,8 +99,9 @@ def _budget(evidence: Evidence) -> Iterator[Said]:
 
 
 def _share(share: float, interval: object) -> str:
-    low, high = (100.0 * getattr(interval, end) for end in ("low", "high"))
-    return f"{100.0 * share:.3g} % of the error, 95 % interval {low:.3g} to {high:.3g} %"
+    ends = (share, *(getattr(interval, end) for end in ("low", "high")))
+    percent, low, high = (100.0 * min(max(v, 0.0), 1.0) for v in ends)  # cut as in every page
+    return f"{percent:.3g} % of the error, 95 % interval {low:.3g} to {high:.3g} %"
 
 
 def _seen(evidence: Evidence) -> Iterator[Said]:

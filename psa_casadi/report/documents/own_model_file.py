@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from psa_casadi.any_model.budget import OdeBudget
 from psa_casadi.any_model.result import OutputError, PortCause
 from psa_casadi.diagnosis.result import Candidate, Remaining, Verdict
 from psa_casadi.report.documents.diagnosis_file import RecordUsed
@@ -25,7 +26,8 @@ class FreeCorrection:
 class OwnModelFile:
     """A diagnosis of a model of one's own: verdict, causes, errors of every output, what remains.
 
-    `values` are the parameters of the extended model in the model's units.
+    `values` are the parameters of the extended model in the model's units. Files of older versions
+    have no `budget`.
     """
 
     format: Literal["psa_casadi.own_model_diagnosis/1"]
@@ -40,3 +42,4 @@ class OwnModelFile:
     notes: tuple[str, ...]
     values: Mapping[str, float]
     records: tuple[RecordUsed, ...]
+    budget: OdeBudget | None = None

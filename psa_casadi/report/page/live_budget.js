@@ -10,7 +10,7 @@ psaLive.budget = function (box, rows, now, noise, length) {
   if (!rows.length || !isFinite(now)) { return; }
   var lines = rows.map(function (row) {
     var without = above(row[1]), share = without > 0 ? 1 - Math.pow(above(now) / without, 2) : 0;
-    var removed = isFinite(without) ? Math.round(100 * Math.max(-9.99, share)) + '\u00a0%' : 'cannot be run';
+    var removed = isFinite(without) ? Math.round(100 * Math.min(1, Math.max(0, share))) + '\u00a0%' : 'cannot be run';
     return cells('td', [row[0], isFinite(without) ? length(without) : '', removed]);
   });
   box.appendChild(make('p', {className: 'note', text: 'Error above the noise at these values: ' + length(above(now)) +

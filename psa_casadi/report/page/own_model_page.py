@@ -12,6 +12,7 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.plots.patch_plot import free_plot
+from psa_casadi.report.words.budget_words import share_with_interval
 from psa_casadi.report.words.fit_words import whiteness_sentence
 from psa_casadi.report.words.own_series import own_fit_series, own_series
 from psa_casadi.report.words.own_words import (
@@ -105,8 +106,9 @@ def _tiles(d: OdeDiagnosis) -> list[tuple[str, str, str]]:
         error = with_its_unit(e.extended, e.unit)
         tiles.append((f"{e.output}: held-out rms", error, noise))
     if added(d):
-        share = percent(min(max(d.explained_share, 0.0), 1.0))
-        tiles.append(("removed of the error", share, "of its power above the noise, held out"))
+        share, low, high = d.budget.together.shown
+        said = f"of its power above the noise, held out ({100 * low:.0f} to {100 * high:.0f} %)"
+        tiles.append(("removed of the error", percent(share), said))
     return tiles
 
 
@@ -117,6 +119,7 @@ def _budget(page: Document, d: OdeDiagnosis) -> None:
     page.paragraph(
         "Shares are of the power of the base model's held-out error above the noise, outputs"
         " over their noise; each cause's is what the model fitted again without it leaves more."
+        " Intervals are taken over held-out records, or over blocks of them if fewer than four."
     )
     page.table(own_budget_table(d))
     free = d.correction
@@ -146,11 +149,11 @@ def _causes(page: Document, d: OdeDiagnosis) -> None:
     if not d.causes:
         return
     page.section("What was named")
-    for cause in d.causes:
+    for cause, share in zip(d.causes, d.budget.causes, strict=True):
         page.heading(f"{plain(cause.effect)} ({cause.belongs_to})")
         page.paragraph(
             f"Confidence {percent(cause.confidence)}. In {cause.description}. It removes"
-            f" {percent(cause.explained_share)} of the held-out error above the noise."
+            f" {share_with_interval(share)} of the held-out error above the noise."
         )
         _law(page, d, cause)
         page.table(parameter_table(d.model, only=cause.parameters))

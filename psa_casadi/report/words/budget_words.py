@@ -1,7 +1,7 @@
 """The error budget and the unnamed correction in words and as a table."""
 
-from psa_casadi.diagnosis.budget import Share
 from psa_casadi.diagnosis.corrections.patch import Patch
+from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.words.phrases import Scale, listing, number, plain
 from psa_casadi.report.words.tables import Table
@@ -19,8 +19,8 @@ def share_percent(share: float) -> str:
 
 def share_with_interval(s: Share) -> str:
     """Return "62 % (58 to 66 %)"."""
-    low, high = (min(max(v, 0.0), 1.0) for v in s.interval)
-    return f"{share_percent(max(s.share, 0.0))} ({100 * low:.0f} to {100 * high:.0f} %)"
+    share, low, high = s.shown
+    return f"{share_percent(share)} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def patch_text(patch: Patch) -> str:
@@ -55,17 +55,18 @@ def budget_table(d: Diagnosis, scale: Scale) -> Table:
     b = d.budget
     if b is None:
         return Table(("", "share", "95 % interval"), ())
-    rows = [_row(plain(c.what), c) for c in b.causes]
+    rows = [share_row(plain(c.what), c) for c in b.causes]
     if len(b.causes) > 1:
-        rows.append(_row("all causes together", b.together))
+        rows.append(share_row("all causes together", b.together))
     if b.unnamed is not None and d.patch is not None:
-        rows.append(_row(f"unnamed: {d.patch.name}", b.unnamed))
+        rows.append(share_row(f"unnamed: {d.patch.name}", b.unnamed))
     remains = number(scale.factor * b.remains_rms_m)
     share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
     rows.append(("remains above the noise", f"{share_percent(share)}, {remains} {scale.unit}", ""))
     return Table(("what", "removes", "95 % interval"), tuple(rows))
 
 
-def _row(what: str, s: Share) -> tuple[str, str, str]:
-    low, high = (100.0 * min(max(v, 0.0), 1.0) for v in s.interval)
-    return (what, share_percent(max(s.share, 0.0)), f"{low:.0f} to {high:.0f} %")
+def share_row(what: str, s: Share) -> tuple[str, str, str]:
+    """Return a row of the budget: what removes, its share, and the 95 % interval."""
+    share, low, high = s.shown
+    return (what, share_percent(share), f"{100 * low:.0f} to {100 * high:.0f} %")

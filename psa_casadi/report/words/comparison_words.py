@@ -13,6 +13,7 @@ from psa_casadi.report.words.phrases import (
     number,
     percent,
     plain,
+    within,
 )
 from psa_casadi.report.words.population_words import p_text
 from psa_casadi.report.words.tables import Table
@@ -96,8 +97,8 @@ def budget_table(findings: Sequence[Finding]) -> Table:
 def _share_text(s: BudgetShare | None) -> str:
     if s is None:
         return ""
-    low, high = (100.0 * min(max(v, 0.0), 1.0) for v in s.interval)
-    return f"{percent(max(s.share, 0.0))} ({low:.0f} to {high:.0f} %)"
+    share, low, high = (within(v) for v in (s.share, *s.interval))
+    return f"{percent(share)} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def difference_table(findings: Sequence[Finding], rows: Sequence[Difference]) -> Table:

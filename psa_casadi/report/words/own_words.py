@@ -6,7 +6,8 @@ import numpy as np
 
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
-from psa_casadi.report.words.budget_words import share_percent
+from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
     listing,
     naming_sentence,
@@ -87,16 +88,17 @@ def _cause(c: PortCause) -> str:
 
 
 def own_budget_table(d: OdeDiagnosis) -> Table:
-    """Return the shares of the base model's held-out error above the noise."""
-    rows = [(plain(c.effect), share_percent(c.explained_share)) for c in d.causes]
+    """Return the shares of the base model's held-out error above the noise, with intervals."""
+    b = d.budget
+    rows = [share_row(plain(s.what), s) for s in b.causes]
     if len(rows) > 1:
-        rows.append(("all causes together", share_percent(within(d.explained_share))))
-    if d.correction is not None:
-        free = d.correction
-        what = f"unnamed: a free function of {free.of} in {free.port}"
-        rows.append((what, share_percent(within(free.share))))
-    rows.append(("remains above the noise", share_percent(within(1.0 - d.explained_share))))
-    return Table(("what", "removes"), tuple(rows))
+        rows.append(share_row("all causes together", b.together))
+    if b.unnamed is not None:
+        rows.append(share_row(f"unnamed: a free function of {b.unnamed.what}", b.unnamed))
+    low, high = b.together.interval
+    left = Share("left", 1.0 - b.together.share, (1.0 - high, 1.0 - low))
+    rows.append(share_row("remains above the noise", left))
+    return Table(("what", "removes", "95 % interval"), tuple(rows))
 
 
 def own_error_table(d: OdeDiagnosis) -> Table:

@@ -1,0 +1,59 @@
+"""The error budget of any model: what each cause removes of the base's held-out error.
+
+Shares are of the power above the noise, outputs over their noise, with the intervals of a stack's
+budget (`psa_casadi.diagnosis.held_out.shares`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.any_model.runs import Run
+from psa_casadi.diagnosis.held_out.shares import Removed, Share
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OdeBudget:
+    """Where the held-out error of the base model above the noise goes.
+
+    `together` is what all causes remove, `causes` what each does beside the others (the model
+    fitted again without it leaves so much more), `unnamed` what a free function would remove.
+    """
+
+    together: Share
+    causes: tuple[Share, ...]
+    unnamed: Share | None = None
+
+
+def removed_from(
+    runs: Sequence[Run], outputs: Sequence[int], base: Sequence[FloatArray], noise: Sequence[float]
+) -> Removed:
+    """Return what models remove of a base's held-out error in the given outputs of a model.
+
+    `base` are its predictions (n, ny) of all runs, `noise` is the rms of each output's noise in the
+    output's unit.
+    """
+    return Removed(partial(_judged_errors, runs, tuple(outputs)), base, tuple(noise))
+
+
+def _judged_errors(
+    runs: Sequence[Run], outputs: Sequence[int], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return measured minus predicted (n, outputs) where any output is judged, else nan.
+
+    An output of which no sample is held out is judged by its fitted ones.
+    """
+    parts = []
+    held = [any(r.judged(j).any() for r in runs) for j in outputs]
+    for r, y in zip(runs, predicted, strict=True):
+        which = np.column_stack(
+            [r.judged(j) if own else r.fitted(j) for j, own in zip(outputs, held, strict=True)]
+        )
+        errors = np.where(which, (r.outputs - y)[:, outputs], np.nan)
+        parts.append(errors[which.any(axis=1)])
+    return parts

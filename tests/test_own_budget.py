@@ -1,0 +1,107 @@
+"""The error budget of any model: shares and intervals against draws whose shares are known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import binom
+
+from psa_casadi.any_model.budget import removed_from
+from psa_casadi.any_model.runs import Run
+from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.records.signals import Signals
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Noise of two outputs in units of their own, and what each of two causes adds to them.
+NOISE = np.array([2e-6, 0.3])
+ONE, OTHER = NOISE * [2.0, 3.0], NOISE * [1.0, 4.0]
+#: Of all that is above the noise (4 + 9 + 1 + 16), what the first cause makes.
+SHARE = 13.0 / 30.0
+SAMPLES, DRAWS = 240, 150
+
+
+def _drawn(
+    rng: np.random.Generator, records: int
+) -> tuple[list[Run], list[FloatArray], list[FloatArray]]:
+    """Return runs of two outputs with noise, and what either cause adds along each."""
+    runs, one, other = [], [], []
+    for k in range(records):
+        time: FloatArray = np.arange(SAMPLES, dtype=np.float64)
+        outputs = NOISE * rng.standard_normal((SAMPLES, 2))
+        outputs[rng.random(SAMPLES) < 0.3, 1] = np.nan  # the second sensor is slower
+        held = time % 4 == 3 if records < 4 else np.full(SAMPLES, k > 0)
+        signals = Signals(name=f"run {k}", time=time, columns={"y": outputs[:, 0]})
+        runs.append(Run(signals, time, np.zeros((SAMPLES, 0)), outputs, ~held, held))
+        one.append(ONE * rng.standard_normal((SAMPLES, 2)))
+        other.append(OTHER * rng.standard_normal((SAMPLES, 2)))
+    return runs, one, other
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    first: Share
+    other: Share
+    together: Share
+
+
+def _shares(rng: np.random.Generator, records: int) -> _Drawn:
+    runs, one, other = _drawn(rng, records)
+    none = [np.zeros((SAMPLES, 2)) for _ in runs]
+    both = [a + b for a, b in zip(one, other, strict=True)]
+    removed = removed_from(runs, (0, 1), both, NOISE.tolist())
+    return _Drawn(
+        removed.share("first", one, none),
+        removed.share("other", other, none),
+        removed.share("together", both, none),
+    )
+
+
+def _covered(shares: Sequence[Share], truth: float) -> int:
+    return sum(s.interval[0] <= truth <= s.interval[1] for s in shares)
+
+
+@pytest.mark.parametrize("records", [1, 7])  # blocks of one, and six that are held out whole
+def test_intervals_cover_the_known_shares(records: int) -> None:
+    rng = np.random.default_rng(29)
+    found = [_shares(rng, records) for _ in range(DRAWS)]
+    low, high = binom.interval(0.999, DRAWS, 0.95)
+    for shares, truth in (
+        ([f.first for f in found], SHARE),
+        ([f.other for f in found], 1.0 - SHARE),
+        ([f.together for f in found], 1.0),
+    ):
+        centres = np.array([s.share for s in shares])
+        assert np.mean(centres) == pytest.approx(truth, abs=4.0 * np.std(centres) / DRAWS**0.5)
+        assert low <= _covered(shares, truth) <= high
+
+
+def test_an_output_that_no_held_out_sample_shows_is_judged_by_its_fitted_ones() -> None:
+    runs, one, _ = _drawn(np.random.default_rng(1), 1)
+    (run,) = runs
+    run.outputs[run.held_out, 1] = np.nan
+    none = [np.zeros((SAMPLES, 2))]
+    s = removed_from(runs, (0, 1), one, NOISE.tolist()).share("one", one, none)
+    y, seen = run.outputs, run.fitted(1)
+    powers = [
+        np.mean((y - m)[rows, j] ** 2)
+        for j, rows in ((0, run.held_out), (1, seen))
+        for m in (one[0], none[0])
+    ]
+    gone = [(powers[2 * j] - powers[2 * j + 1]) / NOISE[j] ** 2 for j in (0, 1)]
+    above = powers[0] / NOISE[0] ** 2 + powers[2] / NOISE[1] ** 2 - 2.0
+    assert s.share == pytest.approx(sum(gone) / above, rel=1e-12)
+
+
+def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power() -> None:
+    assert Share("worse", -0.2, (-0.5, 0.1)).shown == (0.0, 0.0, 0.1)
+    assert Share("all", 1.01, (0.9, 1.2)).shown == (1.0, 0.9, 1.0)
+    runs, one, _ = _drawn(np.random.default_rng(2), 1)
+    (run,) = runs
+    quiet = [Run(run.signals, run.time, run.inputs, np.zeros((SAMPLES, 2)), run.used, run.held_out)]
+    left = removed_from(quiet, (0, 1), one, (0.0, 0.0)).share("half", one, [0.5 * one[0]])
+    assert left.share == pytest.approx(0.75, rel=1e-9)
+    still = removed_from(quiet, (0, 1), [0.0 * one[0]], (0.0, 0.0)).share("none", one, one)
+    assert (still.share, still.interval) == (0.0, (0.0, 0.0))
