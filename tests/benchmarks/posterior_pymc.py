@@ -77,7 +77,7 @@ def stack() -> psa.Model:
 
 def record() -> psa.Record:
     """Return a simulated record of two slow triangles of the voltage, with noise."""
-    times: FloatArray = np.arange(SAMPLES) * (2 * len(PEAKS) * LEG / SAMPLES)
+    times: FloatArray = np.arange(SAMPLES, dtype=np.float64) * (2 * len(PEAKS) * LEG / SAMPLES)
     corners = np.concatenate([[0.0], *([p, 0.0] for p in PEAKS)])
     applied = np.interp(times, LEG * np.arange(len(corners)), corners)
     clean = psa.simulate(stack(), times, applied, rtol=1e-8).displacement
