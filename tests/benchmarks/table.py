@@ -74,6 +74,12 @@ BENCHES: dict[str, Bench] = {
             sized=True,
         ),
         _later(
+            "posterior_pymc",
+            "sampling",
+            "effective samples per second beside an ODE in PyMC, on one posterior (--size)",
+            sized=True,
+        ),
+        _later(
             "own_model",
             "own_model",
             "models that are no stacks: hidden causes, errors before and after, and a page",
