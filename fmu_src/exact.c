@@ -45,13 +45,21 @@ static void try_step(psa_state *state, const psa_level *level, long sample, real
 }
 
 /* The matrices' derivatives by the parameters, of one of the levels */
-#if PSA_LANES == 1
+#if PSA_SENSITIVE
 static column *slopes_of(const psa_state *state, int at) {
     const int blocks = (state->thetas + COLUMNS - 1) / COLUMNS;
     return state->slopes + (size_t)at * (size_t)(blocks * state->slopes_size);
 }
 #endif
 
+#if PSA_DEVICE
+static const psa_level *level_of(psa_state *state, int step, int level) {
+    const int at = step * (state->run->finest + 1) + level;
+    if (state->held_at != at) fill_level(state->ladders + step, level, 0, state->scale[0], 0, &state->held);
+    state->held_at = at;
+    return &state->held;
+}
+#else
 static const psa_level *level_of(psa_state *state, int step, int level) {
     const int at = step * (state->run->finest + 1) + level;
     psa_level *const found = state->levels + at;
@@ -68,6 +76,7 @@ static const psa_level *level_of(psa_state *state, int step, int level) {
     }
     return found;
 }
+#endif
 
 /* Values of the ports at the start of an interval, with their derivatives */
 static void start_ports(psa_state *state, const double *input) {
@@ -77,7 +86,7 @@ static void start_ports(psa_state *state, const double *input) {
         real *const out = state->start_slopes[j];
         ex_port_slopes(j, state->t, state->x, v, REAL(0.0), state->k, out);
         state->port[j] = out[0];
-#if PSA_LANES == 1
+#if PSA_SENSITIVE
         for (int b = 0; b < state->blocks; ++b)
             ex_port_chain(j, out + 1, state->s + b * EX_NX, NONE, state->unit + b * EX_NP,
                           state->sport + b * (EX_NPORT + 1) + j);
@@ -85,6 +94,7 @@ static void start_ports(psa_state *state, const double *input) {
     }
 }
 
+#if !PSA_DEVICE
 static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
     const psa_exact *const run = state->run;
     const int sets = run->sets;
@@ -124,6 +134,7 @@ static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
     return 0;
 #endif
 }
+#endif
 
 /* The levels of lanes that differ, put together; what a lane had the last time it has still */
 #if PSA_LANES > 1
@@ -209,7 +220,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
             SET_LANE(accepted, lane, -1);
         }
         if (!any(accepted)) continue;
-#if PSA_LANES == 1
+#if PSA_SENSITIVE
         if (run->count > 0) step_columns(state, slopes_of(state, step * (finest + 1) + level[0]));
 #endif
         keep(state, accepted);
@@ -218,7 +229,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
     return 0;
 }
 
-#if PSA_LANES == 1
+#if PSA_SENSITIVE
 /* Columns for the unknowns: parameters of the linear part first; 0, or 2 where memory is out */
 APART static int set_up_columns(psa_state *state, int *theta) {
     psa_exact *const run = state->run;
@@ -268,6 +279,43 @@ APART static int set_up_columns(psa_state *state, int *theta) {
 }
 #endif
 
+/* A piece of memory behind the last one, each on cache lines of its own; NULL where only the size is asked for */
+static char *piece(char *memory, size_t *size, size_t more) {
+    char *const found = memory ? memory + *size : NULL;
+    *size += (more + LINE - 1) / LINE * LINE;
+    return found;
+}
+
+#define PIECE(type, count) ((type *)piece(memory, &size, (size_t)(count) * sizeof(type)))
+
+/* Cut what a run needs from zeroed memory, which may be NULL; its size in bytes */
+static size_t cut(psa_state *state, char *memory) {
+    const psa_exact *const run = state->run;
+    const int one = NL * (NL + EX_NU + 1), ladders = run->lengths * PSA_LANES, below = run->finest + 2;
+    const size_t rung = (size_t)(EX_NCH + 1) * (size_t)(state->thetas + 1);
+    size_t size = 0;
+#if !PSA_DEVICE
+    const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
+    state->levels = PIECE(psa_level, levels);
+    state->mixed = PIECE(psa_level, 1);
+    state->ready = PIECE(char, levels);
+#endif
+    state->plain = PIECE(real, one);
+    state->linear_slopes = PIECE(real, state->thetas > 0 ? one * EX_NTHETA : 0);
+    state->lin = PIECE(double, one * (state->thetas + 1));
+    state->balanced = PIECE(double, one * (state->thetas + 1));
+    state->terms = PIECE(psa_block, 3 * rung);
+    state->ladders = PIECE(psa_ladder, ladders);
+    for (int i = 0; i < ladders; ++i) {
+        psa_block *const blocks = PIECE(psa_block, (size_t)RUNGS(below) * rung);
+        if (!memory) continue;
+        state->ladders[i].count = state->thetas;
+        state->ladders[i].levels = below;
+        state->ladders[i].blocks = blocks;
+    }
+    return size;
+}
+
 APART static int set_up(psa_state *state) {
     psa_exact *const run = state->run;
     const int one = NL * (NL + EX_NU + 1);
@@ -286,48 +334,41 @@ APART static int set_up(psa_state *state) {
     state->brief = v_sqrt(state->tolerance);
     psa_prepare(state->p, state->k);
     int theta[EX_NTHETA + 1];
-#if PSA_LANES == 1
+#if PSA_SENSITIVE
     if (run->count > 0 && set_up_columns(state, theta)) return 2;
 #endif
-    state->ladders = calloc((size_t)(run->lengths * PSA_LANES), sizeof(psa_ladder));
-    const size_t levels = (size_t)run->lengths * (size_t)(run->finest + 1);
-    state->levels = lined(levels * sizeof(psa_level));
-    state->ready = calloc(levels, 1);
-    state->mixed = lined(sizeof(psa_level));
-    real *const plain = lined((size_t)one * sizeof(real));
-    real *const slopes = lined((size_t)(one * (EX_NTHETA + 1)) * sizeof(real));
-    double *const lin = malloc((size_t)(one * (state->thetas + 1)) * sizeof(double));
-    int status = !state->mixed || !state->ladders || !state->levels || !state->ready || !plain || !slopes || !lin ? 2 : 0;
-    if (status == 0) {
-        psa_linear(state->p, plain);
-        if (state->thetas > 0) psa_linear_slopes(state->p, slopes);
-    }
+#if !PSA_DEVICE
+    state->memory = lined(cut(state, NULL));
+    if (!state->memory) return 2;
+    cut(state, state->memory);
+#endif
+    double *const lin = state->lin;
+    int status = 0;
+    psa_linear(state->p, state->plain);
+#if PSA_SENSITIVE
+    if (state->thetas > 0) psa_linear_slopes(state->p, state->linear_slopes);
+#endif
     for (int lane = 0; lane < PSA_LANES && status == 0; ++lane) {
         for (int i = 0; i < one; ++i) {
-            lin[i] = LANE(plain[i], lane);
+            lin[i] = LANE(state->plain[i], lane);
             for (int m = 0; m < state->thetas; ++m)
-                lin[(m + 1) * one + i] = LANE(slopes[theta[m] * one + i], lane);
+                lin[(m + 1) * one + i] = LANE(state->linear_slopes[theta[m] * one + i], lane);
         }
         for (int step = 0; step < run->lengths && status == 0; ++step)
-            status = build_ladder(state->ladders + step * PSA_LANES + lane, state->thetas, lin, state->scale[lane],
-                                  run->length[step], run->finest + 2);
+            status = build_ladder(state->ladders + step * PSA_LANES + lane, lin, state->scale[lane], run->length[step],
+                                  state->balanced, state->terms);
     }
-    free_lined(plain);
-    free_lined(slopes);
-    free(lin);
     return status;
 }
 
-APART static void tear_down(psa_state *state) {
-    if (state->ladders)
-        for (int i = 0; i < state->run->lengths * PSA_LANES; ++i) free(state->ladders[i].blocks);
-    free(state->ladders);
-    free_lined(state->levels);
-    free(state->ready);
-    free_lined(state->mixed);
-    free_lined(state->s);
+/* From one sample to the next */
+static int go_on(psa_state *state, long sample, psa_pace *pace) {
+    const psa_exact *const run = state->run;
+    if (run->zero_order_hold && sample > 0) start_ports(state, run->v + sample * EX_NU);
+    return next_sample(state, sample, pace);
 }
 
+#if !PSA_DEVICE
 int psa_run_exact(psa_exact *run) {
     psa_state *const state = lined(sizeof *state);
     if (!state) return 2;
@@ -343,12 +384,13 @@ int psa_run_exact(psa_exact *run) {
         status = write_sample(state, 0, &pace);
     }
     for (long sample = 0; sample + 1 < run->samples && status == 0; ++sample) {
-        if (run->zero_order_hold && sample > 0) start_ports(state, run->v + sample * EX_NU);
-        status = run->stop && *run->stop ? 4 : next_sample(state, sample, &pace);
+        status = run->stop && *run->stop ? 4 : go_on(state, sample, &pace);
         if (status == 0) status = write_sample(state, sample + 1, &pace);
     }
     run->t_failed = LANE(state->t, 0);
-    tear_down(state);
+    free_lined(state->memory);
+    free_lined(state->s);
     free_lined(state);
     return status;
 }
+#endif

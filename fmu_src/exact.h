@@ -2,7 +2,9 @@
 #ifndef PSA_EXACT_H
 #define PSA_EXACT_H
 
-#if defined(_WIN32)
+#if defined(__CUDACC_RTC__)
+#define PSA_EXACT_API
+#elif defined(_WIN32)
 #define PSA_EXACT_API __declspec(dllexport)
 #else
 #define PSA_EXACT_API __attribute__((visibility("default")))

@@ -6,7 +6,7 @@
 #include "exact_loops.h"
 #include "exact_ports.h"
 
-#if PSA_LANES == 1
+#if PSA_SENSITIVE
 static const column NONE = {0.0};
 
 /* One block of columns: at the start of the step (states, ports), at its half and its end */

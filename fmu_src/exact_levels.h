@@ -20,9 +20,11 @@
 #ifndef PSA_EXACT_LEVELS_H
 #define PSA_EXACT_LEVELS_H
 
-#include <stdlib.h>
-
 #include "exact_math.h"
+
+#if !PSA_DEVICE
+#include <stdlib.h>
+#endif
 
 #define NL EX_NL
 #define LINE 64 /* bytes of a cache line: a vector that lies across two is dearer */
@@ -33,19 +35,25 @@
 
 /* F and the vectors of one direction (or of none) at one length: [F | a_1 a_2 c_1 q_1 q_2 q_3], a row padded with 0 to
    whole quads */
+#if PSA_DEVICE
+typedef double quad;
+#define QUAD 1
+#else
 typedef double quad __attribute__((vector_size(32), aligned(8)));
-#define QUADS ((NL + NV + 3) / 4)
+#define QUAD 4
+#endif
+#define QUADS ((NL + NV + QUAD - 1) / QUAD)
 #define VEC(k) (NL + (k)) /* the column of a vector */
 
 typedef struct {
-    double m[NL][4 * QUADS];
+    double m[NL][QUAD * QUADS];
 } psa_block;
 
 /* Rows of L by blocks of one vector, the last ones 0; with lanes a row is a vector already */
 #define BLOCKS ((NL + COLUMNS - 1) / COLUMNS)
 #define ROWS EX_ROWS
 #if PSA_LANES == 1
-typedef double rows __attribute__((vector_size(32), aligned(8)));
+typedef quad rows;
 #else
 typedef real rows;
 #endif
@@ -126,14 +134,13 @@ static void first_term(const double *lin, double d, int chord, int theta, psa_bl
 
 /* F and all vectors of the length d, where M d is small, by their Taylor series: a term is M d times the one before,
    over its number and m. `lin` are M, B, c and their derivatives by the parameters, each (NL * (NL + EX_NU + 1))
-   numbers, row-major one after the other. 0, or 1 where memory is out. */
-APART static int start_blocks(int count, const double *lin, double d, psa_block *blocks) {
+   numbers, row-major one after the other; z has room for three times the blocks. */
+APART static void start_blocks(int count, const double *lin, double d, psa_block *blocks, psa_block *z) {
     const size_t all = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
     const int one = NL * (NL + EX_NU + 1);
-    psa_block *const z = malloc(3 * all * sizeof *z), *term = z + all, *next = term + all;
-    double order[4 * QUADS]; /* m */
-    if (!z) return 1;
-    for (int k = 0; k < 4 * QUADS; ++k) order[k] = 1.0;
+    psa_block *term = z + all, *next = term + all;
+    double order[QUAD * QUADS]; /* m */
+    for (int k = 0; k < QUAD * QUADS; ++k) order[k] = 1.0;
     for (int j = 0; j < EX_NU; ++j) order[VEC(A2(j))] = 2.0;
     for (int j = 0; j < EX_NPORT; ++j) order[VEC(Q(1, j))] = 2.0, order[VEC(Q(2, j))] = 3.0;
     for (int c = 0; c <= EX_NCH; ++c)
@@ -141,8 +148,8 @@ APART static int start_blocks(int count, const double *lin, double d, psa_block 
     memcpy(term, z, all * sizeof *z);
     memcpy(blocks, z, all * sizeof *z);
     for (int k = 1; k <= TAYLOR; ++k) {
-        double over[4 * QUADS];
-        for (int q = 0; q < 4 * QUADS; ++q) over[q] = 1.0 / (k + order[q]);
+        double over[QUAD * QUADS];
+        for (int q = 0; q < QUAD * QUADS; ++q) over[q] = 1.0 / (k + order[q]);
         memset(next, 0, all * sizeof *next);
         for (int c = 0; c <= EX_NCH; ++c)
             for (int t = 0; t <= count; ++t) {
@@ -161,8 +168,6 @@ APART static int start_blocks(int count, const double *lin, double d, psa_block 
         term = next;
         next = swap;
     }
-    free(z);
-    return 0;
 }
 
 /* Twice the length, in one direction */
@@ -188,10 +193,13 @@ static void double_direction(int count, const psa_block *from, int c, int t, psa
 /* A step length h, its halves, and what has been asked of them */
 typedef struct {
     int count;          /* parameters by which it is differentiated */
-    int depth;          /* levels below h that are there */
-    psa_block *blocks;  /* [depth + 1][EX_NCH + 1][count + 1] */
+    int levels;         /* levels below h that are there; of those below two at a time, in turn */
+    psa_block *blocks;  /* [RUNGS(levels)][EX_NCH + 1][count + 1] */
 } psa_ladder;
 
+#define RUNGS(levels) ((levels) + 3)
+
+#if !PSA_DEVICE
 /* Zeroed memory that begins with a cache line, NULL where there is none; what is before it says what to free */
 static void *lined(size_t size) {
     char *const memory = calloc(1, size + 2 * LINE);
@@ -206,18 +214,19 @@ static void free_lined(void *begin) {
     if (begin) memcpy(&memory, (char *)begin - sizeof memory, sizeof memory);
     free(memory);
 }
+#endif
 
 static const psa_block *rung(const psa_ladder *ladder, int level) {
     const size_t each = (size_t)(EX_NCH + 1) * (size_t)(ladder->count + 1);
-    return ladder->blocks + each * (size_t)level;
+    const int below = level - ladder->levels;
+    return ladder->blocks + each * (size_t)(below > 0 ? ladder->levels + 1 + below % 2 : level);
 }
 
-/* Fill a ladder down to `levels` at least; 0, or 1 where numbers are not finite or memory is out. `scale` are
-   typical sizes of the states, by which M is balanced. */
-APART static int build_ladder(psa_ladder *ladder, int count, const double *lin, const double *scale, double h,
-                        int levels) {
-    const int one = NL * (NL + EX_NU + 1);
-    const size_t each = (size_t)(EX_NCH + 1) * (size_t)(count + 1);
+/* Fill a ladder; 0, or 1 where numbers are not finite. `scale` are typical sizes of the states, by which M is
+   balanced; `balanced` has room for as many numbers as `lin`, `terms` for three times the blocks of a rung. */
+APART static int build_ladder(psa_ladder *ladder, const double *lin, const double *scale, double h, double *balanced,
+                              psa_block *terms) {
+    const int one = NL * (NL + EX_NU + 1), count = ladder->count;
     double norm = 0.0;
     for (int i = 0; i < NL; ++i) {
         double sum = 0.0;
@@ -226,13 +235,8 @@ APART static int build_ladder(psa_ladder *ladder, int count, const double *lin, 
     }
     for (int i = 0; i < one * (count + 1); ++i)
         if (!isfinite(lin[i])) return 1;
-    int depth = levels;
+    int depth = ladder->levels;
     while (depth < DEEPEST && !(ldexp(norm * h, -depth) <= SMALL)) ++depth;
-    ladder->count = count;
-    ladder->depth = depth;
-    ladder->blocks = malloc((size_t)(depth + 1) * each * sizeof(psa_block));
-    double *const balanced = malloc((size_t)(one * (count + 1)) * sizeof(double));
-    if (!ladder->blocks || !balanced) return 1;
     for (int t = 0; t <= count; ++t)
         for (int i = 0; i < NL; ++i) {
             for (int j = 0; j < NL; ++j)
@@ -242,14 +246,13 @@ APART static int build_ladder(psa_ladder *ladder, int count, const double *lin, 
                 balanced[at] = lin[at] / scale[i];
             }
         }
-    const int status = start_blocks(count, balanced, ldexp(h, -depth), (psa_block *)rung(ladder, depth));
-    for (int level = depth - 1; level >= 0 && status == 0; --level)
+    start_blocks(count, balanced, ldexp(h, -depth), (psa_block *)rung(ladder, depth), terms);
+    for (int level = depth - 1; level >= 0; --level)
         for (int c = 0; c <= EX_NCH; ++c)
             for (int t = 0; t <= count; ++t)
                 double_direction(count, rung(ladder, level + 1), c, t,
                                  (psa_block *)BLOCK(rung(ladder, level), count, c, t));
-    free(balanced);
-    return status;
+    return 0;
 }
 
 /* Weights of a port's values at start, half and end in the response at the node theta of the step, from the

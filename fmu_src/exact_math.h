@@ -4,9 +4,11 @@
 #ifndef PSA_EXACT_MATH_H
 #define PSA_EXACT_MATH_H
 
+#if !defined(__CUDACC_RTC__) /* which has no headers; exact_kernel.cu has what it needs of them */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#endif
 
 #include "exact_tables.h"
 
@@ -20,6 +22,13 @@
 #define PSA_LANES 1
 #endif
 
+/* 1: for a processor of which every thread runs one set by itself, with scalars alone and without sensitivities
+   (exact_kernel.cu); the text is C++, too */
+#ifndef PSA_DEVICE
+#define PSA_DEVICE 0
+#endif
+#define PSA_SENSITIVE (PSA_LANES == 1 && !PSA_DEVICE)
+
 #if PSA_LANES == 1
 typedef double real;
 typedef int64_t bits;
@@ -28,12 +37,17 @@ typedef uint64_t ubits;
 #define SET_LANE(r, i, value) ((void)(i), (r) = (value))
 #define REAL(c) (c)
 /* Columns of sensitivities, four at a time; with lanes there are none */
+#if PSA_DEVICE
+typedef double column;
+#define COLUMNS 1
+#else
 #if defined(_WIN32) && !defined(__clang__) /* gcc there does not align its stack for vectors (its bug 54412) */
 typedef double column __attribute__((vector_size(32), aligned(8)));
 #else
 typedef double column __attribute__((vector_size(32)));
 #endif
 #define COLUMNS 4
+#endif
 #else
 typedef double real __attribute__((vector_size(8 * PSA_LANES), aligned(8)));
 typedef int64_t bits __attribute__((vector_size(8 * PSA_LANES), aligned(8)));

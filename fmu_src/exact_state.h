@@ -80,10 +80,19 @@ typedef struct {
     real p[EX_NP + 1], k[EX_NK + EX_NRATED + 1];
     real nominal[EX_NX], over_nominal[EX_NX], tolerance, over_tolerance, brief;
     psa_ladder *ladders;                  /* [lengths][lanes] */
+    real *plain, *linear_slopes;          /* matrices of the linear part, their derivatives by EX_NTHETA parameters */
+    double *lin, *balanced;               /* those of one lane and of the unknown parameters */
+    psa_block *terms;                     /* to build a ladder with */
+#if PSA_DEVICE
+    psa_level held;                       /* the last one that was asked for */
+    int held_at;                          /* which of [lengths][finest + 1] it is, -1: none */
+#else
     psa_level *levels;                    /* [lengths][finest + 1] */
     psa_level *mixed;                     /* of lanes whose levels differ; of one parameter's derivatives */
     const psa_level *mixed_from[PSA_LANES];
     char *ready;                          /* [lengths][finest + 1] */
+    void *memory;                         /* what the pointers above are cut from */
+#endif
     double scale[PSA_LANES][NL];
     int thetas;                           /* unknown parameters of the linear part: the first columns */
     int place[MOST_UNKNOWNS + 1];         /* column of each unknown */

@@ -51,9 +51,14 @@ def chain(name: str, entries: Sequence[Entry], rows: int = 1, last: Sequence[int
 
 
 def chains(name: str, texts: Sequence[str]) -> str:
-    """Return chains and the function that calls one of them; with lanes there are no columns."""
+    """Return chains and the function that calls one of them; with lanes there are none."""
     text = "".join(texts) + dispatch(name, len(texts), _OF_COLUMNS)
-    return f"#if PSA_LANES == 1\n{text}#endif\n"
+    return sensitive(text)
+
+
+def sensitive(text: str) -> str:
+    """Return text that stands only where there are derivatives: not with lanes nor on a GPU."""
+    return f"#if PSA_SENSITIVE\n{text}#endif\n"
 
 
 def of_linear_part(
@@ -65,9 +70,7 @@ def of_linear_part(
     of a row are not zero, `linear` which state each is of.
     """
     rows = [*range(len(linear)), *needed]
-    return "\n".join(
-        ["#if PSA_LANES == 1", *_product(reach, rows, linear), *_own(reach, rows), "#endif\n"]
-    )
+    return sensitive("\n".join([*_product(reach, rows, linear), *_own(reach, rows), ""]))
 
 
 def _product(reach: npt.NDArray[np.bool_], rows: Sequence[int], linear: Sequence[int]) -> list[str]:

@@ -14,6 +14,7 @@ from psa_casadi.simulation.exact.columns import (
     chains,
     dispatch,
     of_linear_part,
+    sensitive,
 )
 from psa_casadi.simulation.exact.dependence import closure
 from psa_casadi.simulation.exact.emit import Printer
@@ -33,6 +34,7 @@ def generate(split: Split, output: str) -> str:
     thetas = [k for k in range(s.p.numel()) if ca.depends_on(linear, s.p[k])]
     printer.of_parameters("psa_linear", [linear])
     printer.of_parameters("psa_linear_slopes", [ca.jacobian(linear, s.p[k]) for k in thetas])
+    printer.functions.append(sensitive(printer.functions.pop()))
     group_size, rate_size = _groups(split, printer, rate)
     port_size = _ports(split, printer, tables)
     shown = s.y[[o.name for o in s.outputs].index(output)]

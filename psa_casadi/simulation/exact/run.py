@@ -32,7 +32,7 @@ LANES = 4
 #: Tried steps over the samples, times 2^coarsest, beyond which a run is left to the stepper, which
 #: takes the time of 10 to 60 of them for a sample: at this tolerance of a step, and as its root
 #: below. A set in lanes has no other way.
-MOST, AT, _MOST_IN_LANES = 60, 1e-6, 100_000
+MOST, AT, MOST_IN_LANES = 60, 1e-6, 100_000
 #: Time steps that differ by less than this share count as one, and so many may differ by more.
 ALIKE, LENGTHS = 1e-6, 8
 #: Vectors of four numbers whatever the processor; strict C99 has no vectors.
@@ -83,30 +83,38 @@ class ExactSteps:
 
 def why_not(structure: Structure, output: str) -> str | None:
     """Return why a model's output cannot be had by exact steps; None if it can."""
+    found = _unfit(structure, output) or _compiled(structure, output, 1)
+    return found if isinstance(found, str) else None
+
+
+def _unfit(structure: Structure, output: str) -> str | None:
     if output not in (o.name for o in structure.outputs):
         return f"it has no output {output}"
-    if structure.foreign:
-        return "it calls an FMU, which has no formula"
-    found = _compiled(structure, output, 1)
-    return found if isinstance(found, str) else None
+    return "it calls an FMU, which has no formula" if structure.foreign else None
+
+
+def model_text(structure: Structure, output: str) -> str:
+    """Return a model's generated C (`exact_model.h`); raises NotExact where there is none."""
+    split = _unfit(structure, output) or split_of(structure)
+    if isinstance(split, str):
+        raise NotExact(split)
+    try:
+        return generate(split, output)
+    except Unprintable as reason:
+        raise NotExact(str(reason)) from reason
 
 
 @cache
 def _compiled(structure: Structure, output: str, lanes: int) -> Path | str:
     """Return the model's library, or why there is none; the text is made where it is not cached."""
-
-    def text() -> dict[str, str]:
-        split = split_of(structure)
-        if isinstance(split, str):
-            raise NotExact(split)
-        return {"exact_model.h": generate(split, output)}
-
     optimise = _OPTIMISE if lanes == 1 else _OPTIMISE_LANES
     flags = (*_FLAGS, *optimise, *vector_flags(), f"-DPSA_LANES={lanes}")
     named = repr((fingerprint(structure), output, _generator()))
     try:
-        return generated_library(named, text, ("exact.c",), flags)
-    except (NotExact, Unprintable) as reason:
+        return generated_library(
+            named, lambda: {"exact_model.h": model_text(structure, output)}, ("exact.c",), flags
+        )
+    except NotExact as reason:
         return str(reason)
 
 
@@ -218,7 +226,7 @@ def run_sets(
         "p": _doubles(p), "x0": _doubles(x0), "nominal": _doubles(nominal),
         "shown": np.empty((len(t), sets)),
     }  # fmt: skip
-    limit = _MOST_IN_LANES * len(t)
+    limit = MOST_IN_LANES * len(t)
     how = {"tolerance": tolerance, "coarsest": 0, "steps_limit": limit}
     _run(_library(structure, output, LANES), (t, u, hold), arrays, sets=sets, count=0, **how)
     return arrays["shown"]
