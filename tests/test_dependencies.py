@@ -95,7 +95,7 @@ def test_an_optional_package_is_asked_for_in_a_sentence(extra: str) -> None:
 
 def test_the_developers_install_has_every_extra() -> None:
     (own,) = [r for r in EXTRAS["dev"] if r.name == PROJECT["name"]]
-    assert own.extras == EXTRAS.keys() - {"dev"}
+    assert own.extras == EXTRAS.keys() - {"dev", "gpu"}  # which is large, and for one system
 
 
 def test_the_workflow_runs_every_python_that_is_promised() -> None:

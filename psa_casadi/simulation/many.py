@@ -1,6 +1,9 @@
-"""One record under many sets of parameters: in the lanes of a core's vectors, on all cores."""
+"""One record under many sets of parameters: in the lanes of a core's vectors, or on a GPU."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -8,14 +11,20 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
+from psa_casadi.simulation.device.run import Numbers, Task, device_module, run_on_device
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_sets
+from psa_casadi.simulation.reductions import REDUCTIONS, Reduction, ReductionName
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on
+from psa_casadi.simulation.starts import starts_on
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way, output_of, trace
 
 FloatArray = npt.NDArray[np.float64]
+
+Device = Literal["cpu", "cuda"]
+_Reduce = Callable[[FloatArray], npt.ArrayLike]
 
 
 def simulate_many(
@@ -24,7 +33,8 @@ def simulate_many(
     record: Record,
     *,
     rtol: float = 1e-6,
-    reduce: Callable[[FloatArray], npt.ArrayLike] | None = None,
+    reduce: ReductionName | _Reduce | None = None,
+    device: Device = "cpu",
 ) -> FloatArray:
     """Simulate a record under many sets of parameter values (SI units); returns (len(sets), n) [m].
 
@@ -35,17 +45,87 @@ def simulate_many(
 
     `reduce` makes of each displacement (n,) [m] what is kept of it, a number or an array of one
     shape, and the result is (len(sets), *shape): memory then holds a few displacements at a time,
-    where 10^4 sets of 10^4 samples take 0.8 GB. Several threads call it.
+    where 10^4 sets of 10^4 samples take 0.8 GB. Several threads call it. By name there are "range",
+    "peak" (the largest magnitude), "last" and "misfit" (root mean square of the distance from the
+    record's displacement), all in metres.
 
-    Raises InputError for an unknown parameter, a value out of bounds, or a model without output.
+    `device="cuda"` runs one set a thread of an NVIDIA GPU, in double precision and by the same
+    equations (extra `gpu`). What `reduce` names is made there, so that no displacement leaves it;
+    whole rows and other functions of them are for fewer sets. It takes models and records that
+    exact steps fit.
+
+    Raises InputError for an unknown parameter, a value out of bounds, a model without output, a
+    name that `reduce` does not know, a record without what it needs, or a missing GPU.
     """
     output = output_of(model)
     if output is None:
         raise InputError(["The model has no displacement; use `run` for models of other kinds."])
-    for values in sets:
-        model.with_values(values)  # mistakes are told before work begins
+    if device not in get_args(Device):
+        raise InputError(f"There is no device {device!r}; choose one of {get_args(Device)}.")
+    if device == "cuda":
+        device_module()  # told before work begins
+    kept = _named(reduce) if isinstance(reduce, str) else reduce
+    meant = _meant(record) if reduce == "misfit" else np.zeros(record.n)
     t, u = record.time - record.time[0], record_inputs(model, record, record.n)
-    whole = np.empty((len(sets) if reduce is None else 0, record.n))
+    work = _Work(
+        model, sets, *_numbers(model, sets), Task(model.structure, output, t, u, meant, rtol)
+    )
+    if device == "cuda":
+        return _on_device(work, kept)
+    return _on_cores(work, kept.beside(meant) if isinstance(kept, Reduction) else kept)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """A task under sets of parameters p (np, m), with the sizes `nominal` (nx, m) of the states."""
+
+    model: Model
+    sets: Sequence[Mapping[str, float]]
+    p: FloatArray
+    nominal: FloatArray
+    task: Task
+
+    def numbers(self, which: range) -> Numbers:
+        """Return the numbers of some of the sets, with their starts."""
+        p, nominal = (a[:, which.start : which.stop] for a in (self.p, self.nominal))
+        return Numbers(p, starts_on(self.model, p, nominal, self.task.t, self.task.u), nominal)
+
+
+def _numbers(model: Model, sets: Sequence[Mapping[str, float]]) -> tuple[FloatArray, FloatArray]:
+    """Return parameters (np, m) and usual sizes of states (nx, m); mistakes are told here."""
+    p, nominal = (
+        np.empty((len(sets), k.size)) for k in (model.parameter_vector(), model.state_nominals())
+    )
+    for k, values in enumerate(sets):
+        one = model.with_values(values)
+        p[k], nominal[k] = one.parameter_vector(), one.state_nominals()
+    return p.T, nominal.T
+
+
+def _named(name: str) -> Reduction:
+    for known, reduction in REDUCTIONS.items():
+        if known == name:
+            return reduction
+    raise InputError(
+        f"There is no reduction {name!r}; choose one of {tuple(REDUCTIONS)}, or give a function of"
+        " a displacement."
+    )
+
+
+def _meant(record: Record) -> FloatArray:
+    """Return what was measured [m]."""
+    if record.displacement is None or record.displacement_unit != "m":
+        raise InputError(
+            f"reduce='misfit' needs the displacement of the record {record.name!r} in metres, and"
+            " it has none; read it with its displacement column, or keep something else."
+        )
+    return record.displacement
+
+
+def _on_cores(work: _Work, reduce: _Reduce | None) -> FloatArray:
+    """Run sets in lanes on all cores, or one by one in the stepper."""
+    task, count, n = work.task, len(work.sets), len(work.task.t)
+    whole = np.empty((count if reduce is None else 0, n))
 
     def kept(rows: FloatArray, which: range) -> list[FloatArray]:
         if reduce is not None:
@@ -54,34 +134,43 @@ def simulate_many(
         return []
 
     def lanes(which: range) -> list[FloatArray]:
-        group = [model.with_values(sets[k]) for k in which]
-        p, x0, nominal = (
-            np.array(rows).T
-            for rows in (
-                [m.parameter_vector() for m in group],
-                [start_on(m, t, u).x for m in group],
-                [m.state_nominals() for m in group],
-            )
-        )
+        p, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
         found = run_sets(
-            model.structure, t, u, p=p, x0=x0, nominal=nominal, tolerance=rtol, output=output
-        )
+            task.structure, task.t, task.u, p=p, x0=x0, nominal=nominal,
+            tolerance=task.tolerance, output=task.output,
+        )  # fmt: skip
         return kept(found.T, which)
 
     def alone(which: range) -> list[FloatArray]:
-        one = model.with_values(sets[which.start])
+        one = work.model.with_values(work.sets[which.start])
+        way = Way(task.tolerance, task.tolerance, stepped=True)
         try:
-            x0, way = start_on(one, t, u).x, Way(rtol, rtol, stepped=True)
-            row = trace(one, t, u, x0, way=way, output=output).output
+            x0 = start_on(one, task.t, task.u).x
+            row = trace(one, task.t, task.u, x0, way=way, output=task.output).output
         except SimulationError:
-            row = np.full(record.n, np.nan)
+            row = np.full(n, np.nan)
         return kept(row[None], which)
 
     try:
-        rows = side_by_side(lanes, _parts(len(sets), LANES))
+        numbers = work.numbers(range(count))
+        rows = side_by_side(lanes, _parts(count, LANES))
     except NotExact:
-        rows = side_by_side(alone, _parts(len(sets), 1))
+        rows = side_by_side(alone, _parts(count, 1))
     return whole if reduce is None else np.array([row for group in rows for row in group])
+
+
+def _on_device(work: _Work, reduce: Reduction | _Reduce | None) -> FloatArray:
+    """Run sets on a GPU, one a thread."""
+    count, n = len(work.sets), len(work.task.t)
+    found: list[FloatArray] = [np.empty((0, n))] if reduce is None else []
+    named = isinstance(reduce, Reduction)
+    parts = partial(_parts, count)
+    for summary, rows in run_on_device(work.task, parts, work.numbers, whole=not named):
+        if isinstance(reduce, Reduction):
+            found.append(reduce.of_summary(summary, n))
+        elif rows is not None:
+            found.append(rows if reduce is None else np.array([reduce(row) for row in rows]))
+    return np.concatenate(found) if found else np.empty(0)
 
 
 def _parts(count: int, size: int) -> list[range]:

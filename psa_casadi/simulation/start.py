@@ -19,7 +19,7 @@ from psa_casadi.model.compose import Model, Structure
 
 FloatArray = npt.NDArray[np.float64]
 
-_NEWTON_STEPS = 30
+NEWTON_STEPS = 30
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def start_state(
             "An imported FMU has no second derivatives, which a settled start needs; it can only"
             " begin at its start values."
         )
-    settle, rest, moving = _functions(structure)
+    settle, rest, moving = start_functions(structure)
     names = memory_names(structure)
     deviation = np.array([(memory or {}).get(n, 0.0) for n in names])
     u, w = np.array(inputs, dtype=float), np.array(rates or [0.0] * len(inputs), dtype=float)
@@ -132,7 +132,7 @@ def _at_rest(
     """Return where Newton's method leads from x; `where` is time and what comes behind x."""
     x = x.copy()
     step = _Call(newton, (where[0], x, *where[1:]))
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS):
         new = step()[0][:, 0]
         with np.errstate(invalid="ignore"):  # overflow ends in nan, which is no equilibrium
             change = np.max(np.abs(new - x) / (np.abs(new) + nominal), initial=0.0)
@@ -140,11 +140,16 @@ def _at_rest(
         if not change > 1e-13:
             break
     if not change < 1e-9:
-        raise PsaError(
-            "The state at the start of the record has no equilibrium; the parameter values are the"
-            " likely cause: check them."
-        )
+        raise no_equilibrium()
     return x
+
+
+def no_equilibrium() -> PsaError:
+    """Return what is raised where Newton's method finds no rest."""
+    return PsaError(
+        "The state at the start of the record has no equilibrium; the parameter values are the"
+        " likely cause: check them."
+    )
 
 
 class _Call:
@@ -176,7 +181,7 @@ def _memory(array: FloatArray) -> Any:
 
 
 @cache
-def _functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
+def start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return a Newton step for all that settles, one for the states without memory, the motion."""
     s = structure
     memory = [i for i, state in enumerate(s.states) if state.memory]

@@ -1,0 +1,160 @@
+"""Many sets of parameters on a GPU: a kernel through CuPy, in batches that fit its memory."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Structure
+from psa_casadi.simulation.device.kernel import OPTIONS, kernel_text
+from psa_casadi.simulation.exact.run import FINEST, MOST_IN_LANES, NotExact, time_steps
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Sets in one launch at most, threads of a block, and the share of free memory that is taken.
+BATCH, _BLOCK, _SHARE = 1 << 17, 128, 0.5
+_INSTEAD = "or leave `device` out, which simulates on all cores."
+
+
+class Summary(NamedTuple):
+    """What the device keeps of displacements: (m,) numbers of m sets [m]; nan where a set ended.
+
+    `squares` is the sum of the squares of the distances from what was measured [m^2].
+    """
+
+    least: FloatArray
+    largest: FloatArray
+    last: FloatArray
+    squares: FloatArray
+
+
+@dataclass(frozen=True)
+class Task:
+    """A model's output under inputs `u` (n, nu) at times `t` (n,) [s], compared with `meant` (n,).
+
+    `tolerance` bounds the error of a step over the states' nominal sizes.
+    """
+
+    structure: Structure
+    output: str
+    t: FloatArray
+    u: FloatArray
+    meant: FloatArray
+    tolerance: float
+
+
+class Numbers(NamedTuple):
+    """Parameters p (np, m), initial states and nominal sizes (nx, m) of m sets."""
+
+    p: FloatArray
+    x0: FloatArray
+    nominal: FloatArray
+
+
+def device_module() -> Any:
+    """Return the module cupy; raises InputError where it or a GPU is missing."""
+    try:
+        cupy = import_module("cupy")
+    except ImportError as error:
+        raise InputError(
+            f"device='cuda' needs CuPy, which cannot be loaded ({error}); run"
+            f" `pip install 'psa-casadi[gpu]'` on a machine with an NVIDIA GPU, {_INSTEAD}"
+        ) from error
+    try:
+        count = cupy.cuda.runtime.getDeviceCount()
+    except RuntimeError as error:
+        raise InputError(
+            f"device='cuda' finds no GPU ({error}); an NVIDIA GPU with a driver for CUDA 12 is"
+            f" needed: see what `nvidia-smi` lists, install the driver, {_INSTEAD}"
+        ) from error
+    if not count:
+        raise InputError(
+            "device='cuda' finds no GPU that this process may use (CUDA_VISIBLE_DEVICES may hide"
+            f" it); lend it one, {_INSTEAD}"
+        )
+    return cupy
+
+
+def run_on_device(
+    task: Task, parts: Callable[[int], Iterable[range]], numbers: Callable[[range], Numbers],
+    *, whole: bool,
+) -> Iterator[tuple[Summary, FloatArray | None]]:  # fmt: skip
+    """Yield the sets' summaries batch by batch, with their displacements (m, n) if `whole`.
+
+    `parts` divides the sets into batches of at most so many, `numbers` gives those of a batch: the
+    device works while those of the next are made. Raises InputError where there is no device, or
+    model and record are not for exact steps.
+    """
+    launch = _Launch(device_module(), task, whole=whole)
+    waiting: tuple[Any, Any] | None = None
+    for which in parts(launch.batch):
+        given = numbers(which)
+        if waiting is not None:
+            yield launch.fetched(*waiting)
+        waiting = launch(given)
+    if waiting is not None:
+        yield launch.fetched(*waiting)
+
+
+class _Launch:
+    """A task on the device: what all batches share, and one launch of the kernel a batch."""
+
+    def __init__(self, cupy: Any, task: Task, *, whole: bool) -> None:
+        self._cupy, self._whole, self._task = cupy, whole, task
+        try:
+            lengths, which_step = time_steps(task.t)
+            self._kernels = _kernels(cupy, task.structure, task.output)
+        except NotExact as error:
+            raise InputError(
+                f"device='cuda' is for models and records that exact steps fit: {error}; choose"
+                f" another, {_INSTEAD}"
+            ) from error
+        self._record = [cupy.asarray(np.ascontiguousarray(a)) for a in (task.t, task.u)]
+        self._steps = [cupy.asarray(lengths), cupy.asarray(which_step)]
+        self._meant = cupy.asarray(task.meant)
+        size = cupy.empty(1, np.int64)
+        measure = self._kernels.get_function("psa_exact_room")
+        measure((1,), (1,), (np.int32(len(lengths)), np.int32(FINEST), size))
+        self._room = int(cupy.asnumpy(size)[0])
+        states, rows = len(task.structure.states), len(task.structure.parameters)
+        each = self._room + 8 * (rows + 2 * states + 4 + (2 * len(task.t) if whole else 0))
+        free = cupy.cuda.Device().mem_info[0]
+        self.batch = int(max(1, min(BATCH, _SHARE * free / each)))
+        self._rooms: Any = None
+
+    def __call__(self, numbers: Numbers) -> tuple[Any, Any]:
+        """Launch the kernel for a batch; return the summary (4, m) and (n, m) on the device."""
+        cupy, task, sets, n = self._cupy, self._task, numbers.p.shape[1], len(self._task.t)
+        if self._rooms is None:  # the first batch is the largest
+            self._rooms = cupy.empty(sets * self._room, np.int8)
+        summary = cupy.empty((4, sets))
+        shown = cupy.empty((n, sets)) if self._whole else np.intp(0)  # NULL
+        self._kernels.get_function("psa_exact_sets")(
+            (-(-sets // _BLOCK),),
+            (_BLOCK,),
+            (
+                np.int64(sets), np.int64(n), *self._record, np.int32(0),
+                np.int32(len(self._steps[0])), *self._steps,
+                *(cupy.asarray(np.ascontiguousarray(a)) for a in numbers),
+                np.float64(task.tolerance), np.int32(FINEST),
+                np.int64(min(MOST_IN_LANES * n, 2**31 - 1)), self._meant, self._rooms,
+                np.int64(self._room), summary, shown,
+            ),
+        )  # fmt: skip
+        return summary, shown
+
+    def fetched(self, summary: Any, shown: Any) -> tuple[Summary, FloatArray | None]:
+        """Wait for a batch; return what it left."""
+        kept = Summary(*self._cupy.asnumpy(summary))
+        return kept, self._cupy.asnumpy(shown).T if self._whole else None
+
+
+@cache
+def _kernels(cupy: Any, structure: Structure, output: str) -> Any:
+    """Return a model's compiled kernels; CuPy keeps them in its own cache, too."""
+    return cupy.RawModule(code=kernel_text(structure, output), options=OPTIONS)
