@@ -100,7 +100,7 @@ def start_state(
     x = settled
     if any(s.memory and s.settles for s in structure.states):
         x = _at_rest(rest, settled, (now, u, p, deviation, settled), nominal)
-    final, by_p, by_memory = _Call(moving, (now, x, u, p, deviation, settled, w))()
+    final, by_p, by_memory = Call(moving, (now, x, u, p, deviation, settled, w))()
     return Start(final[:, 0], by_p, by_memory)
 
 
@@ -131,7 +131,7 @@ def _at_rest(
 ) -> FloatArray:
     """Return where Newton's method leads from x; `where` is time and what comes behind x."""
     x = x.copy()
-    step = _Call(newton, (where[0], x, *where[1:]))
+    step = Call(newton, (where[0], x, *where[1:]))
     for _ in range(NEWTON_STEPS):
         new = step()[0][:, 0]
         with np.errstate(invalid="ignore"):  # overflow ends in nan, which is no equilibrium
@@ -152,7 +152,7 @@ def no_equilibrium() -> PsaError:
     )
 
 
-class _Call:
+class Call:
     """One function with dense results, evaluated in place: `results` follow from the `arguments`.
 
     An ordinary call takes five times as long, most of it for its arguments. A call belongs to one
@@ -171,6 +171,7 @@ class _Call:
             self._buffer.set_res(i, _memory(result))
 
     def __call__(self) -> list[FloatArray]:
+        """Evaluate for what the arguments hold now; return `results`."""
         self._run()
         return self.results
 
