@@ -13,9 +13,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from psa_casadi.cache import cached
+from psa_casadi.simulation import many
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
+from psa_casadi.simulation.device import run
 
 _BEFORE = """\
 #define __global__ __attribute__((visibility("default")))
@@ -41,12 +44,21 @@ class HostCuda:
 
     def __init__(self, free: int) -> None:
         self.launches: list[int] = []
-        device = SimpleNamespace(mem_info=(free, free))
-        self.cuda = SimpleNamespace(Device=lambda: device)
+        device = SimpleNamespace(mem_info=(free, free), id=0)
+        told = SimpleNamespace(getDeviceProperties=lambda _: {"name": b"this processor"})
+        self.cuda = SimpleNamespace(Device=lambda: device, runtime=told)
 
     def RawModule(self, *, code: str, options: tuple[str, ...]) -> "HostModule":  # noqa: N802
         assert "--fmad=false" in options
         return HostModule(code, self.launches)
+
+
+def lend(monkeypatch: pytest.MonkeyPatch, free: int) -> HostCuda:
+    """Put this processor with so much memory in the place of a GPU; return it."""
+    host = HostCuda(free)
+    for module in (many, run):
+        monkeypatch.setattr(module, "device_module", lambda: host)
+    return host
 
 
 class HostModule:

@@ -1,14 +1,27 @@
 """The benchmark `ensembles`: every way solves the same problem, and equal error is what it says."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
+from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.simulation.device import run as device
 from tests.benchmarks import ensembles, ensembles_peers
 from tests.benchmarks.ensembles import Case, cases, drawn, loosest, measured
+from tests.benchmarks.ensembles_gpu import on_gpu
 from tests.benchmarks.ensembles_peers import Peer, Solve, Work, peers
+from tests.cuda_host import lend
+
+
+@pytest.fixture(autouse=True)
+def _no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent() -> None:
+        raise InputError("there is none.")
+
+    monkeypatch.setattr(device, "device_module", absent)
 
 
 def short() -> Case:
@@ -47,6 +60,19 @@ def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPa
     assert all(float(row[4]) <= 1e-5 for row in beside.table.rows)
     assert beside.table.rows[0][6] == "1.0"
     assert "pip install --group ensembles" in beside.note
+    assert whole.note.endswith("No rows of a GPU: there is none.")
+
+
+def test_a_gpu_has_rows_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve sets, on this processor in the place of a GPU."""
+    host = lend(monkeypatch, 10**9)
+    model = stack_model("P-885.51")
+    tables, missing = on_gpu(told, model, [(short().record, 1e-6)], partial(drawn, model), 12)
+    assert not missing
+    (row,) = tables[0].table.rows
+    assert row[:5] == ("sine of 10 Hz", "12", "40", "1e-06", "0.0e+00")
+    assert "this processor" in tables[0].note
+    assert host.launches == [1, 128, 1, 128]
 
 
 def test_a_way_that_is_never_accurate_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import compose
-from psa_casadi.simulation import many
 from psa_casadi.simulation.device import run as device
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.starts import starts_on
-from tests.cuda_host import HostCuda
+from tests.cuda_host import HostCuda, lend
 from tests.exact_cases import KINK
 from tests.stack_models import stack
 from tests.test_many import record, sets
@@ -33,14 +32,7 @@ SMALL = 400_000
 @pytest.fixture
 def host(monkeypatch: pytest.MonkeyPatch) -> HostCuda:
     """Put this processor in the place of a GPU with little memory."""
-    found = HostCuda(SMALL)
-    _lend(monkeypatch, found)
-    return found
-
-
-def _lend(monkeypatch: pytest.MonkeyPatch, cupy: HostCuda) -> None:
-    for module in (many, device):
-        monkeypatch.setattr(module, "device_module", lambda: cupy)
+    return lend(monkeypatch, SMALL)
 
 
 def test_the_kernel_has_the_bits_of_the_lanes(host: HostCuda) -> None:
@@ -117,6 +109,15 @@ def test_what_a_gpu_cannot_do_is_told(host: HostCuda) -> None:
         simulate_many(model, [{}], record(), reduce="misfit")
     assert not host.launches
     assert simulate_many(model, [], record(), device="cuda").shape == (0, 600)
+
+
+def test_a_gpu_that_fails_is_told(host: HostCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(shape: object, dtype: object = None) -> None:
+        raise MemoryError("out of memory allocating 512 bytes")
+
+    monkeypatch.setattr(host, "empty", full)
+    with pytest.raises(MachineError, match=r"GPU failed \(out of memory .*nvidia-smi"):
+        simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
 
 
 class _NoDriver:

@@ -56,7 +56,8 @@ def simulate_many(
     exact steps fit.
 
     Raises InputError for an unknown parameter, a value out of bounds, a model without output, a
-    name that `reduce` does not know, a record without what it needs, or a missing GPU.
+    name that `reduce` does not know, a record without what it needs, or a missing GPU; MachineError
+    where the GPU fails.
     """
     output = output_of(model)
     if output is None:

@@ -21,6 +21,7 @@ from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.side_by_side import threads
+from tests.benchmarks.ensembles_gpu import MORE, on_gpu
 from tests.benchmarks.ensembles_peers import At, Peer, Solve, Work, peers
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable
 
@@ -94,8 +95,11 @@ def measured(
     progress: Progress, given: Sequence[Case], count: int, part: int, ways: Sequence[Peer],
     absent: str = "",
 ) -> Outcome:  # fmt: skip
-    """Measure all sets of each case by `simulate_many`, and `part` samples of it by the others."""
-    model, whole, beside, doubts = stack_model("P-885.51"), [], [], []
+    """Measure all sets of each case by `simulate_many`, and `part` samples of it by the others.
+
+    Where there is a GPU, it runs 100 times as many.
+    """
+    model, whole, beside, doubts, done = stack_model("P-885.51"), [], [], [], []
     sets = drawn(model, max(count, *(way.sets for way in ways)))
     for case in given:
         progress(f"{case.name}: reference")
@@ -106,6 +110,7 @@ def measured(
         doubts.append(float(np.max(apart) / np.ptp(truth[0])))
         progress(f"{case.name}: {OURS}, {count} sets")
         ours = loosest(partial(_of_many, model, sets, work), truth)
+        done.append((case.record, ours.tolerance))
         wall, spent = _whole(model, sets[:count], case.record, ours.tolerance)
         each = spent / count / len(case.times)
         whole.append((
@@ -118,9 +123,11 @@ def measured(
             found = loosest(way.prepare(work.first(way.sets)), truth)
             theirs = least_time(found.solve) / way.sets / part
             beside.append(_row(case, way.name, way.sets, part, found, theirs, each))
+    gpu, missing = on_gpu(progress, model, done, partial(drawn, model), MORE * count)
     return Outcome((
         TitledTable("Many sets of parameters of a full stack", Table(_HEAD, tuple(whole)),
-                    _NOTE.format(threads(), _JUDGED, part, number(max(doubts), 2))),
+                    _NOTE.format(threads(), _JUDGED, part, number(max(doubts), 2)) + missing),
+        *gpu,
         TitledTable("Others on a part of the work, at equal error",
                     Table(_BESIDE, tuple(beside)), _BESIDE_NOTE.format(WANTED) + absent),
     ))  # fmt: skip

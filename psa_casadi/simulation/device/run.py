@@ -1,6 +1,7 @@
 """Many sets of parameters on a GPU: a kernel through CuPy, in batches that fit its memory."""
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import Structure
 from psa_casadi.simulation.device.kernel import OPTIONS, kernel_text
 from psa_casadi.simulation.exact.run import FINEST, MOST_IN_LANES, NotExact, time_steps
@@ -88,17 +89,34 @@ def run_on_device(
 
     `parts` divides the sets into batches of at most so many, `numbers` gives those of a batch: the
     device works while those of the next are made. Raises InputError where there is no device, or
-    model and record are not for exact steps.
+    model and record are not for exact steps, MachineError where the device fails.
     """
-    launch = _Launch(device_module(), task, whole=whole)
+    with _failures():
+        launch = _Launch(device_module(), task, whole=whole)
     waiting: tuple[Any, Any] | None = None
     for which in parts(launch.batch):
         given = numbers(which)
-        if waiting is not None:
-            yield launch.fetched(*waiting)
-        waiting = launch(given)
+        with _failures():
+            found = launch.fetched(*waiting) if waiting is not None else None
+            waiting = launch(given)
+        if found is not None:
+            yield found
     if waiting is not None:
-        yield launch.fetched(*waiting)
+        with _failures():
+            found = launch.fetched(*waiting)
+        yield found
+
+
+@contextmanager
+def _failures() -> Iterator[None]:
+    """Say what fails on the device; CuPy's errors are of these two kinds."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        raise MachineError(
+            f"The GPU failed ({error}); too little free memory is the likely cause: `nvidia-smi`"
+            f" says what else it holds. End that, {_INSTEAD}"
+        ) from error
 
 
 class _Launch:
