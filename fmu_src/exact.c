@@ -288,7 +288,7 @@ static char *piece(char *memory, size_t *size, size_t more) {
 
 #define PIECE(type, count) ((type *)piece(memory, &size, (size_t)(count) * sizeof(type)))
 
-/* Cut what a run needs from zeroed memory, which may be NULL; its size in bytes */
+/* Cut what a run needs from memory, which may be NULL; its size in bytes. Levels, and which are ready, must be 0. */
 static size_t cut(psa_state *state, char *memory) {
     const psa_exact *const run = state->run;
     const int one = NL * (NL + EX_NU + 1), ladders = run->lengths * PSA_LANES, below = run->finest + 2;

@@ -40,13 +40,17 @@ _ITEMS = {**{name: kind for name, (kind, _) in _SCALARS.items()}, "char": np.int
 class HostCuda:
     """The few names of the module cupy; `free` bytes of memory are said to be there."""
 
-    asarray, empty, asnumpy = staticmethod(np.array), staticmethod(np.empty), staticmethod(np.array)
+    asarray, asnumpy = staticmethod(np.array), staticmethod(np.array)
 
     def __init__(self, free: int) -> None:
         self.launches: list[int] = []
         device = SimpleNamespace(mem_info=(free, free), id=0)
         told = SimpleNamespace(getDeviceProperties=lambda _: {"name": b"this processor"})
         self.cuda = SimpleNamespace(Device=lambda: device, runtime=told)
+
+    def empty(self, shape: int | tuple[int, ...], dtype: Any = np.float64) -> Any:
+        """Return memory full of what must not be read: numbers in it are nan."""
+        return np.full(shape, np.nan if dtype is np.float64 else -1, dtype)
 
     def RawModule(self, *, code: str, options: tuple[str, ...]) -> "HostModule":  # noqa: N802
         assert "--fmad=false" in options

@@ -114,8 +114,9 @@ def _failures() -> Iterator[None]:
         yield
     except (MemoryError, RuntimeError) as error:
         raise MachineError(
-            f"The GPU failed ({error}); too little free memory is the likely cause: `nvidia-smi`"
-            f" says what else it holds. End that, {_INSTEAD}"
+            f"The GPU failed ({error}); too little free memory (`nvidia-smi` says what holds it) or"
+            " a CuPy without CUDA's compiler (`pip install 'psa-casadi[gpu]'` brings it) is the"
+            f" likely cause: mend it, {_INSTEAD}"
         ) from error
 
 
