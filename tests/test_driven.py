@@ -24,7 +24,7 @@ from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
 from tests.report_cases import diagnosis
 from tests.test_cli import done
-from tests.tiers import slow
+from tests.tiers import slow, slow_but
 
 TIME: FloatArray = np.arange(2000, dtype=float) * 1e-3
 VOLTAGE = 50.0 - 50.0 * np.cos(2 * np.pi * TIME)
@@ -38,7 +38,7 @@ def shown() -> FloatArray:
     return found + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
 
 
-@pytest.mark.parametrize("kind", ["noise", "drift", "another device"])
+@pytest.mark.parametrize("kind", slow_but(["noise"], ["noise", "drift", "another device"]))
 def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
     rng = np.random.default_rng(1)
     y: FloatArray = {
@@ -63,7 +63,7 @@ def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
     )
 
 
-@pytest.mark.parametrize("factor", [1e-6, 1e3])
+@pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
 def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray) -> None:
     found = diagnose(
         [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=factor * shown)], effects=TABLE
@@ -123,6 +123,7 @@ def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: Float
         diagnose([Record(name="r", time=TIME, voltage=VOLTAGE, displacement=bit)], effects=TABLE)
 
 
+@slow
 def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArray) -> None:
     hold = Record(
         name="hold",

@@ -51,6 +51,7 @@ def _with_spectrum(**values: Any) -> Model:
     return compose(own, {"u_rated": 120.0, "play_0": -0.05, "square_0": 0.02, **values})
 
 
+@slow
 def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
     record = psa.record_from(_loops())
     bouc_wen = psa.identify(record)

@@ -19,7 +19,7 @@ from tests.tiers import slow_but
 
 
 @pytest.mark.usefixtures("code_runs_here")
-@pytest.mark.parametrize("name", slow_but(["position_controller", "flexure_stage"], PARTS))
+@pytest.mark.parametrize("name", slow_but(["position_controller"], PARTS))
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_a_part_passes_the_check_as_an_fmu(name: str, fmi: int, tmp_path: Path) -> None:
     path = export_fmu(part_model(name), tmp_path / f"{name}.fmu", fmi=fmi)

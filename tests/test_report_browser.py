@@ -16,7 +16,7 @@ from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone
 from tests.report_cases import diagnosis, identification
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 pytestmark = pytest.mark.xdist_group("browser")
 
@@ -62,6 +62,7 @@ def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: P
         assert re.search(r'class="(js-line|point|hm|trace)', box), "axes without any curve"
 
 
+@slow
 def test_a_still_picture_is_seen_where_scripts_are_off(browser: Browser, page: Path) -> None:
     off = page.with_name("off.html")
     none = """<head><meta http-equiv="Content-Security-Policy" content="script-src 'none'">"""
@@ -115,6 +116,7 @@ def test_text_is_legible_on_a_phone(told: dict[str, Any]) -> None:
     assert told["smallest"] >= 9
 
 
+@slow
 def test_it_is_bright_by_day_and_dark_at_night(browser: Browser, page: Path) -> None:
     day = pixels(browser.screenshot(page, 1280, 1800))
     night = pixels(browser.screenshot(page, 1280, 1800, DARK))
@@ -129,6 +131,7 @@ def test_it_is_bright_by_day_and_dark_at_night(browser: Browser, page: Path) -> 
     assert np.sum(np.all(np.abs(day - BLUE) < 0.02, axis=2)) > 2000
 
 
+@slow
 def test_a_screenshot_of_a_phone_is_filled(browser: Browser, page: Path) -> None:
     image = pixels(browser.screenshot(on_a_phone(page, 1800), 500, 1800))[:, :PHONE]
     assert colours(image) > 40
@@ -139,6 +142,7 @@ def test_a_screenshot_of_a_phone_is_filled(browser: Browser, page: Path) -> None
     assert not np.any(np.abs(image[:, -4:] - np.median(image)) > 0.2)
 
 
+@slow
 def test_a_page_prints_on_few_sheets(browser: Browser, page: Path) -> None:
     path = page.with_suffix(".pdf")
     browser.document(page, DARK, f"--print-to-pdf={path}")
