@@ -40,7 +40,7 @@ ELSEWHERE = {
     "temperature": "test_hidden_effects",
 }  # fmt: skip
 #: Foreign causes of which one is tried here for each verdict: the benchmark `diagnose` has all.
-TRIED = ("dead_zone_hysteresis", "dry_friction")
+TRIED = ("floor_vibration", "dry_friction")
 #: What looks like two causes of which the third remains.
 LIKE_THREE = ("temperature", "self_heating", "structural_mode", "slow_creep", "drive_lag",
               "hysteresis_memory", "ageing")  # fmt: skip
