@@ -126,11 +126,13 @@ def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
 
 @pytest.mark.parametrize(
     "effects",
-    [SETS[0], *(pytest.param(s, marks=slow) for s in SETS[1 : len(ALL)]), EVERY],
+    [SETS[0], EVERY],
     ids=name_of,
 )
 def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
     """An effect of gain 0 adds to no equation: both runs have the base's trajectory.
+
+    With all effects at once, as what one of them added would show; equations of each one: above.
 
     The rule is the tolerance of a step: after one step for each sample they may differ by 1e-8 of
     a variable's largest value. Steps are not counted against each other: Newton's stopping test and
@@ -236,9 +238,7 @@ def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
         assert convert(1.0, variable.unit, unit) > 0.0
 
 
-@pytest.mark.parametrize(
-    "effects", [(), *(pytest.param((e,), marks=slow) for e in ALL), EVERY], ids=name_of
-)
+@pytest.mark.parametrize("effects", [(), EVERY], ids=name_of)
 def test_c_value_is_the_casadi_value(effects: tuple[Component, ...]) -> None:
     generator = np.random.default_rng(4)
     for gains in (True, True, True, False):

@@ -40,7 +40,7 @@ FULL = {
     "records-xlsx": 150, "records-tdms": 300, "records-h5": 10, "records-npz": 300,
     "records-npy": 300, "records-lvm": 300, "records-dat": 300,
     "column-maps": 3000, "mapped-records": 500, "units": 2000, "models": 750, "paths": 1000,
-    "binaries": 3000, "zips": 150, "descriptions": 500, "states": 500,
+    "binaries": 1500, "zips": 150, "descriptions": 500, "states": 250,
 }  # fmt: skip
 #: Commands, which take seconds each.
 COMMANDS = {
