@@ -9,6 +9,7 @@ from psa_casadi.model.stacks import stack_model
 from tests.benchmarks import ensembles, ensembles_peers
 from tests.benchmarks.ensembles import Case, cases, drawn, loosest, measured
 from tests.benchmarks.ensembles_peers import Peer, Solve, Work, peers
+from tests.tiers import slow
 
 
 def short() -> Case:
@@ -36,6 +37,7 @@ def test_the_loosest_tolerance_is_the_first_that_is_accurate() -> None:
     assert never.error == np.inf
 
 
+@slow
 def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight sets of 40 samples, scipy and CVODES beside `simulate_many`."""
     monkeypatch.setattr(ensembles_peers, "find_spec", lambda _: None)

@@ -23,7 +23,7 @@ from psa_casadi.simulation.stepper import run
 from psa_casadi.units import convert
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 from tests.random_models import Point, random_model, random_point
-from tests.tiers import slow
+from tests.tiers import slow, slow_but
 
 FloatArray = NDArray[np.float64]
 
@@ -37,6 +37,8 @@ SETS = [
 #: All effects at once take long to compile.
 EVERY = pytest.param(ALL, marks=slow)
 every_effect = pytest.mark.parametrize("effect", ALL, ids=lambda e: e.name)
+#: What runs the compiled model is tried with every fourth effect in the quick tier.
+each_in_turn = pytest.mark.parametrize("effect", slow_but(ALL[::4], ALL), ids=lambda e: e.name)
 
 
 def name_of(effects: tuple[Component, ...]) -> str:
@@ -153,7 +155,7 @@ def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
         assert np.all(differences <= 1e-8 * ranges)
 
 
-@every_effect
+@each_in_turn
 def test_a_gain_changes_what_is_measured(effect: Component) -> None:
     """At its ordinary size every effect shows: by more than 1e-4 of the stroke, and alone."""
     model = random_model((effect,), np.random.default_rng(3), gains=True)
@@ -291,7 +293,7 @@ def test_generated_jacobians_are_the_slopes_of_the_model(effect: Component) -> N
         assert np.all(np.abs(found - wanted) <= 1e-5 * np.abs(wanted) + 1e-7 * np.abs(size))
 
 
-@every_effect
+@each_in_turn
 def test_sensitivities_are_differences_of_runs(effect: Component) -> None:
     """Steps that end at a reversal move with the parameters; their lengths count as constant."""
     model = random_model((effect,), np.random.default_rng(6), gains=True)

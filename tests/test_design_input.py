@@ -83,6 +83,7 @@ def test_limits_are_kept_and_cost_accuracy(limits: AmplifierLimits) -> None:
     assert found.error.rms > 10.0 * a_design().error.rms
 
 
+@slow
 def test_minimax_lowers_the_largest_error() -> None:
     found = track(scanner(), a_scan(), minimax=True, corrections=1)
     assert found.error.largest < 0.98 * a_design().error.largest
@@ -244,6 +245,7 @@ def _on_fmu(folder: Path, *, nested: bool) -> tuple[np.ndarray, np.ndarray]:
     return slopes[0], slopes[1]
 
 
+@slow
 def test_the_equations_of_an_fmu_have_the_derivatives_of_the_model(tmp_path: Path) -> None:
     by_fmu, by_model = _on_fmu(tmp_path, nested=False)
     assert by_fmu == pytest.approx(by_model, abs=1e-5 * np.abs(by_model).max())

@@ -16,7 +16,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
 from tests.plants.make import make_record
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 N = 4000
 
@@ -112,6 +112,7 @@ def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> No
     assert mains_line(60.02, noise)
 
 
+@slow
 @pytest.mark.parametrize("hum", slow_but([49.97], [49.97, 47.0]))
 def test_a_hum_between_the_harmonics_of_a_periodic_drive_is_named(hum: float) -> None:
     """47 Hz is nobody's mains, and may be distortion of the drive."""

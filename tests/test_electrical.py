@@ -53,6 +53,7 @@ def test_a_current_tells_the_capacitance(fast: Record) -> None:
     assert "keeps the 3 uF given" in found.sentence(3e-6)
 
 
+@slow
 def test_several_records_have_each_its_zero(fast: Record) -> None:
     assert fast.current is not None
     second = replace(fast.slice(0, 900), current=fast.current[:900] - 0.05)

@@ -39,7 +39,9 @@ def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
     assert len(description.modelVariables) == len(variable_table(model_named(name)))
 
 
-@pytest.mark.parametrize("breakage", ["unit", "dependencies", "start", "order"])
+@pytest.mark.parametrize(
+    "breakage", slow_but(["order"], ["unit", "dependencies", "start", "order"])
+)
 def test_the_validation_finds_faults(breakage: str, tmp_path: Path) -> None:
     text = model_description3(model_named("flexure"), "m", "{t}", ())
     broken = {

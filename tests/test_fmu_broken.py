@@ -276,6 +276,7 @@ def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) ->
         assert not list(misplaced_binaries(whole))
 
 
+@slow
 @harmless
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_sources_and_model_that_are_not_those_of_the_binary(fmi: int, tmp_path: Path) -> None:

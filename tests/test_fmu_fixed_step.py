@@ -65,7 +65,7 @@ def simulated(every: int = 1, hold: str = "linear") -> FloatArray:
     return np.asarray(run.outputs["displacement"])
 
 
-@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=slow), 5])
 def test_communication_steps_are_one_step_or_several(every: int) -> None:
     """FMI 2 passes on the slope of the inputs."""
     assert error(played(2, every), simulated(every)) <= 5e-5
@@ -250,6 +250,7 @@ def test_the_check_of_another_part_with_a_fixed_step(tmp_path: Path) -> None:
     assert report.passed, report.failures
 
 
+@slow
 def test_an_importer_that_holds_inputs_is_told_its_own_errors(tmp_path: Path) -> None:
     """FMI 3.0 has no way to move them: what a jump within a step leaves is twice as much there."""
     moved, held = (told(written(fmi, tmp_path)) for fmi in (2, 3))

@@ -17,6 +17,7 @@ from psa_casadi.records import read_record, write_record
 from psa_casadi.simulation.history import memory_after, settled_at
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
+from tests.tiers import slow
 
 STACK = stack_model("P-885.51")
 
@@ -26,6 +27,7 @@ def _falling() -> tuple[FloatArray, FloatArray]:
     return t, 60.0 + 60.0 * np.cos(np.pi * t)
 
 
+@slow
 def test_a_record_that_begins_at_the_top_follows_the_reference_played_from_zero() -> None:
     """Independent: the reference integrates the way up and the record in one piece."""
     t, voltage = _falling()

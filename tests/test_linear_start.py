@@ -148,6 +148,7 @@ def test_without_displacement_or_motion_there_is_no_start() -> None:
     assert linear_start([record.slice(0, 10)], base) is None
 
 
+@slow
 @pytest.mark.parametrize("scale", slow_but([40.0], [5.0, 40.0]))
 def test_no_size_is_built_in(scale: float) -> None:
     """Times, volts and metres in other units give the same candidates in those units."""

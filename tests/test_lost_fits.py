@@ -68,6 +68,7 @@ def _begun(record: Record, names: tuple[str, ...]) -> tuple[View, Task]:
     return examine(plain, task), task
 
 
+@slow
 def test_a_needless_cause_is_not_kept(tmp_path: Path) -> None:
     """A leaking charge and a creep look alike at first; one of them explains all of it."""
     make_record("charge_leakage", 5, tmp_path / "a.csv", visible=(1.0, 2.0))

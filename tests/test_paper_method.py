@@ -270,7 +270,7 @@ def test_a_record_without_displacement_is_refused() -> None:
         paper_method([Record(name="planned", time=time, voltage=triangle(time, 0.0, 60.0, 2.0))])
 
 
-@pytest.mark.parametrize("with_step", [True, False])
+@pytest.mark.parametrize("with_step", slow_but([True], [True, False]))
 def test_the_command(tmp_path: Path, with_step: bool) -> None:
     paths = []
     for k, r in enumerate([loop(), real_step(120.0)][: 1 + with_step]):

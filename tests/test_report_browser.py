@@ -50,6 +50,7 @@ def colours(image: np.ndarray[tuple[int, int, int], np.dtype[np.float64]]) -> in
     return len(np.unique(levels))
 
 
+@slow
 def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: Path) -> None:
     document, console = browser.document(page, "--window-size=1280,900")
     assert console == []

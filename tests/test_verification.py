@@ -69,6 +69,7 @@ def test_what_is_kept_was_not_fitted() -> None:
     assert not {share for share, _ in FITTED_LOOPS} & {share for share, _ in KEPT_LOOPS}
 
 
+@slow
 def test_a_stack_is_predicted_to_its_noise(shown: list[Comparison]) -> None:
     """Where the plant is the model, what is left on records never fitted is little but noise."""
     assert [c.kind for c in shown] == [LOOPS, LOOPS, STEPS, OTHER]
