@@ -37,7 +37,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what takes long, so that at the end no process waits for another.
 
-    With pytest-xdist the quick tests of a file run in one process, which makes once what they share.
+    With pytest-xdist the quick tests of a file run in one process: what they share is made once.
     """
     items.sort(key=_turn)
     for item in items:

@@ -41,7 +41,7 @@ ELSEWHERE = {
 }  # fmt: skip
 #: Foreign causes of which one is tried here for each verdict: the benchmark `diagnose` has all.
 TRIED = ("floor_vibration", "dry_friction")
-#: What looks like two causes of which the third remains.
+#: Three causes, and what looks like one of them.
 LIKE_THREE = ("temperature", "self_heating", "structural_mode", "slow_creep", "drive_lag",
               "hysteresis_memory", "ageing")  # fmt: skip
 #: Fresh records in every run: so many, and twice as many where one of them misleads.
@@ -103,10 +103,10 @@ def test_three_causes_are_found_where_one_by_one_ends_with_two(tmp_path: Path) -
     other = ("self_heating", "structural_mode")
     case = Case("three", "temperature", 205877, (1.0, 3.0), other)
     truth, records = records_of(case, tmp_path)
-    found = psa.diagnose(records)
+    few = [psa.EFFECTS[n] for n in LIKE_THREE]
+    found = psa.diagnose(records, effects=few)
     assert {c.effect for c in found.causes} == set(case.hidden)
     assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
-    few = [psa.EFFECTS[n] for n in LIKE_THREE]
     method = Method(frozenset({"several at once"}))
     one_by_one = psa.diagnose(records, effects=few, method=method)
     assert one_by_one.extended_errors.holdout_rms_m > 1.1 * truth.sigma

@@ -43,8 +43,8 @@ def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
 
 
 @slow
-@pytest.mark.parametrize("ends", [(900, 1200), (1000, 1000)], ids=["lengths", "alike"])
-def test_the_order_of_the_records_tells_nothing(ends: tuple[int, int], tmp_path: Path) -> None:
+def test_the_order_of_the_records_tells_nothing(tmp_path: Path) -> None:
+    ends = (1000, 1000)  # their lengths tell nothing either
     truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
     play_again(truth, 4, tmp_path / "b.csv")
     pairs = zip(("a", "b"), ends, strict=True)
