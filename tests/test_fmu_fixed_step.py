@@ -206,9 +206,9 @@ def told(path: Path) -> dict[str, float]:
 
 
 @slow
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_the_check_finds_the_errors_that_it_states(fmi: int, tmp_path: Path) -> None:
+def test_the_check_finds_the_errors_that_it_states(tmp_path: Path) -> None:
     """On the voltages behind them; what means nothing there is left out, and said."""
+    fmi = 3
     path = written(fmi, tmp_path)
     report = psa.check_fmu(path)
     assert report.passed, report.failures

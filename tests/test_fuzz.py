@@ -42,12 +42,11 @@ FULL = {
     "column-maps": 3000, "mapped-records": 500, "units": 2000, "models": 750, "paths": 1000,
     "binaries": 1500, "zips": 150, "descriptions": 500, "states": 250,
 }  # fmt: skip
-#: Commands, which take seconds each.
+#: Commands, which take seconds each. Kills and damaged caches are in `test_ended_commands` and
+#: `test_compiler_cache`.
 COMMANDS = {
     "harm": {"harm": "exit", "at": "step", "fmi": 2},
-    "kills": {"command": "export fmu", "signal": "SIGTERM", "at": 0.6, "old": True},
     "environments": {"surroundings": "HOME a file", "run": "simulate"},
-    "cache": {"way": "half", "run": "simulate"},
 }
 
 

@@ -25,7 +25,7 @@ from tests.identified_plants import (
 )
 from tests.tiers import slow, slow_but
 
-SEEDS = (2, 3, 4, 5)
+SEEDS = (2, 3, 4)
 #: Largest relative error of each combination; the asymmetry is a small part of these loops.
 TOLERANCE = {"slope": 2e-3, "width": 5e-3, "asymmetry": 0.5, "n": 1e-2, "lag": 1e-2}
 
@@ -49,7 +49,7 @@ def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
 
 @slow
 def test_intervals_cover_the_truth() -> None:
-    """Of 20 intervals of 95 % at most three may miss (p = 0.016), and none by far."""
+    """Of 15 intervals of 95 % at most two may miss (p = 0.036), and none by far."""
     deviations = []
     for seed in SEEDS:
         stack, found = plant(seed)[0].stack, identified(seed)
@@ -60,7 +60,7 @@ def test_intervals_cover_the_truth() -> None:
         errors = standard_errors(found.fit, found.experiments, rated)
         deviations += [(values[name] - true[name]) / errors[name] for name in true]
     z = np.abs(deviations)
-    assert np.count_nonzero(z > 1.96) <= 3
+    assert np.count_nonzero(z > 1.96) <= 2
     assert z.max() < 4.0
     assert np.median(z) > 0.2  # intervals that are far too wide would cover too
 
