@@ -1,7 +1,7 @@
-"""Rows of docs/measured.md on the measured micromanipulator are what a diagnosis says of it.
+"""A row of docs/measured.md on the measured micromanipulator is what a diagnosis says of it.
 
-Those of the minor loops, alone and judged on the other record; `python -m tests.benchmarks
-measured` has the rows of the sine and of both records too, which take a minute each.
+That of the minor loops, which the README diagnoses; `python -m tests.benchmarks measured` has the
+others, which take a minute each.
 """
 
 import json
@@ -12,12 +12,9 @@ from typing import Any
 import pytest
 
 from build_scripts.page_commands import block_in_tests, run_block
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
-from psa_casadi.records import read_record
 
 PAGE = Path(__file__).parent.parent / "docs" / "measured.md"
-JUDGED = "`minor_loops.csv`, judged on `sine_1hz.csv` (`--holdout`)"
 
 
 def rows() -> dict[str, list[str]]:
@@ -54,15 +51,6 @@ def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
     errors = [d["errors"][model]["holdout_nrmse_percent"] for model in ("base", "extended")]
     assert within(errors[0], base)
     assert within(errors[1], base if extended == "the same" else extended)
-
-
-@pytest.mark.slow
-def test_the_row_of_one_record_judged_on_another_is_played_again(measured_data: Path) -> None:
-    loops, sine = (
-        read_record(measured_data / "micromanipulator" / f"{name}.csv")
-        for name in ("minor_loops", "sine_1hz")
-    )
-    is_what_the_row_says(json.loads(diagnose([loops], holdout=[sine]).to_json()), JUDGED)
 
 
 @pytest.mark.slow
