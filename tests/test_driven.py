@@ -148,7 +148,7 @@ def _curved(shown: FloatArray) -> FloatArray:
 
 @slow
 def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) -> None:
-    time = np.arange(4000) * 1e-3
+    time = np.arange(2500) * 1e-3
     voltage = 50.0 + 30.0 * np.sin(2 * np.pi * time) + 15.0 * np.sin(2 * np.pi * 0.31 * time)
     clean = simulate(stack_model("P-885.51"), time, voltage).displacement
     noise = 5e-9 * np.random.default_rng(2).standard_normal(time.size)

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 #: Frequency [Hz], damping ratio and static share of the modes that are hidden.
 HIDDEN = ((212.0, 0.012, 0.06), (487.0, 0.02, 0.11), (905.0, 0.015, 0.05), (1330.0, 0.01, 0.09))
-RATE, COUNT = 5000.0, 6000
+RATE, COUNT = 5000.0, 4000
 
 
 def response(frequency: float, damping: float, drive: FloatArray, time: FloatArray) -> FloatArray:
