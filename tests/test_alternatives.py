@@ -31,6 +31,7 @@ def _reading() -> tuple[FloatArray, FloatArray, FloatArray]:
     return voltage, np.asarray(x + bend + noise, dtype=np.float64), bend
 
 
+@slow
 def test_both_plants_are_offered_and_differ_by_the_bend() -> None:
     """One plant has the bend, the other leaves it to the sensor: apart they are the bend itself."""
     voltage, reading, bend = _reading()

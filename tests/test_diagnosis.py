@@ -153,6 +153,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> psa.Diagnosis:
     return psa.diagnose([psa.read_record(path)])
 
 
+@slow
 def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> None:
     content = json.loads(clean.to_json())
     assert content["format"] == "psa_casadi.diagnosis/1"
@@ -171,6 +172,7 @@ def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> 
     assert content["next_experiment"]["why"]
 
 
+@slow
 def test_held_out_samples_are_never_used(clean: psa.Diagnosis) -> None:
     experiment = clean.experiments[0]
     assert not np.any(experiment.used & experiment.held_out)

@@ -78,6 +78,7 @@ def test_a_slow_current_of_any_size_and_a_lossy_ceramic(capacitance: float) -> N
     assert found.error < 0.01 * capacitance
 
 
+@slow
 def test_a_current_that_is_not_the_stack_s_tells_nothing(fast: Record) -> None:
     noise = np.random.default_rng(1).standard_normal(fast.n)
     assert fast.current is not None

@@ -14,7 +14,7 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate
 from psa_casadi.reference import from_samples, simulate
 from tests.fmu_models import exported, model_named
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 MODELS = (
@@ -128,6 +128,7 @@ def test_input_derivatives_reduce_the_error() -> None:
     assert errors[1] < errors[0] / 30.0
 
 
+@slow
 def test_tolerance_is_the_accuracy() -> None:
     """The error, as a share of the range, is a few times the tolerance an importer asks for.
 

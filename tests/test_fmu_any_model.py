@@ -80,6 +80,7 @@ def test_a_wired_system_passes_the_check(tmp_path: Path) -> None:
     assert report.passed, report.failures
 
 
+@slow
 @pytest.mark.usefixtures("code_runs_here")
 def test_without_outputs_the_states_are_compared(tmp_path: Path) -> None:
     report = check_fmu(export_fmu(_without_outputs(), tmp_path / "m.fmu"), _without_outputs())

@@ -175,6 +175,7 @@ TOGETHER = (
 )  # fmt: skip
 
 
+@slow
 @harmless
 @pytest.mark.parametrize(
     "faults", [TOGETHER[0], *(pytest.param(t, marks=slow) for t in TOGETHER[1:])]
@@ -233,6 +234,7 @@ def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
     assert "stays negative after an event" in found["event indicators"]
 
 
+@slow
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_binaries_that_cannot_be_used(fmi: int, tmp_path: Path) -> None:
     """Missing, cut off, of something else, or of a new library: found, and nothing is loaded."""

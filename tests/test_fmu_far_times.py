@@ -14,7 +14,7 @@ from psa_casadi.units import FloatArray
 from tests import sampled_fmus
 from tests.fmu_models import exported, model_named
 from tests.sampled_models import PERIOD, loop
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
@@ -144,6 +144,7 @@ def test_sampled_states_far_from_zero(fmi: int) -> None:
     assert np.abs(runs[2] - runs[0]).max() < 1e-5
 
 
+@slow
 @VERSIONS
 def test_instants_that_cannot_be_counted_are_refused(fmi: int) -> None:
     """By the start, by a step, by the period, in model exchange, and outside of an FMU."""

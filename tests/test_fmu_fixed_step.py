@@ -169,6 +169,7 @@ def test_what_has_no_fixed_step_is_refused(
     assert not (tmp_path / "fixed.fmu").exists()
 
 
+@slow
 def test_the_command_wants_both_options_or_neither(tmp_path: Path) -> None:
     base = ["export", "fmu", "--stack", "P-885.51", "-o", str(tmp_path / "fixed.fmu")]
     for options in (["--solver", "fixed"], ["--step", "10us"]):

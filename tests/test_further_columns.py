@@ -98,6 +98,7 @@ def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path)
     assert told.value == pytest.approx(stack.c_p_el + stack.k_l * slope, rel=0.05)
 
 
+@slow
 def test_the_derivatives_of_further_columns_are_those_of_their_residuals() -> None:
     r = plants.plain(1).record(1, "charge", "monitor_voltage", samples=300)
     found = columns_of(starting_model([r]), [r])

@@ -68,6 +68,7 @@ def test_no_history_is_the_relaxed_start() -> None:
     assert set(memory_after(STACK, [], at=0.0).values()) == {0.0}
 
 
+@slow
 def test_an_exported_model_starts_settled_and_stays_while_its_voltage_does(tmp_path: Path) -> None:
     """By fmpy: no transient at 60 V, where the way up and back down has left the hysteresis."""
     fmpy = pytest.importorskip("fmpy")

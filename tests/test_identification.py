@@ -146,6 +146,7 @@ def start_model(p: dict[str, float]) -> Model:
     return compose(BASE, {**p, **wrong, "n": 1.2, "tau": 0.4 * p["tau"], "delta": 0.0})
 
 
+@slow
 def test_intervals_cover_the_reference_where_the_mechanics_are_known() -> None:
     """With stiffness and masses right, every parameter is in its interval, the lag tau too."""
     p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
@@ -190,6 +191,7 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     assert refit_or_keep(first, found.experiments, first.unknowns.names, first.sigma) is first
 
 
+@slow
 @pytest.mark.parametrize(
     ("record", "limit"), [pytest.param("sine_1hz", 0.49, marks=slow), ("minor_loops", 0.64)]
 )

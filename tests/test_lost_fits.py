@@ -118,6 +118,7 @@ def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
     assert to_end(any_, task.experiments).fit.rms < 1.02 * truth.sigma
 
 
+@slow
 def test_each_form_of_an_effect_gets_a_start(tmp_path: Path) -> None:
     """Between its forms no fit moves."""
     make_record("rate_dependent_hysteresis", 303, tmp_path / "a.csv", visible=(0.3, 3.0))

@@ -15,9 +15,10 @@ from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value
 from tests.modelica_runs import simulated
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 
+@slow
 @pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize("name", slow_but(["position_controller"], PARTS))
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))

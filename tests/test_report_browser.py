@@ -116,6 +116,7 @@ def told(browser: Browser, page: Path) -> dict[str, Any]:
     return told_of(document)
 
 
+@slow
 def test_a_phone_shows_it_without_scrolling_sideways(told: dict[str, Any]) -> None:
     assert told["width"] == PHONE
     assert told["needed"] == PHONE
@@ -124,6 +125,7 @@ def test_a_phone_shows_it_without_scrolling_sideways(told: dict[str, Any]) -> No
     assert told["narrowest"] > 0.9 * PHONE
 
 
+@slow
 def test_text_is_legible_on_a_phone(told: dict[str, Any]) -> None:
     assert told["small"] == []
     assert told["smallest"] >= 9

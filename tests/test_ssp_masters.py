@@ -79,6 +79,7 @@ def test_the_closed_loop_approaches_one_model_of_it(rates: bool, order: int) -> 
     assert errors[1] < (1e-2 if order == 1 else 1e-4) * _HEIGHT
 
 
+@slow
 def test_fmpy_and_ecos_agree_and_approach_one_model() -> None:
     """Both hold inputs and pass outputs on after every step, so only rounding is between them."""
     path, errors = archive_of("closed_loop"), []

@@ -18,7 +18,7 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
 from psa_casadi.variables import Interval
 from tests.evidence_models import evident_fmu, evident_model
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 _SAID = "From here on the results are extrapolated."
 
@@ -56,6 +56,7 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
     assert outside[0] == outside[-1] == 0.0
 
 
+@slow
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
     said, outside = messages(fmi, 75.0, 0.01)

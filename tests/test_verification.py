@@ -82,6 +82,7 @@ def test_a_stack_is_predicted_to_its_noise(shown: list[Comparison]) -> None:
         assert c.voltage.max() <= RATED
 
 
+@slow
 def test_the_step_is_normalised_by_its_end(shown: list[Comparison]) -> None:
     (step,) = of_kind(shown, STEPS)
     assert step.voltage[1] == pytest.approx(0.6 * RATED)
