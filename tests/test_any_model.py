@@ -192,10 +192,11 @@ def _is_adequate_without_friction(model: psa.Model) -> None:
 
 @pytest.mark.slow
 def test_a_bent_sensor_and_an_overflow_of_tanks_are_told_apart() -> None:
-    bent = psa.diagnose(tanks(), plants.tanks(3, "sensor"))
+    unlike = ["lag", "delay", "loss", "drag", "dead_zone", "drift"]
+    bent = psa.diagnose(tanks(), plants.tanks(3, "sensor"), leave_out=unlike)
     assert _only(bent, "bend_of_level")
     assert bent.causes[0].belongs_to == "sensor"
-    over = psa.diagnose(tanks(), plants.tanks(3, "overflow"))
+    over = psa.diagnose(tanks(), plants.tanks(3, "overflow"), leave_out=unlike)
     assert over.verdict in ("cause_named", "partly_explained")
     assert [c.effect for c in over.causes] == ["stop_of_h1_in_h1"]
     assert over.causes[0].explained_share > 0.95

@@ -78,9 +78,7 @@ def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
 
 @slow
 def test_a_diagnosis_begins_with_the_spectrum() -> None:
-    near = ("hysteresis_memory", "rate_independent_asymmetry", "backlash", "slow_creep",
-            "load_stiffness")  # fmt: skip
-    effects = [psa.EFFECTS[n] for n in near]
+    effects = [psa.EFFECTS[n] for n in ("hysteresis_memory", "backlash", "load_stiffness")]
     d = psa.diagnose(psa.record_from(_loops()), hysteresis="spectrum", effects=effects)
     assert "memory_spectrum" in [c.name for c in d.model.components]
     assert d.base_errors.holdout_rms_m < 1.5 * _NOISE
