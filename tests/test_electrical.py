@@ -91,7 +91,7 @@ def test_a_current_that_is_not_the_stack_s_tells_nothing(fast: Record) -> None:
 @slow
 def test_an_identified_model_has_the_measured_capacitance(fast: Record) -> None:
     """Without the current the capacitance is assumed, and the simulated current as wrong."""
-    found = psa.identify([fast.slice(0, 400)])
+    found = psa.identify([fast.slice(0, 700)])
     assert found.model.values["C_p"] == pytest.approx(C_P, rel=0.01)
     interval = found.model.provenance.intervals["C_p"]
     assert interval.low < found.model.values["C_p"] < interval.high
