@@ -6,12 +6,18 @@
 #include <stdio.h>
 
 int __stdcall DllMainCRTStartup(void *library, unsigned long reason, void *reserved);
+int __stdcall _DllMainCRTStartup(void *library, unsigned long reason, void *reserved);
 
 int __stdcall DllMainCRTStartup(void *library, unsigned long reason, void *reserved) {
     (void)library;
     (void)reason;
     (void)reserved;
     return 1;
+}
+
+/* The name that earlier versions of the compiler look for. */
+int __stdcall _DllMainCRTStartup(void *library, unsigned long reason, void *reserved) {
+    return DllMainCRTStartup(library, reason, reserved);
 }
 
 /* The option 2 is the return value of C99: the length that the whole text has. */
