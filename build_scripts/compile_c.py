@@ -1,9 +1,10 @@
 """Compile every C file of the project as strict C99, with warnings as errors.
 
 The sources are those an FMU carries and those of the library that the Python side simulates with:
-the files of `fmu_src/` and the code generated for a model. Each is compiled on its own with zig's C
-compiler, at two levels of optimisation, because some warnings need the optimiser's analysis. Exact
-steps are vectors of numbers, an extension of C99, and compiled for one number and for four.
+the files of `fmu_src/` and the code generated for a model. Each is a translation unit of its own
+for zig's C compiler, which is started once for a folder: its start took most of the time. They are
+optimised, because some warnings need the optimiser's analysis; all others come at every level.
+Exact steps are vectors of numbers, an extension of C99, and compiled for one number and for four.
 """
 
 import os
@@ -11,8 +12,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import fmpy
@@ -30,26 +31,34 @@ from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import SOURCES
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
-OPTIMISATION = ("-O0", "-O2")
+OPTIMISATION = "-O2"
 EXACT_FLAGS = ("-std=gnu99", "-fno-math-errno", "-Wall", "-Wextra", "-Werror")
 #: Sets of parameters side by side.
 LANES = (1, 4)
 
 
-def compile_strictly(
-    source: Path, include: Sequence[Path], output: Path, flags: Sequence[str] = FLAGS
-) -> list[str]:
-    """Compile one file at every level of optimisation; return the complaints."""
-    complaints = []
-    made = "_".join(source.parts[-2:])  # sources of two FMUs have the same names
-    for level in OPTIMISATION:
-        includes = [f"-I{directory}" for directory in include]
-        command = [sys.executable, "-m", "ziglang", "cc", *flags, level, *includes]
-        command += ["-c", str(source), "-o", str(output / f"{made}{flags[-1]}.o")]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            complaints.append(f"{source.name} {flags[-1]} {level}:\n{done.stdout}{done.stderr}")
-    return complaints
+@dataclass(frozen=True)
+class Work:
+    """Files of one folder that are compiled alike, where their headers are, and how."""
+
+    sources: tuple[Path, ...]
+    include: tuple[Path, ...]
+    flags: tuple[str, ...] = FLAGS
+
+    @property
+    def name(self) -> str:
+        """Folder and last flag, as they are told."""
+        return f"{self.sources[0].parent.name} {self.flags[-1]}"
+
+
+def compile_strictly(work: Work) -> list[str]:
+    """Compile the files, each on its own; return the complaints."""
+    includes = [f"-I{directory}" for directory in work.include]
+    command = [sys.executable, "-m", "ziglang", "cc", *work.flags, OPTIMISATION, *includes]
+    command += ["-c", *map(str, work.sources)]
+    with tempfile.TemporaryDirectory() as objects:
+        done = subprocess.run(command, cwd=objects, capture_output=True, text=True, check=False)
+    return [f"{work.name}:\n{done.stdout}{done.stderr}"] if done.returncode != 0 else []
 
 
 def write_library(model: Model, directory: Path) -> None:
@@ -85,55 +94,53 @@ def write_imported(directory: Path) -> Path:
     return directory / "imported.c"
 
 
-def page_work(
-    model: Model, directory: Path
-) -> list[tuple[Path, tuple[Path, ...], tuple[str, ...]]]:
-    """Write what is generated of a model in a page; return its files with folders and flags."""
+def page_work(model: Model, directory: Path) -> Work:
+    """Write what is generated of a model in a page; return what is to be compiled."""
     directory.mkdir(parents=True)
     for name, text in module_texts(model.structure).items():
         (directory / name).write_text(text, encoding="utf-8")
     here = ROOT / "fmu_src"
     flags = (*WEB_FLAGS, "-Wall", "-Wextra", "-Werror")
-    return [(f, (directory, here / "page", here), flags) for f in sorted(here.glob("page/*.c"))]
+    return Work(tuple(sorted(here.glob("page/*.c"))), (directory, here / "page", here), flags)
 
 
-def main() -> int:
-    """Compile all sources of a model; return 1 if the compiler complained or missed a file.
+def write_all(sources: Path) -> list[Work]:
+    """Write every source into folders of its own; return what is to be compiled.
 
     The FMUs, of FMI 2 and FMI 3, are those of the base model, the library that of the model with
     every effect. Exact steps are those of the base, and of a load, whose ports feed back.
     """
     headers = Path(fmpy.__file__).parent / "c-code"
+    every_effect = compose((*BASE, *EFFECTS.values()))
+    for fmi in (2, 3):
+        write_sources(compose(BASE), sources / f"fmi{fmi}", fmi=fmi)
+    write_library(every_effect, sources / "library")
+    write_imported(sources / "imported")
+    work = [
+        Work(tuple(sorted(folder.glob("*.c"))), (folder, headers))
+        for folder in sorted(sources.iterdir())
+    ]
+    for k, model in enumerate((compose(BASE), compose((*BASE, EFFECTS["load_stiffness"])))):
+        exact = write_exact(model, sources / f"exact{k}")
+        for lanes in LANES:
+            flags = (*EXACT_FLAGS, f"-DPSA_LANES={lanes}")
+            work.append(Work((exact,), (exact.parent,), flags))
+    return [*work, page_work(every_effect, sources / "web")]
+
+
+def main() -> int:
+    """Compile all sources of a model; return 1 if the compiler complained or missed a file."""
     with tempfile.TemporaryDirectory() as scratch:
-        sources, objects = Path(scratch, "sources"), Path(scratch, "objects")
-        objects.mkdir()
         os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str(Path(tempfile.gettempdir()) / "zig"))
-        for fmi in (2, 3):
-            write_sources(compose(BASE), sources / f"fmi{fmi}", fmi=fmi)
-        write_library(compose((*BASE, *EFFECTS.values())), sources / "library")
-        files = sorted(sources.rglob("*.c"))
-        exact = [
-            write_exact(model, sources / f"exact{k}")
-            for k, model in enumerate((compose(BASE), compose((*BASE, EFFECTS["load_stiffness"]))))
-        ]
-        files.append(write_imported(sources / "imported"))
-        missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")}
-        missing -= {f.name for f in (*files, *exact)}
+        work = write_all(Path(scratch))
+        files = [path for item in work for path in item.sources]
+        missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")} - {f.name for f in files}
         complaints = [f"{name}: not among the written sources." for name in sorted(missing)]
-        exactly = [(*EXACT_FLAGS, f"-DPSA_LANES={lanes}") for lanes in LANES]
-        work: list[tuple[Path, tuple[Path, ...], tuple[str, ...]]]
-        work = [(f, (f.parent, headers), FLAGS) for f in files]
-        work += [(f, (f.parent,), flags) for f in exact for flags in exactly]
-        work += page_work(compose((*BASE, *EFFECTS.values())), sources / "web")
-
-        def compiled(item: tuple[Path, tuple[Path, ...], tuple[str, ...]]) -> list[str]:
-            source, include, flags = item
-            print(f"{'/'.join(source.parts[-2:])} {flags[-1]}\n", end="", flush=True)
-            return compile_strictly(source, include, objects, flags)
-
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            complaints += [c for found in pool.map(compiled, work) for c in found]
-    print("\n".join(complaints) or f"{len(work)} C files compile without a warning.")
+            complaints += [c for found in pool.map(compile_strictly, work) for c in found]
+    for item in work:
+        print(item.name, "-", " ".join(path.name for path in item.sources))
+    print("\n".join(complaints) or f"{len(files)} C files compile without a warning.")
     return 1 if complaints or not files else 0
 
 

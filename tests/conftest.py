@@ -35,8 +35,15 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what takes long, so that at the end no process waits for another."""
+    """Begin with what takes long, so that at the end no process waits for another.
+
+    With pytest-xdist the quick tests of a file run in one process: what they share is made once.
+    """
     items.sort(key=_turn)
+    for item in items:
+        alone = item.get_closest_marker("slow") or item.get_closest_marker("xdist_group")
+        if alone is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 def _turn(item: pytest.Item) -> int:

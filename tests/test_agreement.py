@@ -81,7 +81,12 @@ def stack_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
 #: Every stack with one voltage of its own, and every voltage.
 ONCE = [(s, "cascade", d) for s, d in zip(sorted(STACKS), DRIVES, strict=True)]
 ONCE += [("P-885.51", "single_mass", DRIVES[0])]
-AGREEMENTS = list(product(sorted(STACKS), ("cascade", "single_mass"), DRIVES))
+#: Any two of stack, mechanics and voltage.
+IN_TURN = [
+    (stack, ("cascade", "single_mass")[(k + j) % 2], drive)
+    for (k, stack), (j, drive) in product(enumerate(sorted(STACKS)), enumerate(DRIVES))
+]
+AGREEMENTS = [*ONCE, *(case for case in IN_TURN if case not in ONCE)]
 
 
 @pytest.mark.parametrize(

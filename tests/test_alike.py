@@ -51,6 +51,7 @@ def test_bends_are_alike_where_no_resonance_shows(
     assert tuple(tuple(sorted(group)) for group in groups) == alike
 
 
+@slow
 @pytest.mark.parametrize(
     ("hidden", "seed", "rho"),
     [

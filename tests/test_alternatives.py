@@ -14,6 +14,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
+from tests.tiers import slow
 
 NOISE = 5e-9
 TABLE = [EFFECTS[n] for n in ("sensor_nonlinearity", "load_stiffness", "slow_creep", "sensor_lag")]
@@ -30,6 +31,7 @@ def _reading() -> tuple[FloatArray, FloatArray, FloatArray]:
     return voltage, np.asarray(x + bend + noise, dtype=np.float64), bend
 
 
+@slow
 def test_both_plants_are_offered_and_differ_by_the_bend() -> None:
     """One plant has the bend, the other leaves it to the sensor: apart they are the bend itself."""
     voltage, reading, bend = _reading()
@@ -54,6 +56,7 @@ def test_both_plants_are_offered_and_differ_by_the_bend() -> None:
     assert "which these data do not decide" in " ".join(psa.story(d).split())
 
 
+@slow
 def test_the_command_writes_the_other_model_beside_the_extended_one(tmp_path: Path) -> None:
     voltage, reading, _ = _reading()
     record, out = tmp_path / "r.csv", tmp_path / "ext.json"

@@ -109,12 +109,10 @@ def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Pa
     assert found.verdict == "adequate"
 
 
+@slow
 @pytest.mark.parametrize(
     ("hidden", "seed", "like", "own"),
-    [
-        pytest.param(None, 93180, "sensor_lag", True, marks=slow),
-        ("sensor_delay", 93099, "sensor_delay", False),
-    ],
+    [(None, 93180, "sensor_lag", True), ("sensor_delay", 93099, "sensor_delay", False)],
 )
 def test_a_resonance_above_the_band_stands_for_a_lag_only_where_it_fits(
     hidden: str | None, seed: int, like: str, own: bool, tmp_path: Path

@@ -14,6 +14,7 @@ from tests.benchmarks.ensembles import Case, cases, drawn, loosest, measured
 from tests.benchmarks.ensembles_gpu import on_gpu
 from tests.benchmarks.ensembles_peers import Peer, Solve, Work, peers
 from tests.cuda_host import lend
+from tests.tiers import slow
 
 
 @pytest.fixture(autouse=True)
@@ -49,6 +50,7 @@ def test_the_loosest_tolerance_is_the_first_that_is_accurate() -> None:
     assert never.error == np.inf
 
 
+@slow
 def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight sets of 40 samples, scipy and CVODES beside `simulate_many`."""
     monkeypatch.setattr(ensembles_peers, "find_spec", lambda _: None)

@@ -13,6 +13,7 @@ import pytest
 
 from tests.benchmarks.causes import write as writing
 from tests.benchmarks.causes.draw import cases_of
+from tests.tiers import slow
 
 OWN = Path(writing.__file__).parent
 SCORE = OWN / "score.py"
@@ -130,6 +131,7 @@ def test_the_score_imports_numpy_and_the_standard_library_only() -> None:
     assert names <= {"numpy", *sys.stdlib_module_names}
 
 
+@slow
 def test_a_seed_gives_the_same_bytes_and_the_truth_stays_apart(tmp_path: Path) -> None:
     case = next(c for c in cases_of(5, 10) if c.kind == "clean")
     first, again = tmp_path / "first", tmp_path / "again"

@@ -26,7 +26,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
 from tests.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
 from tests.fmu_models import exported, rewritten
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 
 def carried(path: Path) -> Model:
@@ -96,6 +96,7 @@ def test_an_error_that_is_stated_too_small_is_found(tmp_path: Path) -> None:
     assert "stated 0.015 um" in failed[0].remark
 
 
+@slow
 def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
     def moved(content: bytes) -> bytes:
         lines = content.decode().splitlines()

@@ -23,7 +23,7 @@ from psa_casadi.simulation.stepper import run
 from psa_casadi.units import convert
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 from tests.random_models import Point, random_model, random_point
-from tests.tiers import slow
+from tests.tiers import slow, slow_but
 
 FloatArray = NDArray[np.float64]
 
@@ -37,6 +37,8 @@ SETS = [
 #: All effects at once take long to compile.
 EVERY = pytest.param(ALL, marks=slow)
 every_effect = pytest.mark.parametrize("effect", ALL, ids=lambda e: e.name)
+#: What runs the compiled model is tried with every fourth effect in the quick tier.
+each_in_turn = pytest.mark.parametrize("effect", slow_but(ALL[::4], ALL), ids=lambda e: e.name)
 
 
 def name_of(effects: tuple[Component, ...]) -> str:
@@ -126,11 +128,13 @@ def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
 
 @pytest.mark.parametrize(
     "effects",
-    [SETS[0], *(pytest.param(s, marks=slow) for s in SETS[1 : len(ALL)]), EVERY],
+    [SETS[0], EVERY],
     ids=name_of,
 )
 def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
     """An effect of gain 0 adds to no equation: both runs have the base's trajectory.
+
+    With all effects at once, as what one of them added would show; equations of each one: above.
 
     The rule is the tolerance of a step: after one step for each sample they may differ by 1e-8 of
     a variable's largest value. Steps are not counted against each other: Newton's stopping test and
@@ -151,7 +155,7 @@ def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
         assert np.all(differences <= 1e-8 * ranges)
 
 
-@every_effect
+@each_in_turn
 def test_a_gain_changes_what_is_measured(effect: Component) -> None:
     """At its ordinary size every effect shows: by more than 1e-4 of the stroke, and alone."""
     model = random_model((effect,), np.random.default_rng(3), gains=True)
@@ -236,9 +240,7 @@ def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
         assert convert(1.0, variable.unit, unit) > 0.0
 
 
-@pytest.mark.parametrize(
-    "effects", [(), *(pytest.param((e,), marks=slow) for e in ALL), EVERY], ids=name_of
-)
+@pytest.mark.parametrize("effects", [(), EVERY], ids=name_of)
 def test_c_value_is_the_casadi_value(effects: tuple[Component, ...]) -> None:
     generator = np.random.default_rng(4)
     for gains in (True, True, True, False):
@@ -291,7 +293,7 @@ def test_generated_jacobians_are_the_slopes_of_the_model(effect: Component) -> N
         assert np.all(np.abs(found - wanted) <= 1e-5 * np.abs(wanted) + 1e-7 * np.abs(size))
 
 
-@every_effect
+@each_in_turn
 def test_sensitivities_are_differences_of_runs(effect: Component) -> None:
     """Steps that end at a reversal move with the parameters; their lengths count as constant."""
     model = random_model((effect,), np.random.default_rng(6), gains=True)

@@ -26,10 +26,13 @@ from tests.html_page import Page, figures
 from tests.identified_plants import same_as_the_named_stack
 from tests.test_report import png_size
 from tests.test_schemas import valid
+from tests.tiers import slow
 
 #: The demo takes half a minute: with pytest-xdist's loadgroup it runs once, else once per process.
 pytestmark = pytest.mark.xdist_group("demo")
 
+#: The record that the demonstration copies.
+DEMO = Path(psa_casadi.__file__).parent / "data" / "demo.csv"
 COMMANDS = {
     (): "demo",
     ("demo",): "psa demo",
@@ -107,6 +110,7 @@ def test_every_public_name_is_there() -> None:
         psa_casadi.__getattr__("identfy")
 
 
+@slow
 def test_the_demo_leaves_what_it_says(demo: Demo) -> None:
     assert {p.name for p in demo.directory.iterdir()} == set(FILES)
     for name in FILES:
@@ -120,6 +124,7 @@ def test_the_demo_leaves_what_it_says(demo: Demo) -> None:
     assert "base fit" in demo.progress
 
 
+@slow
 def test_the_demo_names_the_hidden_effect_and_gains_by_it(demo: Demo) -> None:
     d = json.loads((demo.directory / "diagnosis.json").read_text(encoding="utf-8"))
     assert set(d) >= {"format", "verdict", "causes", "candidates", "errors", "gain", "blind_to",
@@ -138,6 +143,7 @@ def test_the_demo_names_the_hidden_effect_and_gains_by_it(demo: Demo) -> None:
     assert extended.provenance.identified_from == (("synthetic_record", record.sha256),)
 
 
+@slow
 def test_the_demos_report_is_whole_and_calls_its_data_synthetic(demo: Demo) -> None:
     text = (demo.directory / "report.html").read_text(encoding="utf-8")
     page = Page(text)
@@ -152,6 +158,7 @@ def test_the_demos_report_is_whole_and_calls_its_data_synthetic(demo: Demo) -> N
     assert png_size(demo.directory / "diagnosis.png") == (1600, 1000)
 
 
+@slow
 def test_the_demos_fmu_is_valid_and_can_be_checked_again(demo: Demo) -> None:
     fmu = demo.directory / "extended.fmu"
     assert fmpy.read_model_description(str(fmu)).coSimulation is not None
@@ -163,6 +170,7 @@ def test_the_demos_fmu_is_valid_and_can_be_checked_again(demo: Demo) -> None:
     assert "did not pass" in other.stdout
 
 
+@slow
 def test_the_commands_of_the_page_go_on_from_the_demo(demo: Demo) -> None:
     block = block_in_tests("docs/fmu.md")
     begin, *rest = block.commands
@@ -171,6 +179,7 @@ def test_the_commands_of_the_page_go_on_from_the_demo(demo: Demo) -> None:
     assert run_block(replace(block, commands=tuple(rest)), demo.directory.parent) is None
 
 
+@slow
 def test_the_demos_stack_is_what_its_record_gives(demo: Demo) -> None:
     record = read_record(demo.directory / "synthetic_record.csv")
     found = load_model(demo.directory / "model.json")
@@ -179,6 +188,7 @@ def test_the_demos_stack_is_what_its_record_gives(demo: Demo) -> None:
     same_as_the_named_stack(rms, record, "demo")
 
 
+@slow
 def test_identify_starts_from_a_model_and_writes_its_page(demo: Demo, tmp_path: Path) -> None:
     model, page = tmp_path / "m.json", tmp_path / "fit.html"
     record = demo.directory / "synthetic_record.csv"
@@ -200,9 +210,9 @@ def test_identify_starts_from_a_model_and_writes_its_page(demo: Demo, tmp_path: 
 
 
 def test_diagnose_writes_only_what_is_asked_for_and_can_be_quiet(
-    demo: Demo, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
-    record = read_record(demo.directory / "synthetic_record.csv")
+    record = read_record(DEMO)
     parts = [record.slice(0, 1200), record.slice(1200, 2000)]
     paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
     for path, part in zip(paths, parts, strict=True):
@@ -283,9 +293,9 @@ def test_effects_are_listed_and_shown() -> None:
     assert "4 further resonances" in done("effects", "modal_series_4").stdout
 
 
-def test_an_identification_tells_its_warnings(demo: Demo) -> None:
-    record = read_record(demo.directory / "synthetic_record.csv").slice(0, 800)
-    found = psa_casadi.identify([record], model=load_model(demo.directory / "model.json"))
+def test_an_identification_tells_its_warnings() -> None:
+    record = read_record(DEMO).slice(0, 800)
+    found = psa_casadi.identify([record], model=psa_casadi.stack_model("demo"))
     text = identification_text(found)
     for warning in found.warnings:
         assert " ".join(warning.split()) in " ".join(text.split())

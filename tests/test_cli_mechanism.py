@@ -10,10 +10,12 @@ from psa_casadi.cli.app import app
 from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.stacks import stack_model
+from tests.tiers import slow
 
 STACK = "PTBS200"
 
 
+@slow
 def test_command_writes_model_port_and_page(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("mount.json", "stack.json", "page.html")]
     arguments = ["design", "mechanism", "--stack", STACK, "--damping", "0.7", "--starts", "1"]

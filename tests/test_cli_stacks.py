@@ -63,6 +63,7 @@ def test_simulate_takes_a_stack(planned: Path, tmp_path: Path) -> None:
     assert 10e-6 < np.ptp(found) < 13e-6
 
 
+@slow
 def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> None:
     fmu = tmp_path / "p.fmu"
     done = psa("export", "fmu", "--stack", "P-885.51", "-o", fmu)

@@ -14,7 +14,7 @@ from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from tests.fmu_models import entries, exported, model_named
-from tests.tiers import slow_but
+from tests.tiers import slow
 
 STACK = "P-885.51"
 
@@ -27,7 +27,8 @@ def _named_step(fmi: int) -> float:
     return float(found[1])
 
 
-@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+@slow
+@pytest.mark.parametrize("fmi", [2, 3])
 def test_the_step_on_the_page_keeps_the_fmu_within_a_thousandth_and_twice_it_does_not(
     fmi: int,
 ) -> None:

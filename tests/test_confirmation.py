@@ -18,6 +18,7 @@ from psa_casadi.records.split import Experiment, whole
 from psa_casadi.report.words.text import story
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
+from tests.tiers import slow
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,7 @@ def shown_up_to(record: Record, share: float) -> Record:
     return replace(record, displacement=np.minimum(y, y.min() + share * np.ptp(y)))
 
 
+@slow
 @pytest.mark.parametrize(
     ("share", "effect", "told"),
     [

@@ -22,6 +22,7 @@ from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, split
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
+from tests.tiers import slow_but
 
 TIME: FloatArray = np.linspace(0.0, 4.0, 2001)
 #: Loops of several sizes about several places, so that voltage, displacement and time differ.
@@ -93,7 +94,7 @@ def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> 
     assert spent.unnamed.interval[0] > 0.0
 
 
-@pytest.mark.parametrize("hidden", HIDDEN)
+@pytest.mark.parametrize("hidden", slow_but(["memory at the force"], HIDDEN))
 def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatArray) -> None:
     """In the model it does what the linear estimate promises; the file reads back the same."""
     found, experiments, colour = _fitted(_measured(clean, HIDDEN[hidden](clean)))

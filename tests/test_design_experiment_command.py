@@ -37,6 +37,7 @@ def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None
     assert "The voltage to apply" in page.read_text(encoding="utf-8")
 
 
+@slow
 def test_the_command_fits_the_rivals_to_the_records_at_hand(tmp_path: Path) -> None:
     effect = EFFECTS["sensor_nonlinearity"]
     model = stack_model(STACK).with_effect(effect)

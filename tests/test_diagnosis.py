@@ -16,7 +16,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
 from tests.plants.make import make_record
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 N = 4000
 
@@ -112,6 +112,7 @@ def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> No
     assert mains_line(60.02, noise)
 
 
+@slow
 @pytest.mark.parametrize("hum", slow_but([49.97], [49.97, 47.0]))
 def test_a_hum_between_the_harmonics_of_a_periodic_drive_is_named(hum: float) -> None:
     """47 Hz is nobody's mains, and may be distortion of the drive."""
@@ -152,6 +153,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> psa.Diagnosis:
     return psa.diagnose([psa.read_record(path)])
 
 
+@slow
 def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> None:
     content = json.loads(clean.to_json())
     assert content["format"] == "psa_casadi.diagnosis/1"
@@ -170,6 +172,7 @@ def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> 
     assert content["next_experiment"]["why"]
 
 
+@slow
 def test_held_out_samples_are_never_used(clean: psa.Diagnosis) -> None:
     experiment = clean.experiments[0]
     assert not np.any(experiment.used & experiment.held_out)

@@ -15,6 +15,7 @@ import pytest
 from psa_casadi.scratch import PREFIX, temporary_folder
 from psa_casadi.simulation import compiler
 from tests.record_files import HEADER, write
+from tests.tiers import slow
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells and signals of POSIX")
 PSA = [sys.executable, "-m", "psa_casadi.cli"]
@@ -82,6 +83,7 @@ def test_a_command_that_is_told_to_end_leaves_nothing(name: str, tmp_path: Path)
         assert not runs(child)
 
 
+@slow
 @posix
 def test_what_a_killed_command_left_goes_with_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

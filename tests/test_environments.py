@@ -22,6 +22,7 @@ from psa_casadi.model.model_file import dumps
 from psa_casadi.scratch import PREFIX
 from psa_casadi.simulation import compiler
 from tests.record_files import HEADER, ROWS, write
+from tests.tiers import slow
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
 MODEL = dumps(compose(BASE))
@@ -235,6 +236,7 @@ def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["x.fmu"]
 
 
+@slow
 @posix
 def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(
     record: Path, tmp_path: Path

@@ -19,7 +19,7 @@ from psa_casadi.report.words.series import compact, extremes, kept, series_of_fi
 from psa_casadi.report.words.tables import parameter_table
 from tests.html_page import Page, figures, numbers
 from tests.report_cases import diagnosis, identification, long_fit
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 pytestmark = pytest.mark.xdist_group("fit-page")
 
@@ -149,9 +149,10 @@ def test_pairs_that_are_known_only_together_are_named() -> None:
     assert "No two estimates correlate" in pairs_sentence([])
 
 
-LONG = [(1, 1_000_000), (8, 250_000), (20, 5_000)]
+LONG = [(1, 1_000_000), (20, 5_000)]
 
 
+@slow
 @pytest.mark.parametrize(("records", "samples"), slow_but([(1, 1_000_000)], LONG))
 def test_long_and_many_records_stay_below_1_5_mb_and_keep_their_spikes(
     records: int, samples: int

@@ -164,15 +164,34 @@ CORE = {
 }
 
 
+#: Faults that share a binary, as each has a row that none of the others in it fails.
+TOGETHER = (
+    ("wrong sign of a derivative",),
+    ("state shared by instances",),
+    ("input held where a rate is given", "parameters without effect during a run",
+     "indicators that stand still"),
+    ("wrong directional derivative", "a start without the rise", "no line of the input",
+     "checksum not looked at", "every call allowed", "a step beside the communication point"),
+)  # fmt: skip
+
+
+@slow
 @harmless
 @pytest.mark.parametrize(
-    "fault", slow_but(["wrong sign of a derivative", "checksum not looked at"], CORE)
+    "faults", [TOGETHER[0], *(pytest.param(t, marks=slow) for t in TOGETHER[1:])]
 )
-def test_wrong_sources(fault: str, tmp_path: Path) -> None:
-    file, old, new, rows = CORE[fault]
-    report = check_fmu(_recompiled(tmp_path / "b.fmu", 2, {file: ((old, new),)}))
+def test_wrong_sources(faults: tuple[str, ...], tmp_path: Path) -> None:
+    edits: dict[str, tuple[tuple[str, str], ...]] = {}
+    for file, old, new, _ in (CORE[fault] for fault in faults):
+        edits[file] = (*edits.get(file, ()), (old, new))
+    report = check_fmu(_recompiled(tmp_path / "b.fmu", 2, edits))
     assert report.compared
-    assert rows <= set(_failures(report)), _failures(report)
+    found = set(_failures(report))
+    assert all(CORE[fault][3] <= found for fault in faults), found
+
+
+def test_every_fault_is_tried_once() -> None:
+    assert sorted(fault for faults in TOGETHER for fault in faults) == sorted(CORE)
 
 
 #: Faults of the FMI 3.0 face that share a binary, as each has a row of its own.
@@ -215,6 +234,7 @@ def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
     assert "stays negative after an event" in found["event indicators"]
 
 
+@slow
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_binaries_that_cannot_be_used(fmi: int, tmp_path: Path) -> None:
     """Missing, cut off, of something else, or of a new library: found, and nothing is loaded."""
@@ -258,6 +278,7 @@ def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) ->
         assert not list(misplaced_binaries(whole))
 
 
+@slow
 @harmless
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_sources_and_model_that_are_not_those_of_the_binary(fmi: int, tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def test_same_bytes_elsewhere_and_another_day(
         "PSA_CASADI_CACHE": str(tmp_path / "cache"),
         "ZIG_GLOBAL_CACHE_DIR": str(cache_directory() / "zig"),
         "ZIG_LOCAL_CACHE_DIR": str(tmp_path / "zig"),
-        "CC": " ".join(zig_command()),
+        "CC": "cc -g",
     }
     again = export_apart(tmp_path / "a longer name of a folder", fmi, *platforms, **changes)
     here = export_fmu(model_named(STACK), tmp_path / "here.fmu", platforms=platforms, fmi=fmi)
@@ -225,10 +225,13 @@ def test_macos(name: str, fmi: int) -> None:
     assert library.header.cpu_type.name == cpu
 
 
-@pytest.mark.parametrize(("compiler", "fmi"), [("gcc", 3), ("clang", 2), ("zig", 3)])
+@pytest.mark.parametrize(("compiler", "fmi"), [("gcc", 3), ("clang", 2)])
 def test_sources_compile_alone(compiler: str, fmi: int, tmp_path: Path) -> None:
-    """With the line of their README, without a warning; the library gives the binary's numbers."""
-    command = zig_command() if compiler == "zig" else [tool(compiler)]
+    """With the line of their README, without a warning; the library gives the binary's numbers.
+
+    zig's compiler made the binary; its warnings are seen by `build_scripts.compile_c`.
+    """
+    command = [tool(compiler)]
     with zipfile.ZipFile(everywhere(fmi).with_suffix(".fmu")) as archive:
         for entry in archive.infolist():
             if entry.filename.startswith("sources/"):

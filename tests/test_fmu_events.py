@@ -15,7 +15,7 @@ from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, OK, Fmu
 from tests import fmi3_instances as fmi3
 from tests.fmu_models import exported, model_named
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -98,6 +98,7 @@ def test_a_held_voltage_makes_no_events(fmi: int) -> None:
     assert np.count_nonzero(np.diff(path["time"]) == 0.0) <= 4
 
 
+@slow
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_importer_locates_reversals_where_they_are(fmi: int) -> None:
     """After a corner of a triangle, u turns R_s C_p ln 2 later: the drive is of first order."""

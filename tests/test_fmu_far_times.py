@@ -14,6 +14,7 @@ from psa_casadi.units import FloatArray
 from tests import sampled_fmus
 from tests.fmu_models import exported, model_named
 from tests.sampled_models import PERIOD, loop
+from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
@@ -124,7 +125,7 @@ def test_a_step_below_the_resolution_of_time_is_refused() -> None:
         slave.step(1e9, 1e-3)
 
 
-@VERSIONS
+@pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
 def test_sampled_states_far_from_zero(fmi: int) -> None:
     """A million seconds on, each instant is where it is near 0 to the rounding of the time."""
     times = np.arange(24) * (PERIOD / 4.0)
@@ -143,6 +144,7 @@ def test_sampled_states_far_from_zero(fmi: int) -> None:
     assert np.abs(runs[2] - runs[0]).max() < 1e-5
 
 
+@slow
 @VERSIONS
 def test_instants_that_cannot_be_counted_are_refused(fmi: int) -> None:
     """By the start, by a step, by the period, in model exchange, and outside of an FMU."""

@@ -65,7 +65,7 @@ def simulated(every: int = 1, hold: str = "linear") -> FloatArray:
     return np.asarray(run.outputs["displacement"])
 
 
-@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=slow), 5])
 def test_communication_steps_are_one_step_or_several(every: int) -> None:
     """FMI 2 passes on the slope of the inputs."""
     assert error(played(2, every), simulated(every)) <= 5e-5
@@ -169,6 +169,7 @@ def test_what_has_no_fixed_step_is_refused(
     assert not (tmp_path / "fixed.fmu").exists()
 
 
+@slow
 def test_the_command_wants_both_options_or_neither(tmp_path: Path) -> None:
     base = ["export", "fmu", "--stack", "P-885.51", "-o", str(tmp_path / "fixed.fmu")]
     for options in (["--solver", "fixed"], ["--step", "10us"]):
@@ -206,9 +207,9 @@ def told(path: Path) -> dict[str, float]:
 
 
 @slow
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_the_check_finds_the_errors_that_it_states(fmi: int, tmp_path: Path) -> None:
+def test_the_check_finds_the_errors_that_it_states(tmp_path: Path) -> None:
     """On the voltages behind them; what means nothing there is left out, and said."""
+    fmi = 3
     path = written(fmi, tmp_path)
     report = psa.check_fmu(path)
     assert report.passed, report.failures
@@ -250,6 +251,7 @@ def test_the_check_of_another_part_with_a_fixed_step(tmp_path: Path) -> None:
     assert report.passed, report.failures
 
 
+@slow
 def test_an_importer_that_holds_inputs_is_told_its_own_errors(tmp_path: Path) -> None:
     """FMI 3.0 has no way to move them: what a jump within a step leaves is twice as much there."""
     moved, held = (told(written(fmi, tmp_path)) for fmi in (2, 3))

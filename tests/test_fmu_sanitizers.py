@@ -45,9 +45,9 @@ def complaints(command: Sequence[str | Path]) -> str:
     return "" if fine else f"status {done.returncode}\n{done.stdout[-500:]}{done.stderr[-3000:]}"
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
-@pytest.mark.parametrize("kind", SANITIZERS)
+@pytest.mark.parametrize(("kind", "fmi"), [("memory", 2), ("memory", 3), ("threads", 2)])
 def test_sanitizers_find_nothing(kind: str, fmi: int) -> None:
+    """What threads could share is in the files that both versions have."""
     compiler = [tool("gcc"), "-O1", "-g", *SANITIZERS[kind]]
     assert not complaints([linked(fmi, compiler, FILES[fmi], kind)])
 
@@ -59,8 +59,9 @@ def test_nothing_is_allocated_after_instantiation(fmi: int) -> None:
     assert not complaints([linked(fmi, compiler, FILES[fmi], "counted")])
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
-def test_valgrind_finds_nothing(fmi: int) -> None:
+def test_valgrind_finds_nothing() -> None:
+    """It sees values that were never set, which the sanitizers do not."""
+    fmi = 3
     guard = [tool("valgrind"), "--error-exitcode=9", "--leak-check=full", "--quiet"]
     compiler = [tool("gcc"), "-O1", "-g", "-DINSTANCES=20", "-DSTEPS=30"]
     program = linked(fmi, compiler, FILES[fmi], "watched")

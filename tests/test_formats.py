@@ -22,7 +22,7 @@ from psa_casadi.records import Record, read_record, read_records, write_record
 from psa_casadi.records.read.column_map import parse_columns
 from psa_casadi.records.read.columns import Source
 from tests.record_files import HEADER, ROWS, write
-from tests.tiers import slow
+from tests.tiers import slow, slow_but
 
 N = 24
 T = np.arange(N) / 8.0
@@ -268,7 +268,7 @@ def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
     assert "it holds none" in problems_of(empty)[0]
 
 
-@pytest.mark.parametrize("version", ["5", "7", "7.3"])
+@pytest.mark.parametrize("version", slow_but(["5", "7"], ["5", "7", "7.3"]))
 def test_a_damaged_matlab_file_is_told_in_sentences(tmp_path: Path, version: str) -> None:
     whole = mat(tmp_path / "a.mat", {"t": T, "u": U, "y": Y}, version).read_bytes()
     draw = np.random.default_rng(1)

@@ -50,6 +50,7 @@ def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> fl
     return held_out_excess(seen, experiments, (clean,), colour, noise).factor
 
 
+@slow
 @pytest.mark.parametrize("correlation", slow_but([0.0], [0.0, 0.7]))
 def test_noise_is_no_reason_to_doubt(
     fitted: tuple[Fit, FloatArray, FloatArray], correlation: float

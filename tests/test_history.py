@@ -17,6 +17,7 @@ from psa_casadi.records import read_record, write_record
 from psa_casadi.simulation.history import memory_after, settled_at
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
+from tests.tiers import slow
 
 STACK = stack_model("P-885.51")
 
@@ -26,6 +27,7 @@ def _falling() -> tuple[FloatArray, FloatArray]:
     return t, 60.0 + 60.0 * np.cos(np.pi * t)
 
 
+@slow
 def test_a_record_that_begins_at_the_top_follows_the_reference_played_from_zero() -> None:
     """Independent: the reference integrates the way up and the record in one piece."""
     t, voltage = _falling()
@@ -66,6 +68,7 @@ def test_no_history_is_the_relaxed_start() -> None:
     assert set(memory_after(STACK, [], at=0.0).values()) == {0.0}
 
 
+@slow
 def test_an_exported_model_starts_settled_and_stays_while_its_voltage_does(tmp_path: Path) -> None:
     """By fmpy: no transient at 60 V, where the way up and back down has left the hysteresis."""
     fmpy = pytest.importorskip("fmpy")

@@ -51,6 +51,7 @@ def _with_spectrum(**values: Any) -> Model:
     return compose(own, {"u_rated": 120.0, "play_0": -0.05, "square_0": 0.02, **values})
 
 
+@slow
 def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
     record = psa.record_from(_loops())
     bouc_wen = psa.identify(record)
@@ -69,7 +70,7 @@ def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
 @slow
 def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
     make_record(None, 3, tmp_path / "record.csv")
-    record = psa.read_record(tmp_path / "record.csv").slice(0, 1500)
+    record = psa.read_record(tmp_path / "record.csv").slice(0, 1000)
     found = psa.identify(record, hysteresis="best")
     assert "bouc_wen" in [c.name for c in found.model.components]
     assert any(s.startswith("hysteresis: Bouc-Wen") for s in found.sentences)
@@ -77,7 +78,8 @@ def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
 
 @slow
 def test_a_diagnosis_begins_with_the_spectrum() -> None:
-    d = psa.diagnose(psa.record_from(_loops()), hysteresis="spectrum")
+    effects = [psa.EFFECTS[n] for n in ("hysteresis_memory", "backlash", "load_stiffness")]
+    d = psa.diagnose(psa.record_from(_loops()), hysteresis="spectrum", effects=effects)
     assert "memory_spectrum" in [c.name for c in d.model.components]
     assert d.base_errors.holdout_rms_m < 1.5 * _NOISE
     assert {c.effect for c in d.causes} <= {"hysteresis_memory"}

@@ -25,7 +25,7 @@ from tests.identified_plants import (
 )
 from tests.tiers import slow, slow_but
 
-SEEDS = (2, 3, 4, 5)
+SEEDS = (2, 3, 4)
 #: Largest relative error of each combination; the asymmetry is a small part of these loops.
 TOLERANCE = {"slope": 2e-3, "width": 5e-3, "asymmetry": 0.5, "n": 1e-2, "lag": 1e-2}
 
@@ -49,7 +49,7 @@ def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
 
 @slow
 def test_intervals_cover_the_truth() -> None:
-    """Of 20 intervals of 95 % at most three may miss (p = 0.016), and none by far."""
+    """Of 15 intervals of 95 % at most two may miss (p = 0.036), and none by far."""
     deviations = []
     for seed in SEEDS:
         stack, found = plant(seed)[0].stack, identified(seed)
@@ -60,7 +60,7 @@ def test_intervals_cover_the_truth() -> None:
         errors = standard_errors(found.fit, found.experiments, rated)
         deviations += [(values[name] - true[name]) / errors[name] for name in true]
     z = np.abs(deviations)
-    assert np.count_nonzero(z > 1.96) <= 3
+    assert np.count_nonzero(z > 1.96) <= 2
     assert z.max() < 4.0
     assert np.median(z) > 0.2  # intervals that are far too wide would cover too
 
@@ -146,6 +146,7 @@ def start_model(p: dict[str, float]) -> Model:
     return compose(BASE, {**p, **wrong, "n": 1.2, "tau": 0.4 * p["tau"], "delta": 0.0})
 
 
+@slow
 def test_intervals_cover_the_reference_where_the_mechanics_are_known() -> None:
     """With stiffness and masses right, every parameter is in its interval, the lag tau too."""
     p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
@@ -190,6 +191,7 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     assert refit_or_keep(first, found.experiments, first.unknowns.names, first.sigma) is first
 
 
+@slow
 @pytest.mark.parametrize(
     ("record", "limit"), [pytest.param("sine_1hz", 0.49, marks=slow), ("minor_loops", 0.64)]
 )

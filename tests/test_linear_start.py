@@ -148,6 +148,7 @@ def test_without_displacement_or_motion_there_is_no_start() -> None:
     assert linear_start([record.slice(0, 10)], base) is None
 
 
+@slow
 @pytest.mark.parametrize("scale", slow_but([40.0], [5.0, 40.0]))
 def test_no_size_is_built_in(scale: float) -> None:
     """Times, volts and metres in other units give the same candidates in those units."""
@@ -220,7 +221,7 @@ def test_what_the_model_lacks_does_not_mislead(effect: str) -> None:
     assert min(errors(start(record), values_of("PTBS200"), record)) < 0.15
 
 
-@pytest.mark.parametrize("seed", slow_but([1], range(6)))
+@pytest.mark.parametrize("seed", slow_but([1], range(4)))
 def test_stacks_of_any_speed(seed: int) -> None:
     """Resonances from 100 Hz to 300 kHz, light to heavy damping, k_P/k_B from 1.5 to 12."""
     values = random_stack(np.random.default_rng(seed))

@@ -19,6 +19,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.stepper import run
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 STACK, PERIOD, NOISE = "P-885.51", 5e-4, 2e-8
@@ -86,6 +87,7 @@ def test_values_off_by_ten_percent_are_learnt(seed: int) -> None:
         assert found == pytest.approx(true, rel=0.01), name
 
 
+@slow
 def test_an_ageing_stack_is_followed() -> None:
     model, time = stack_model(STACK), np.arange(0.0, 6.0, PERIOD)
     drift = ageing(model, 6.0)

@@ -1,4 +1,8 @@
-"""The rows of docs/measured.md on the measured micromanipulator are what a diagnosis says of it."""
+"""A row of docs/measured.md on the measured micromanipulator is what a diagnosis says of it.
+
+That of the minor loops, which the README diagnoses; `python -m tests.benchmarks measured` has the
+others, which take a minute each.
+"""
 
 import json
 import re
@@ -8,15 +12,9 @@ from typing import Any
 import pytest
 
 from build_scripts.page_commands import block_in_tests, run_block
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
-from psa_casadi.records import read_record
 
 PAGE = Path(__file__).parent.parent / "docs" / "measured.md"
-JUDGED = "`minor_loops.csv`, judged on `sine_1hz.csv` (`--holdout`)"
-FILES = {"`sine_1hz.csv`": ("sine_1hz",), "both files": ("sine_1hz", "minor_loops"),
-         JUDGED: ("minor_loops",)}  # fmt: skip
-HELD_OUT = {JUDGED: ("sine_1hz",)}
 
 
 def rows() -> dict[str, list[str]]:
@@ -53,16 +51,6 @@ def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
     errors = [d["errors"][model]["holdout_nrmse_percent"] for model in ("base", "extended")]
     assert within(errors[0], base)
     assert within(errors[1], base if extended == "the same" else extended)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("given", FILES)
-def test_the_measured_row_is_played_again(given: str, measured_data: Path) -> None:
-    records, held_out = (
-        [read_record(measured_data / "micromanipulator" / f"{name}.csv") for name in names]
-        for names in (FILES[given], HELD_OUT.get(given, ()))
-    )
-    is_what_the_row_says(json.loads(diagnose(records, holdout=held_out).to_json()), given)
 
 
 @pytest.mark.slow

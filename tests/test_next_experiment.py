@@ -25,6 +25,7 @@ from tests.plants.base import simulate_base
 from tests.plants.hide import effect_called
 from tests.plants.make import make_record
 from tests.plants.same_device import in_terms_of
+from tests.tiers import slow
 
 #: The loop from record to name is run once: with pytest-xdist by one process.
 pytestmark = pytest.mark.xdist_group("next-experiment")
@@ -57,6 +58,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
     return Loop(first, ambiguous, design, named)
 
 
+@slow
 def test_the_first_record_leaves_two_causes_open(loop: Loop) -> None:
     d = loop.ambiguous
     assert d.verdict == "ambiguous"
@@ -68,6 +70,7 @@ def test_the_first_record_leaves_two_causes_open(loop: Loop) -> None:
         assert contender.effect in {c.name for c in contender.fit.model.effects}
 
 
+@slow
 def test_a_rival_that_is_the_truth_has_a_standard_error_less_of_its_effect(loop: Loop) -> None:
     d = loop.ambiguous
     best = min(d.contenders, key=lambda c: c.fit.rms).fit
@@ -86,6 +89,7 @@ def test_a_rival_that_is_the_truth_has_a_standard_error_less_of_its_effect(loop:
     assert not np.any(base.truth)
 
 
+@slow
 def test_the_designed_record_is_like_the_first_and_tells_more_than_a_sine(loop: Loop) -> None:
     design, first = loop.design, loop.first
     assert design.record.n == first.n
@@ -98,6 +102,7 @@ def test_the_designed_record_is_like_the_first_and_tells_more_than_a_sine(loop: 
     assert min(design.chance.values()) > 0.9
 
 
+@slow
 def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
     d = loop.named
     assert d.verdict in ("cause_named", "partly_explained")
@@ -107,6 +112,7 @@ def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
         resolving_experiment(d)
 
 
+@slow
 def test_the_command_writes_the_record_and_says_so(
     loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

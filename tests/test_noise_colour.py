@@ -21,6 +21,7 @@ from psa_casadi.records.quality.noise import first_order_noise, high_frequency_n
 from psa_casadi.units import FloatArray
 from tests.plants.make import make_record
 from tests.plants.noise import coloured
+from tests.tiers import slow, slow_but
 
 N = 6000
 TIME = np.linspace(0.0, 6.0, N, endpoint=False)
@@ -69,7 +70,7 @@ def test_what_is_above_coloured_noise_is_its_excess() -> None:
     assert noise_rms(more, colour) <= colour.rms
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.85])
+@pytest.mark.parametrize("correlation", slow_but([0.0, 0.6], [0.0, 0.3, 0.6, 0.85]))
 def test_a_colour_survives_the_projection_of_slow_directions(correlation: float) -> None:
     """A hundred slow waves taken out of 3,000 samples leave 0.54 of a correlation of 0.6."""
     n, rng = 3000, np.random.default_rng(6)
@@ -95,8 +96,8 @@ def test_a_colour_is_not_told_where_most_of_it_was_taken_out() -> None:
         return np.linalg.qr(np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, n), np.arange(100))))[0]
 
     basis = waves(1000)
-    for slow, most in ((0.0, 0.05), (0.5, 0.45)):  # white noise, alone and beside a slow misfit
-        e = rng.standard_normal(1000) + slow * np.sin(2.0 * np.pi * 0.13 * np.arange(1000))
+    for size, most in ((0.0, 0.05), (0.5, 0.45)):  # white noise, alone and beside a slow misfit
+        e = rng.standard_normal(1000) + size * np.sin(2.0 * np.pi * 0.13 * np.arange(1000))
         left = e - basis @ (basis.T @ e)
         assert np.sum(colour_of(left, [1000], None, basis).autoregression[0]) <= most
     e = coloured(rng.standard_normal(1200), 0.8)[200:]
@@ -144,6 +145,7 @@ def test_records_may_differ_in_the_size_of_their_noise() -> None:
     assert _size_test(two, lengths=(N // 2, N // 2)) > 1e-3
 
 
+@slow
 def test_a_cause_is_named_beside_coloured_noise(tmp_path: Path) -> None:
     """It removes a fifth of the residual; the rest looks like excess if noise were white."""
     path = tmp_path / "record.csv"

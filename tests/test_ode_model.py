@@ -38,8 +38,9 @@ def _oscillator(fmi: int) -> Path:
     return psa.export_fmu(van_der_pol(), Path(_FOLDER.name) / f"oscillator{fmi}.fmu", fmi=fmi)
 
 
-@pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
-@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize(
+    ("fmi", "kind"), [(3, "CoSimulation"), pytest.param(2, "ModelExchange", marks=pytest.mark.slow)]
+)
 def test_the_oscillator_runs_in_fmpy(fmi: int, kind: str) -> None:
     fmu = _oscillator(fmi)
     assert read_model_description(str(fmu)).fmiVersion.startswith(str(fmi))

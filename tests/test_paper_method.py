@@ -238,6 +238,7 @@ def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
     assert all(s.endswith(".") for s in found.sentences)
 
 
+@slow
 def test_nothing_is_said_against_a_step_that_serves() -> None:
     assert linear_part(find_steps([_quiet(6e-3, 40001)])[0]).sentences == ()
     found = paper_method([_quiet(6e-3, 40001), loop()])
@@ -270,7 +271,8 @@ def test_a_record_without_displacement_is_refused() -> None:
         paper_method([Record(name="planned", time=time, voltage=triangle(time, 0.0, 60.0, 2.0))])
 
 
-@pytest.mark.parametrize("with_step", [True, False])
+@slow
+@pytest.mark.parametrize("with_step", slow_but([True], [True, False]))
 def test_the_command(tmp_path: Path, with_step: bool) -> None:
     paths = []
     for k, r in enumerate([loop(), real_step(120.0)][: 1 + with_step]):

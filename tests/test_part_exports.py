@@ -15,12 +15,12 @@ from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value
 from tests.modelica_runs import simulated
-from tests.tiers import slow_but
+from tests.tiers import slow
 
 
+@slow
 @pytest.mark.usefixtures("code_runs_here")
-@pytest.mark.parametrize("name", slow_but(["position_controller", "flexure_stage"], PARTS))
-@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+@pytest.mark.parametrize(("name", "fmi"), [(n, 2 + k % 2) for k, n in enumerate(PARTS)])
 def test_a_part_passes_the_check_as_an_fmu(name: str, fmi: int, tmp_path: Path) -> None:
     path = export_fmu(part_model(name), tmp_path / f"{name}.fmu", fmi=fmi)
     report = check_fmu(path, part_model(name))

@@ -15,6 +15,7 @@ from psa_casadi.population.outliers import outliers
 from psa_casadi.population.population import frequencies, population
 from psa_casadi.population.several_tests import adjusted
 from psa_casadi.units import FloatArray
+from tests.tiers import slow_but
 
 # Thirteen trials of a vaccine: events and others, treated and control, and the latitude (G. A.
 # Colditz et al., JAMA 271 (1994) 698).
@@ -71,7 +72,7 @@ def test_units_do_not_matter() -> None:
     assert small.tau == pytest.approx(1e-9 * mixed_regression(y, s).tau, rel=1e-6)
 
 
-@pytest.mark.parametrize("tau", [0.0, 1.0])
+@pytest.mark.parametrize("tau", slow_but([1.0], [0.0, 1.0]))
 def test_intervals_cover_and_few_are_told_without_cause(tau: float) -> None:
     rng = np.random.default_rng(3)
     rounds, tau_in, mean_in, alarms = 600, 0, 0, 0

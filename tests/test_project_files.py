@@ -29,6 +29,7 @@ DATA = (
     "psa_casadi/examples/recipes/simulink.md",
     "psa_casadi/fmu_src/instance.c",
     "psa_casadi/fmu_src/page/page.c",
+    "psa_casadi/fmu_src/windows/start.c",
     "psa_casadi/fmu_src/LICENSE",
 )
 

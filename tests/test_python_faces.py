@@ -10,6 +10,7 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.records import records_given
 from tests.report_cases import diagnosis, identification
+from tests.tiers import slow
 
 T = np.arange(64) * 1e-3
 V = 50.0 - 50.0 * np.cos(40.0 * T)
@@ -97,6 +98,7 @@ def test_results_are_short_in_a_line() -> None:
     assert re.fullmatch(r"<Identification: \d+ parameters from 2 records; .*rms>", repr(found))
 
 
+@slow
 def test_results_draw_and_report_themselves(tmp_path: Path) -> None:
     d, found = diagnosis("cause_named"), identification()
     run = psa.simulate(found.model, T, V)

@@ -222,6 +222,7 @@ def _pushed(voltage: float, end: float) -> float:
     return float(found.y[count, -1])
 
 
+@slow
 @pytest.mark.parametrize("made", ["fmpy"], indirect=True)
 def test_the_shell_commands_of_fmpy(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (made / "voltage.csv").write_text(_script("fmpy", "voltage.csv").text, encoding="utf-8")

@@ -16,7 +16,7 @@ from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone
 from tests.report_cases import diagnosis, identification
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 pytestmark = pytest.mark.xdist_group("browser")
 
@@ -31,8 +31,18 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
 
 @pytest.fixture(scope="module", params=slow_but(["diagnosis"], PAGES))
 def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("pages") / f"{request.param}.html"
-    if request.param == "fit":
+    return _written(request.param, tmp_path_factory.mktemp("pages"))
+
+
+@pytest.fixture(scope="module")
+def of_diagnosis(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The longer page, for what both have by the same style sheet and scripts."""
+    return _written("diagnosis", tmp_path_factory.mktemp("page"))
+
+
+def _written(kind: str, folder: Path) -> Path:
+    path = folder / f"{kind}.html"
+    if kind == "fit":
         said = "Play a voltage that is held for ten times the creep lag at three levels."
         found = replace(identification(), advice=(Advice(said, ("tau",), None),))
         write_fit_report(found, path, origin="synthetic")
@@ -50,6 +60,7 @@ def colours(image: np.ndarray[tuple[int, int, int], np.dtype[np.float64]]) -> in
     return len(np.unique(levels))
 
 
+@slow
 def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: Path) -> None:
     document, console = browser.document(page, "--window-size=1280,900")
     assert console == []
@@ -62,10 +73,13 @@ def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: P
         assert re.search(r'class="(js-line|point|hm|trace)', box), "axes without any curve"
 
 
-def test_a_still_picture_is_seen_where_scripts_are_off(browser: Browser, page: Path) -> None:
-    off = page.with_name("off.html")
+@slow
+def test_a_still_picture_is_seen_where_scripts_are_off(
+    browser: Browser, of_diagnosis: Path
+) -> None:
+    off = of_diagnosis.with_name("off.html")
     none = """<head><meta http-equiv="Content-Security-Policy" content="script-src 'none'">"""
-    off.write_text(page.read_text("utf-8").replace("<head>", none, 1), encoding="utf-8")
+    off.write_text(of_diagnosis.read_text("utf-8").replace("<head>", none, 1), encoding="utf-8")
     image = pixels(browser.screenshot(off, 1280, 900))
     assert np.sum(np.all(np.abs(image - BLUE) < 0.06, axis=2)) > 2000  # the model's curves
     assert 30_000 < len("".join(re.findall('base64,([^"]+)', off.read_text("utf-8")))) < 150_000
@@ -102,6 +116,7 @@ def told(browser: Browser, page: Path) -> dict[str, Any]:
     return told_of(document)
 
 
+@slow
 def test_a_phone_shows_it_without_scrolling_sideways(told: dict[str, Any]) -> None:
     assert told["width"] == PHONE
     assert told["needed"] == PHONE
@@ -110,14 +125,16 @@ def test_a_phone_shows_it_without_scrolling_sideways(told: dict[str, Any]) -> No
     assert told["narrowest"] > 0.9 * PHONE
 
 
+@slow
 def test_text_is_legible_on_a_phone(told: dict[str, Any]) -> None:
     assert told["small"] == []
     assert told["smallest"] >= 9
 
 
-def test_it_is_bright_by_day_and_dark_at_night(browser: Browser, page: Path) -> None:
-    day = pixels(browser.screenshot(page, 1280, 1800))
-    night = pixels(browser.screenshot(page, 1280, 1800, DARK))
+@slow
+def test_it_is_bright_by_day_and_dark_at_night(browser: Browser, of_diagnosis: Path) -> None:
+    day = pixels(browser.screenshot(of_diagnosis, 1280, 1800))
+    night = pixels(browser.screenshot(of_diagnosis, 1280, 1800, DARK))
     for image in (day, night):
         assert image.shape == (1800, 1280, 3)
         assert colours(image) > 40
@@ -129,8 +146,9 @@ def test_it_is_bright_by_day_and_dark_at_night(browser: Browser, page: Path) -> 
     assert np.sum(np.all(np.abs(day - BLUE) < 0.02, axis=2)) > 2000
 
 
-def test_a_screenshot_of_a_phone_is_filled(browser: Browser, page: Path) -> None:
-    image = pixels(browser.screenshot(on_a_phone(page, 1800), 500, 1800))[:, :PHONE]
+@slow
+def test_a_screenshot_of_a_phone_is_filled(browser: Browser, of_diagnosis: Path) -> None:
+    image = pixels(browser.screenshot(on_a_phone(of_diagnosis, 1800), 500, 1800))[:, :PHONE]
     assert colours(image) > 40
     rows = np.any(np.abs(image - np.median(image)) > 0.2, axis=(1, 2))
     # text and curves begin near the top, go on to the end, and no screenful is empty
@@ -139,9 +157,10 @@ def test_a_screenshot_of_a_phone_is_filled(browser: Browser, page: Path) -> None
     assert not np.any(np.abs(image[:, -4:] - np.median(image)) > 0.2)
 
 
-def test_a_page_prints_on_few_sheets(browser: Browser, page: Path) -> None:
-    path = page.with_suffix(".pdf")
-    browser.document(page, DARK, f"--print-to-pdf={path}")
+@slow
+def test_a_page_prints_on_few_sheets(browser: Browser, of_diagnosis: Path) -> None:
+    path = of_diagnosis.with_suffix(".pdf")
+    browser.document(of_diagnosis, DARK, f"--print-to-pdf={path}")
     data = path.read_bytes()
     assert data.startswith(b"%PDF")
     assert len(data) > 60_000

@@ -13,6 +13,7 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, DISCARD, ERROR, Fmu, F
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.sampled_fmus import exported
 from tests.sampled_models import PERIOD, controller, loop
+from tests.tiers import slow_but
 
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
 
@@ -85,8 +86,7 @@ def test_measured_dependencies_are_listed() -> None:
 
 
 @pytest.mark.usefixtures("code_runs_here")
-@VERSIONS
-@pytest.mark.parametrize("name", ["loop", "controller"])
+@pytest.mark.parametrize(("name", "fmi"), slow_but([("loop", 3)], [("loop", 3), ("controller", 2)]))
 def test_check_passes(name: str, fmi: int) -> None:
     model = loop() if name == "loop" else controller()
     report = check_fmu(exported(name, fmi), model)

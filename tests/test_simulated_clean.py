@@ -18,7 +18,7 @@ QUICK = (
 
 @pytest.mark.parametrize(
     "case",
-    [*QUICK, *(pytest.param(c, marks=slow) for c in all_cases()[::3] if c not in QUICK)],
+    [*QUICK, *(pytest.param(c, marks=slow) for c in all_cases()[::6] if c not in QUICK)],
     ids=lambda c: f"{c.stack} {c.voltage} {c.noise}",
 )
 def test_what_the_package_simulates_is_adequate(case: Case) -> None:

@@ -21,6 +21,7 @@ from psa_casadi.model.system.system import System
 from tests.fmu_models import assert_valid, model_named
 from tests.ssp_systems import archive_of, closed_loop, pushed_stage
 from tests.test_fmu_system import STACK
+from tests.tiers import slow, slow_but
 
 #: Each archive is exported once: with pytest-xdist by one process.
 pytestmark = pytest.mark.xdist_group("ssp")
@@ -39,7 +40,7 @@ def texts(path: Path) -> dict[str, str]:
         return {n: archive.read(n).decode() for n in names}
 
 
-@pytest.mark.parametrize("name", ["pushed_stage", "closed_loop"])
+@pytest.mark.parametrize("name", slow_but(["pushed_stage"], ["pushed_stage", "closed_loop"]))
 def test_every_file_follows_its_schema_and_names_what_the_fmus_have(name: str) -> None:
     path = archive_of(name)
     for place, text in texts(path).items():
@@ -60,6 +61,7 @@ def known_start(archive: SspArchive, part: str, name: str) -> float:
     return float(next(v.start for v in variables if v.name == name))
 
 
+@slow
 def test_units_of_connectors_are_defined_and_equal_across_every_wire() -> None:
     root = etree.fromstring(texts(archive_of("closed_loop"))["SystemStructure.ssd"].encode())
     defined = {u.get("name"): dict(u[0].attrib) for u in root.iter("{*}Unit")}
@@ -80,6 +82,7 @@ def test_the_same_system_gives_the_same_bytes(tmp_path: Path) -> None:
     assert again.read_bytes() == archive_of("pushed_stage").read_bytes()
 
 
+@slow
 def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
     shared = shared_parameters(closed_loop().parts)
     assert set(shared["k_L"]) == {"compensator", "stack"}
@@ -91,6 +94,7 @@ def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
     assert re.findall(r'source="k_L" target="(.*?)"', mapping) == ["compensator.k_L", "stack.k_L"]
 
 
+@slow
 def test_a_changed_parameter_set_reaches_both_parts(tmp_path: Path) -> None:
     """The value stands once, so a user who edits it changes the stack and its observer."""
     changed = tmp_path / "changed.ssp"
@@ -138,6 +142,7 @@ def _on_each_other(
     return False
 
 
+@slow
 def test_the_picture_shows_every_part_and_port(tmp_path: Path) -> None:
     wiring = wiring_of(closed_loop())
     layout = layout_of(wiring)
@@ -165,7 +170,7 @@ def test_a_system_that_cannot_be_wired_is_refused_before_anything_is_compiled(
     assert not (tmp_path / "wrong.ssp").exists()
 
 
-@pytest.mark.parametrize("name", ["pushed_stage", "closed_loop"])
+@pytest.mark.parametrize("name", slow_but(["pushed_stage"], ["pushed_stage", "closed_loop"]))
 def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     """As its importer reads it: this annotation, by these prefixes, and no canvas.
 

@@ -10,12 +10,14 @@ from psa_casadi.cli.app import app
 from psa_casadi.export.ssp.archive import wiring_of
 from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.model.system.nanopositioner import nanopositioner
+from tests.tiers import slow
 
 
 def psa(*arguments: str) -> Result:
     return CliRunner().invoke(app, arguments)
 
 
+@slow
 def test_the_archive_and_its_picture_are_written(tmp_path: Path) -> None:
     """Of the default stack, where none is named."""
     archive, picture = tmp_path / "stage.ssp", tmp_path / "wiring.png"

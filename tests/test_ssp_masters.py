@@ -18,6 +18,7 @@ from tests.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
 from tests.benchmarks.coupling_stability import settles
 from tests.ssp_systems import archive_of, closed_loop, pushed_stage
 from tests.test_fmu_system import END, RATE, monolithic
+from tests.tiers import slow
 
 _HEIGHT, _PERIOD, _LOOP_END = 4e-6, 2e-3, 1e-3
 
@@ -68,6 +69,7 @@ def test_two_parts_approach_an_independent_solution(rates: bool, order: int) -> 
     assert errors[1] < (5e-3 if order == 1 else 2e-6)
 
 
+@slow
 @pytest.mark.parametrize(("rates", "order"), [(False, 1), (True, 2)])
 def test_the_closed_loop_approaches_one_model_of_it(rates: bool, order: int) -> None:
     errors = [
@@ -77,6 +79,7 @@ def test_the_closed_loop_approaches_one_model_of_it(rates: bool, order: int) -> 
     assert errors[1] < (1e-2 if order == 1 else 1e-4) * _HEIGHT
 
 
+@slow
 def test_fmpy_and_ecos_agree_and_approach_one_model() -> None:
     """Both hold inputs and pass outputs on after every step, so only rounding is between them."""
     path, errors = archive_of("closed_loop"), []

@@ -23,6 +23,7 @@ from tests.benchmarks import nonlinearity
 from tests.benchmarks.nonlinearity_figure import picture
 from tests.benchmarks.nonlinearity_plant import simulate_positioner
 from tests.modelica_runs import simulated
+from tests.tiers import slow
 
 STACK_AND_STAGE = (
     ("stack.displacement", "flexure.tip_position"),
@@ -184,6 +185,7 @@ def test_a_plant_that_cannot_be_tuned_is_refused() -> None:
     ]  # fmt: skip
 
 
+@slow
 def test_the_closed_loop_is_the_same_as_fmu_and_in_modelica(tmp_path: Path) -> None:
     """A step of 5 um: the stage in fmpy and in rumoca against `run`."""
     system = nanopositioner()

@@ -18,6 +18,7 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
 from psa_casadi.variables import Interval
 from tests.evidence_models import evident_fmu, evident_model
+from tests.tiers import slow, slow_but
 
 _SAID = "From here on the results are extrapolated."
 
@@ -34,7 +35,7 @@ def messages(
         return [m for m in instance.messages if _SAID in m], found[:, 0]
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
 def test_inside_nothing_is_said(fmi: int) -> None:
     said, outside = messages(fmi, 75.0, 0.5, start=1e3)
     assert said == []
@@ -55,7 +56,8 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
     assert outside[0] == outside[-1] == 0.0
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
+@slow
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
     said, outside = messages(fmi, 75.0, 0.01)
     assert len(said) == 1

@@ -69,6 +69,7 @@ def test_what_is_kept_was_not_fitted() -> None:
     assert not {share for share, _ in FITTED_LOOPS} & {share for share, _ in KEPT_LOOPS}
 
 
+@slow
 def test_a_stack_is_predicted_to_its_noise(shown: list[Comparison]) -> None:
     """Where the plant is the model, what is left on records never fitted is little but noise."""
     assert [c.kind for c in shown] == [LOOPS, LOOPS, STEPS, OTHER]
@@ -81,6 +82,7 @@ def test_a_stack_is_predicted_to_its_noise(shown: list[Comparison]) -> None:
         assert c.voltage.max() <= RATED
 
 
+@slow
 def test_the_step_is_normalised_by_its_end(shown: list[Comparison]) -> None:
     (step,) = of_kind(shown, STEPS)
     assert step.voltage[1] == pytest.approx(0.6 * RATED)

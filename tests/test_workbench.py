@@ -60,7 +60,8 @@ class Tab:
         return found
 
     def until(self, status: str) -> dict[str, Any]:
-        for _ in range(400):
+        begun = time.monotonic()
+        while time.monotonic() < begun + 60.0:
             state = self.state()
             if state["run"]["status"] == status:
                 return state

@@ -227,15 +227,20 @@ def _compile(
     sources: Sequence[str],
     flags: Sequence[str],
 ) -> Path:
-    """Compile a library in a folder and return its path there."""
+    """Compile a library in a folder and return its path there.
+
+    As one translation unit: each start of the compiler proper takes as long as a small file.
+    """
     for name, text in generated.items():
         (work / name).write_text(text, encoding="utf-8")
     files = [n for n in generated if n.endswith(".c")] + list(sources)
+    unit = "".join(f'#include "{Path(name).as_posix()}"\n' for name in files)
+    (work / "psa_library.c").write_text(unit, encoding="utf-8")
     output = "model" + suffix
     position = () if platform.system() == "Windows" else ("-fPIC",)
     command = [
         *compiler_command(), *OPTIMISE, *flags, *position, "-fvisibility=hidden", "-shared",
-        "-I.", f"-I{sources_directory()}", *files, "-lm", "-o", output,
+        "-I.", f"-I{sources_directory()}", "psa_library.c", "-lm", "-o", output,
     ]  # fmt: skip
     run_compiler(command, work)
     if not (work / output).is_file():

@@ -1,8 +1,12 @@
-"""The measured micromanipulator: the paper's model and two effects, judged on held-out blocks."""
+"""The measured micromanipulator: the paper's model and two effects, judged on held-out blocks.
+
+And what `diagnose` finds in the records, one and both, and in one judged on the other.
+"""
 
 from collections.abc import Sequence
 
 from psa_casadi import datasets
+from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out.errors import errors_of
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -40,8 +44,29 @@ def run(progress: Progress, quick: bool) -> Outcome:
                 Table(head, tuple(rows)),
                 "One of every four of 16 blocks between reversals is held out and never fitted.",
             ),
+            *([] if quick else [_diagnoses(progress)]),
         )
     )
+
+
+def _diagnoses(progress: Progress) -> TitledTable:
+    """Diagnose what the table of `docs/measured.md` diagnoses."""
+    sine, loops = datasets.micromanipulator()
+    given = {
+        "sine_1hz": ([sine], []), "minor_loops": ([loops], []), "both files": ([sine, loops], []),
+        "minor_loops, judged on sine_1hz": ([loops], [sine]),
+    }  # fmt: skip
+    rows = []
+    for name, (records, held_out) in given.items():
+        progress(f"{name}: the diagnosis")
+        found = diagnose(records, holdout=held_out)
+        shares = [
+            f"{e.holdout_nrmse_percent:.2f}" for e in (found.base_errors, found.extended_errors)
+        ]
+        causes = ", ".join(c.effect for c in found.causes)
+        rows.append((name, *shares, found.verdict, causes))
+    head = ("records", "base, held out", "extended, held out", "verdict", "causes")
+    return TitledTable("What diagnose finds, percent of range", Table(head, tuple(rows)))
 
 
 def _extended(

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import pytest
 
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.platforms import PLATFORMS, Platform
+from psa_casadi.export.fmu.platforms import PLATFORMS, RUNTIME, Platform, windows_alone
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.simulation.compiler import OPTIMISE, run_compiler, zig_command
 from tests.fmu_models import model_named
@@ -94,10 +94,15 @@ def host(platform: Platform) -> Path:
     """
     windows = platform.suffix == ".dll"
     program = Path(_FOLDER.name) / f"host-{platform.name}{'.exe' if windows else ''}"
-    sources = [str(HERE / n) for n in ("host.c", "host_fmi2.c", "host_fmi3.c")]
+    names = ("host.c", "host_fmi2.c", "host_fmi3.c", *(["host_windows.c"] if windows else []))
+    sources = [str(HERE / n) for n in names]
     target = ["-target", platform.target or ""]
     options = [*OPTIMISE, *platform.flags, *STRICT, "-isystem", str(HEADERS), "-g0"]
-    libraries = [] if windows else ["-ldl"]
+    libraries = ["-ldl"]
+    if windows:
+        options += [*windows_alone(), "-Wl,-e,mainCRTStartup"]
+        libraries = [*RUNTIME, *(f"-lapi-ms-win-crt-{n}-l1-1-0" for n in ("convert", "runtime"))]
+        libraries += ["-lkernel32"]
     command = [*zig_command(), *target, *options, *sources, *libraries, "-o", str(program)]
     run_compiler(command, Path(_FOLDER.name))
     return program

@@ -105,6 +105,7 @@ def test_visible_ratio_is_what_was_asked_for(effect: str, tmp_path: Path) -> Non
     assert huge.visible < 1e4
 
 
+@slow
 def test_two_effects_add_up(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     both = make_record("slow_creep", 5, path, more=("mains_hum",), more_visible=2.0)
