@@ -70,6 +70,20 @@ def test_a_cause_without_a_name_is_a_part_that_is_not_explained() -> None:
     assert verdict(_steps("hysteresis_memory", alarm=True)) == "partly_explained"
 
 
+@pytest.mark.parametrize(("share", "told"), [(0.75, "partly_explained"), (0.65, "unexplained")])
+def test_where_structure_remains_names_must_remove_enough(share: float, told: str) -> None:
+    open_, closed = _steps("hysteresis_memory", alarm=True), _steps("hysteresis_memory")
+    assert verdict_of(open_, missing=True, withdrawn=False, share=share) == told
+    assert verdict_of(closed, missing=True, withdrawn=False, share=share) == "cause_named"
+
+
+def test_what_removes_too_little_for_a_name_stays_in_the_model() -> None:
+    (kept,) = withdrawn_names(_steps("drive_lag"), Weighed(566.0, 1, 0.4, (), ()), None, {}, "")
+    assert "in the extended model, where it removes 40 %" in kept
+    (left,) = withdrawn_names(_steps("drive_lag"), Weighed(566.0, 1, 0.04, (), ()), None, {}, "")
+    assert "would remove 4 %" in left
+
+
 def test_notes_say_what_is_not_named_and_why() -> None:
     curve = next(k for k in KINDS if k.name == "curve")
     nothing = np.zeros(1)

@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psa_casadi.cli.diagnosis_files import models
+from psa_casadi.diagnosis.budget import Budget
+from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.report.page.diagnosis import write_report
@@ -71,6 +74,24 @@ def test_the_view_is_drawn_before_and_after_the_extension(tmp_path: Path) -> Non
     base_only, _ = page_of(diagnosis("unexplained"), tmp_path)
     views = [f for f in figures(base_only) if f.get("data") and "error_y" in f["data"][0]]
     assert [_names(f) for f in views] == 3 * [["base model"]]
+
+
+def test_an_effect_without_a_name_is_said_to_be_in_the_extended_model(tmp_path: Path) -> None:
+    share = Share("slow_creep", 0.57, (0.5, 0.6))
+    spent = Budget(4e-8, 5e-9, share, (share,), None, 2.6e-8, 0.16)
+    d = replace(diagnosis("cause_named"), verdict="unexplained", causes=(), budget=spent)
+    assert d.kept == ("slow_creep",)
+    lines = told(d)
+    assert "no cause is named; slow creep removes 57 % of the error above" in lines["verdict"]
+    assert "kept in the extended model without being a cause" in lines["verdict"]
+    assert "extended" in lines
+    assert "cause" not in lines
+    assert "slow creep removes 57 %" in lines["budget"]
+    assert not models(d, Path("MODEL.json"))
+    text, page = page_of(d, tmp_path)
+    assert "Every effect that was tried" in headings(text)
+    assert "extended model, held-out rms" in page.text
+    assert diagnosis("cause_named").kept == ()
 
 
 def _names(figure: dict[str, object]) -> list[str]:

@@ -21,9 +21,6 @@ from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.records.checks import FEWEST_SAMPLES
 
-#: Where structure remains, causes are named that remove this share of the held-out error above the
-#: noise: what changes with time, or has another memory, is no free function that could beat them.
-_ENOUGH = 0.8
 _FEW = (
     "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
 )
@@ -63,7 +60,7 @@ def judged(known: Known) -> OdeDiagnosis:
         notes.append(
             _BEATEN.format(names, share, beaten.of, beaten.port.words, beaten.share)
             if beaten
-            else _LITTLE.format(names, share, _ENOUGH)
+            else _LITTLE.format(names, share, thresholds().enough)
         )
     return _diagnosis(known, verdict, named, removed, told, notes, free)
 
@@ -80,7 +77,7 @@ def _verdict(
     partly = last.test.alarm
     return verdict_by(
         missing=first.test.alarm or bool(causes),
-        withdrawn=withdrawn or not causes or (partly and share < _ENOUGH),
+        withdrawn=withdrawn or not causes or (partly and share < thresholds().enough),
         ambiguous=any(rivals(told[c.name], c.name) for c in causes[:1]),
         more=partly,
     )
@@ -163,7 +160,7 @@ def _diagnosis(
         if c.name not in small
     )  # fmt: skip
     best_free = max(free, key=lambda f: f.share, default=None)
-    if verdict != "unexplained" or (best_free and best_free.share <= thresholds().partly):
+    if verdict != "unexplained" or (best_free and best_free.share <= thresholds().form):
         best_free = None
     return OdeDiagnosis(
         verdict=verdict,

@@ -36,7 +36,7 @@ def models(d: "Diagnosis", output: Path | None) -> list[str]:
         f"written: {path}, with {a.instead} instead of {a.cause}"
         for a, path in alternatives(d, output)
     ]
-    if output is not None and not d.causes:
+    if output is not None and not (d.causes or d.kept):
         lines.append(f"nothing was added: {output} holds the base model")
     return lines
 

@@ -33,6 +33,11 @@ class Weighed:
     shares: Sequence[float]
     whole: float = 0.0
 
+    @property
+    def adds(self) -> bool:
+        """Do the causes remove more than their form may be wrong by, named or not?"""
+        return self.share > thresholds().form
+
     def beaten_by(self) -> Correction | None:
         """Return the unnamed correction that takes the names away, if there is one.
 
@@ -48,7 +53,7 @@ class Weighed:
             clearly = thresholds().clearly * temperature(max(self.evidence, self.whole, c.evidence))
             enough = share - thresholds().form
             if c.copies >= alike:
-                enough = thresholds().as_much * share
+                enough = thresholds().enough * share
             removes_more = share > 0.0 and self.share < enough
             if removes_more and c.evidence - thresholds().price > own + clearly:
                 return c
@@ -73,7 +78,7 @@ def verdict_of(
     alarm = bool(steps) and steps[-1].test.alarm
     return verdict_by(
         missing=missing,
-        withdrawn=withdrawn or not named or (alarm and share < thresholds().partly),
+        withdrawn=withdrawn or not named or (alarm and share < thresholds().enough),
         ambiguous=bool(named and told_from(named[0])),
         more=alarm or bool(unnamed),
     )
@@ -134,20 +139,24 @@ def withdrawn_names(
         return ()
     found = (
         f"{names}: found with a ln of the Bayes factor over the base of {weighed.evidence:.0f},"
-        f" would remove {100 * max(0.0, weighed.share):.0f} % of the held-out error above the noise"
+        f" {{}} {100 * max(0.0, weighed.share):.0f} % of the held-out error above the noise"
     )
+    would = found.format("would remove")
     if doubt:
-        return (f"{found}; not named, because {doubt}.",)
+        return (f"{would}; not named, because {doubt}.",)
     if beaten is not None:
         share = weighed.shares[list(weighed.corrections).index(beaten)]
         return (
-            f"{found}; not named, because an unnamed correction explains more:"
+            f"{would}; not named, because an unnamed correction explains more:"
             f" {beaten.kind.sentence}, with {beaten.evidence:.0f} and {100 * share:.0f} %.",
         )
     if vague:
-        return (f"{found}; not named: {_each(vague)}.",)
-    least = 100 * thresholds().partly
-    return (f"{found}; not named, because that is less than {least:.0f} % and much remains.",)
+        return (f"{would}; not named: {_each(vague)}.",)
+    little = f"that is less than {100 * thresholds().enough:.0f} % and much remains"
+    if weighed.adds:
+        removes = found.format("in the extended model, where it removes")
+        return (f"{removes}; not named, because {little}.",)
+    return (f"{would}; not named, because {little}.",)
 
 
 def vague_note(vague: Mapping[str, Correction]) -> tuple[str, ...]:

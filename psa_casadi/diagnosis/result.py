@@ -194,6 +194,13 @@ class Diagnosis(Reported):
     alternatives: tuple[Alternative, ...] = ()
     columns: tuple[Decision, ...] = ()
 
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Effects that the extended model holds and that are not named as causes."""
+        named = {c.effect for c in self.causes}
+        held = () if self.budget is None else self.budget.causes
+        return tuple(c.what for c in held if c.what not in named)
+
     def to_frame(self) -> Any:
         """Return the samples as a pandas DataFrame: measured, base and extended, in metres."""
         rows = list(zip(self.experiments, self.base, self.extended, strict=True))

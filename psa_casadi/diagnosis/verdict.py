@@ -106,10 +106,11 @@ def conclude(
             unnamed=vague,
         )
     )
-    named = [s for s in steps if s.chosen] if verdict in NAMING else []
-    final = last if named else first
+    weak = verdict == "unexplained" and not (beaten or doubt or vague) and weighed.adds
+    kept = [s for s in steps if s.chosen] if verdict in NAMING or weak else []
+    final = last if kept else first
     patch = patch_of(
-        corrections(last.fit, experiments, colour) if named else weighed.corrections,
+        corrections(last.fit, experiments, colour) if kept else weighed.corrections,
         experiments,
         final.view.of.holdout_rms,
         colour,
@@ -120,7 +121,7 @@ def conclude(
         experiments,
         first.predicted,
         final.predicted,
-        [(s.cause.name, s.without.predicted) for s in named if s.without is not None],
+        [(s.cause.name, s.without.predicted) for s in kept if s.without is not None],
         None if patch is None else (patch.name, patch.predicted),
         floor,
     )
@@ -131,7 +132,8 @@ def conclude(
         stiffness_given,
         evidence=diagnosis_evidence(final.fit, found, experiments, final.predicted, spent),
     )
-    small = too_small([c for c in spent.causes if c.what not in vague]) if partly else ()
+    named = kept if verdict in NAMING else []
+    small = too_small([c for c in spent.causes if c.what not in vague]) if partly and named else ()
     unnamed = {*vague, *(c.what for c in small)}
     causes = tuple(_cause(s, last.fit, found, spent) for s in named if s.cause.name not in unnamed)
     return Diagnosis(
@@ -141,9 +143,9 @@ def conclude(
         noise_floor_rms_m=floor,
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
-        gain=gain if named else gain_of(experiments, first.predicted, final.predicted),
+        gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
         blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
-        remaining=_remaining(final, Excess() if named else beyond),
+        remaining=_remaining(final, Excess() if kept else beyond),
         next_experiment=_next_experiment(
             causes,
             verdict,
@@ -169,12 +171,12 @@ def conclude(
         model=model,
         noise=noise,
         misfit=missed,
-        remainder=_misfits(experiments, errors, noise) if named else missed,
+        remainder=_misfits(experiments, errors, noise) if kept else missed,
         contenders=contenders(first, experiments) if verdict == "ambiguous" else (),
         budget=spent,
         patch=patch,
         alternatives=alternatives(
-            named, final.fit, experiments, table, stiffness_given=stiffness_given
+            kept, final.fit, experiments, table, stiffness_given=stiffness_given
         ),
     )
 

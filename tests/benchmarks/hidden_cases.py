@@ -82,7 +82,8 @@ class Found:
     record is said not to show. `confidence` is that of the first cause; `probability` and
     `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
     the noise; `seconds` the processor time; `patch` the unnamed correction that is offered, which
-    would remove the share `patched` of the base's held-out excess.
+    would remove the share `patched` of the base's held-out excess (with what effects that are kept
+    in the model without a name remove).
     """
 
     case: Case
@@ -158,7 +159,6 @@ def names_of(d: Diagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
     named, within = names_of(d)
-    patched = None if d.budget is None else d.budget.unnamed
     return Found(
         case=case,
         rho=float(min([truth.visible, *(h.visible for h in truth.more)])),
@@ -172,8 +172,17 @@ def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
         ratio=d.extended_errors.holdout_rms_m / _level(d, truth),
         seconds=seconds,
         patch="" if d.patch is None else d.patch.name,
-        patched=0.0 if not patched else patched.share,
+        patched=_patched(d),
     )
+
+
+def _patched(d: Diagnosis) -> float:
+    """Return what is offered without a name: the effects that are kept, and the correction."""
+    b = d.budget
+    if b is None:
+        return 0.0
+    kept = b.together.share if d.kept and not d.causes else 0.0
+    return kept + (b.unnamed.share if b.unnamed is not None else 0.0)
 
 
 def _level(d: Diagnosis, truth: Truth) -> float:

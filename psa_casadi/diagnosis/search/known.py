@@ -112,7 +112,7 @@ class Known:
         if not h.causes or root <= noise:
             return False
         share = (root**2 - h.holdout_rms**2) / (root**2 - noise**2)
-        return share < thresholds().partly and self.view(h).test.alarm
+        return share < thresholds().enough and self.view(h).test.alarm
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with its causes in the order in which they explain most.

@@ -5,7 +5,7 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.patch_plot import patch_plot
 from psa_casadi.report.words.budget_words import budget_table, patch_text
-from psa_casadi.report.words.phrases import length_scale
+from psa_casadi.report.words.phrases import added, length_scale
 
 
 def add_budget(page: Document, d: Diagnosis) -> None:
@@ -24,7 +24,7 @@ def add_budget(page: Document, d: Diagnosis) -> None:
     page.table(budget_table(d, scale))
     if d.patch is None:
         return
-    beside = "beyond the named causes" if d.causes else "that no effect of the table describes"
+    beside = "beyond the extended model" if added(d) else "that no effect of the table describes"
     text = patch_text(d.patch)
     page.paragraph(f"What is missing {beside} is best described by {text}. It has no name.")
     coordinate, plot = patch_plot(d, d.patch)

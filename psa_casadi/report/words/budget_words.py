@@ -3,7 +3,7 @@
 from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.report.words.phrases import Scale, listing, number, plain
+from psa_casadi.report.words.phrases import Scale, added, listing, number, plain
 from psa_casadi.report.words.tables import Table
 
 #: Ports that these records cannot distinguish.
@@ -35,18 +35,18 @@ def budget_sentence(d: Diagnosis, scale: Scale) -> str:
     if b is None:
         return ""
     parts = [f"of {scale.text(b.excess_rms_m)} rms above the noise"]
-    if d.causes:
+    if added(d):
         each = [f"{plain(c.what)} removes {share_with_interval(c)}" for c in b.causes]
         parts.append(listing(each))
     if b.unnamed is not None and d.patch is not None:
-        more = "a further" if d.causes else "of it"
+        more = "a further" if added(d) else "of it"
         parts.append(
             f"an unnamed correction would remove {more} {share_with_interval(b.unnamed)}:"
             f" {patch_text(d.patch)}"
         )
-    if d.causes:
+    if added(d):
         left = f"{scale.text(b.remains_rms_m)} ({number(b.remains_percent, 2)} % of the range)"
-        parts.append(f"above the noise the named ones leave {left}")
+        parts.append(f"above the noise the extended model leaves {left}")
     return "; ".join(parts)
 
 

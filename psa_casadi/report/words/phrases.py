@@ -199,7 +199,7 @@ def interval_text(low: float, high: float) -> str:
 
 def added(d: "Diagnosis | OdeDiagnosis") -> bool:
     """Say whether the extended model differs from the base."""
-    return bool(d.causes)
+    return bool(d.causes or (isinstance(d, Diagnosis) and d.kept))
 
 
 #: What an interval of the gain from blocks of few records says.
@@ -242,7 +242,7 @@ def verdict_sentence(d: Diagnosis) -> str:
     if d.verdict == "unexplained" or not d.causes:
         return (
             "Something is missing, and no effect in the table explains it: no cause is named; "
-            f"{_unnamed(d)}{error}."
+            f"{_kept(d)}{_unnamed(d)}{error}."
         )
     share = None if d.budget is None else d.budget.together.share
     return naming_sentence(d, [_cause(c) for c in d.causes], gain_sentence(d), share)
@@ -275,12 +275,24 @@ def within(share: float) -> float:
     return max(0.0, min(1.0, share))
 
 
+def _kept(d: Diagnosis) -> str:
+    """Say what the extended model of a diagnosis without a cause holds, "" where nothing."""
+    if d.budget is None or not d.kept:
+        return ""
+    share = percent(within(d.budget.together.share))
+    return (
+        f"{listing([plain(name) for name in d.kept])} removes {share} of the error above the noise"
+        " and is kept in the extended model without being a cause; "
+    )
+
+
 def _unnamed(d: Diagnosis) -> str:
     """Say what the unnamed correction would remove, "" without one."""
     if d.patch is None or d.budget is None or d.budget.unnamed is None:
         return ""
     share = percent(within(d.budget.unnamed.share))
-    return f"{d.patch.sentence} would remove {share} of the error above the noise; "
+    more = "a further " if added(d) else ""
+    return f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
 
 
 def _cause(cause: Cause) -> str:
