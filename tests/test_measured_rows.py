@@ -1,7 +1,7 @@
-"""A row of docs/measured.md on the measured micromanipulator is what a diagnosis says of it.
+"""Rows of docs/measured.md on the measured micromanipulator are what a diagnosis says of it.
 
-That of the minor loops, which the README diagnoses; `python -m tests.benchmarks measured` has the
-others, which take a minute each.
+Those of the sine, which is the README's picture, and of the minor loops, which the README
+diagnoses; `python -m tests.benchmarks measured` has the others, which take a minute each.
 """
 
 import json
@@ -12,7 +12,9 @@ from typing import Any
 import pytest
 
 from build_scripts.page_commands import block_in_tests, run_block
+from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
+from psa_casadi.records import read_record
 
 PAGE = Path(__file__).parent.parent / "docs" / "measured.md"
 
@@ -51,6 +53,14 @@ def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
     errors = [d["errors"][model]["holdout_nrmse_percent"] for model in ("base", "extended")]
     assert within(errors[0], base)
     assert within(errors[1], base if extended == "the same" else extended)
+
+
+@pytest.mark.slow
+def test_the_record_of_the_readme_s_picture_gives_its_row(measured_data: Path) -> None:
+    record = read_record(measured_data / "micromanipulator" / "sine_1hz.csv")
+    told = json.loads(diagnose([record]).to_json())
+    is_what_the_row_says(told, "`sine_1hz.csv`")
+    assert told["budget"]["together"]["share"] > 0.95
 
 
 @pytest.mark.slow
