@@ -80,7 +80,7 @@ class Thresholds:
     credible: float = 0.95
     clearly: float = 3.0
     as_much: float = 0.67
-    partly: float = 0.2
+    partly: float = 0.7
     follows: float = 0.5
     falling: float = -0.5
 
