@@ -82,7 +82,7 @@ def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> No
 @shares_hysteresis
 def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     d, path = _hysteresis(), tmp_path / "page.html"
-    d.report(path)
+    psa.write_report(d, path)
     text = path.read_text("utf-8")
     page = Page(text)
     (run,) = d.runs
@@ -104,9 +104,12 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert np.max(np.abs(numbers(below["y"]))) == pytest.approx(np.max(np.abs(miss)), rel=1e-5)
     assert len(numbers(above["y"])) == len(numbers(below["y"])) > 1000
     assert path.stat().st_size < 1_500_000
-    told = valid("own_model", d.to_json())
-    assert told["causes"][0]["port"] == "the rate of v"
-    low, high = told["budget"]["causes"][0]["interval"]
+    told = psa.story(d, width=300).splitlines()
+    assert told[0].startswith("verdict    cause named. The cause is hysteresis of x in v")
+    assert f"error      position: held-out rms 160 µm of the base, {rms:.2f} µm of the e" in told[2]
+    document = valid("own_model", d.to_json())
+    assert document["causes"][0]["port"] == "the rate of v"
+    low, high = document["budget"]["causes"][0]["interval"]
     assert 0.9 < low < d.explained_share < high
     shown = rf"hysteresis of x in v {d.explained_share:.0%}"[:-1] + rf" % {100 * low:.0f} to 100 %"
     assert shown in page.text  # cut, as no share is above 100 %
@@ -267,8 +270,15 @@ def test_records_that_do_not_fit_are_refused_in_sentences(tmp_path: Path) -> Non
         psa.identify(oscillator(), {"time": t, "position": t})
     with pytest.raises(psa.InputError, match=r"no output of the model 'oscillator'"):
         psa.diagnose(oscillator(), {"time": t, "force": t})
-    with pytest.raises(psa.InputError, match=r"none named 'time'"):
+    with pytest.raises(psa.InputError, match=r"none named 'time'; name the times \[s\] so\.$"):
         psa.identify(oscillator(), {"t": t, "force": t, "position": t})
+    for wrong in ({"time [s]": t, "force": t}, {"time": t, "force [N]": t, "position": t}):
+        with pytest.raises(psa.InputError, match=r"Write the names without units \('(time|force)'"):
+            psa.identify(oscillator(), wrong)
+    with pytest.raises(psa.InputError, match=r"model comes first.*psa.diagnose\(model, records\)"):
+        psa.diagnose({"time": t, "force": t, "position": t}, oscillator())  # type: ignore[call-overload]
+    with pytest.raises(psa.InputError, match=r"tells a diagnosis, and this is of type Signals"):
+        psa.story(_quiet(oscillator()))  # type: ignore[arg-type]
     with pytest.raises(psa.InputError, match=r"does not strictly increase"):
         psa.identify(oscillator(), {"time": t[::-1], "force": t, "position": t})
     path = tmp_path / "run.csv"

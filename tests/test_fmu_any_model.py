@@ -8,9 +8,14 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from psa_casadi.any_model.effects.attached import extended
+from psa_casadi.any_model.effects.table import effects_of
+from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Component, Equations
-from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.check.check import as_exported, check_fmu
+from psa_casadi.export.check.origin import wrong_dependencies, wrong_start_values
 from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
@@ -43,6 +48,15 @@ def _without_outputs() -> Model:
     return compose([tank], name="tank")
 
 
+def _seen_late() -> Model:
+    """A first-order model whose output is seen through a lag."""
+    model = _ode("late", u=_U, p=_P, ode=_P * (_U - _X), y=_X)
+    ones = dict.fromkeys((*model.state_names, *model.input_names, *model.output_names), 1.0)
+    sizes = Sizes(ones, ones, ones, ones, sample=0.01, duration=1.0)
+    lag = next(e for e in effects_of(model, sizes) if e.name.startswith("lag_of_y"))
+    return extended(model, [lag]).with_values({f"{lag.name}_time": 0.05})
+
+
 MODELS: dict[str, Callable[[], Model]] = {
     "neither input nor parameter": lambda: _ode("decay", ode=-_X),
     "no input": lambda: _ode("decay", p=_P, ode=-_P * _X),
@@ -69,6 +83,17 @@ IN_TURN = [(n, 2 + k % 2) for k, n in enumerate(MODELS) if (n, 3) not in QUICK]
 def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) -> None:
     report = check_fmu(export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
     assert report.passed, report.failures
+
+
+def test_a_sensors_effect_is_left_out_where_the_fmu_leaves_it_out(tmp_path: Path) -> None:
+    """It has no output of its own: its state and parameters tell."""
+    whole = _seen_late()
+    assert whole.state_names != ("x",)
+    with Archive(export_fmu(whole, tmp_path / "m.fmu")) as archive:
+        chosen = as_exported(archive, whole)
+        assert chosen.state_names == ("x",)
+        assert list(wrong_start_values(archive, chosen)) == []
+        assert list(wrong_dependencies(archive, chosen)) == []
 
 
 @slow

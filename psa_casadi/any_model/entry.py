@@ -96,6 +96,11 @@ def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model 
     """Return the model, if there is one, and the records; `words` lose both."""
     left = list(given)
     model = left.pop(0) if left and isinstance(left[0], Model) else words.pop("model", None)
+    if left[1:] and isinstance(left[1], Model):
+        raise InputError(
+            "The model comes first and its records second: psa.diagnose(model, records). With the"
+            " records of a stack, name it: model=..."
+        )
     records = left.pop(0) if left else words.pop("records", None)
     if records is None or left:
         raise InputError("Give records, or a model of your own and its records, and words beside.")

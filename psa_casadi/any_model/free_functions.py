@@ -58,7 +58,8 @@ class Free:
     """A free function: of what, at which port, its evidence over the base, and what it removes.
 
     `removes` is that with its interval, `law` are its monomials in the variables over their
-    `scales`, `fit` the base with it.
+    `scales`, `fit` the base with it and `errors` what that leaves of every output
+    (`OdeHypothesis.errors`).
     """
 
     port: Port
@@ -67,6 +68,7 @@ class Free:
     removes: Share
     law: _Law
     fit: OdeFit
+    errors: tuple[float, ...]
 
     @property
     def share(self) -> float:
@@ -136,7 +138,7 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
         if h is not None:
             of = " and ".join(law.names)
             removes = _removes(f"{of} in {attached.port.words}", known, h, view)
-            found.append(Free(attached.port, of, known.evidence(h), removes, law, h.fit))
+            found.append(Free(attached.port, of, known.evidence(h), removes, law, h.fit, h.errors))
     return tuple(sorted(found, key=lambda f: -f.evidence))
 
 

@@ -37,7 +37,7 @@ _SAME = 0.01
 _DECADES, _CHANGES = 2.3, 2.0
 _SEED = 29
 #: A residual above so many times its own fast noise shows that the model misses something.
-_MISSED = 1.5
+MISSED = 1.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -266,7 +266,7 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         f"'{n}' is missed by {rms[n] / noise[n]:.2g} times its noise: the model lacks something;"
         " psa.diagnose looks for the cause."
         for n in rms
-        if noise[n] > 0 and rms[n] > _MISSED * noise[n]
+        if noise[n] > 0 and rms[n] > MISSED * noise[n]
     ]
     return OdeIdentification(
         model=with_told(fit.model, runs, sure, fit.interrupted),

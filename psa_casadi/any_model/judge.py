@@ -11,6 +11,13 @@ from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView
 from psa_casadi.any_model.identify import with_told
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
 from psa_casadi.any_model.search import Known, with_cause, without
+from psa_casadi.any_model.weighing import (
+    Weighed,
+    beaten_by,
+    left_out,
+    weighed,
+    why_not_named,
+)
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out.shares import Removed, Share
 from psa_casadi.diagnosis.judgement import SMALL_NOTE, least_share, rivals, verdict_by
@@ -23,14 +30,6 @@ from psa_casadi.records.checks import FEWEST_SAMPLES
 
 _FEW = (
     "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
-)
-_BEATEN = (
-    "{} would remove {:.0%} of the held-out error above the noise; not named, because a free"
-    " function of {} in {} explains more ({:.0%})."
-)
-_LITTLE = (
-    "{} would remove {:.0%} of the held-out error above the noise; not named, because that is less"
-    " than {:.0%} and much remains."
 )
 _UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
 
@@ -46,29 +45,27 @@ def judged(known: Known) -> OdeDiagnosis:
         )
     ]
     removed = removed_from(known.runs, root.fit.places, root.predicted, floors)
-    share = removed.from_base(best.predicted)
+    own = weighed(root, best.errors, floors, removed.from_base(best.predicted))
     held = sum(int(r.held_out.sum()) for r in known.runs)
     few = held < FEWEST_SAMPLES
     free = free_functions(known, first) if first.test.alarm or best.causes else ()
-    beaten = _beaten_by(known, best, share, free) if best.causes else None
+    beaten = beaten_by(known, best, own, free, floors) if best.causes else None
     told = _steps(known, best)
-    verdict = _verdict(first, last, share, told, withdrawn=bool(beaten) or few)
+    verdict = _verdict(first, last, own, told, withdrawn=bool(beaten) or few)
     named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
     notes = [_FEW.format(held, FEWEST_SAMPLES)] if few else []
     names = " and ".join(c.name for c in best.causes)
     if verdict == "unexplained" and best.causes and not few:
-        notes.append(
-            _BEATEN.format(names, share, beaten.of, beaten.port.words, beaten.share)
-            if beaten
-            else _LITTLE.format(names, share, thresholds().enough)
-        )
+        notes.append(why_not_named(names, own, beaten))
+    if not few:
+        notes += left_out(known, best)
     return _diagnosis(known, verdict, named, removed, told, notes, free)
 
 
 def _verdict(
     first: OdeView,
     last: OdeView,
-    share: float,
+    own: Weighed,
     told: Mapping[str, Mapping[str, float]],
     *,
     withdrawn: bool,
@@ -77,23 +74,10 @@ def _verdict(
     partly = last.test.alarm
     return verdict_by(
         missing=first.test.alarm or bool(causes),
-        withdrawn=withdrawn or not causes or (partly and share < thresholds().enough),
+        withdrawn=withdrawn or not causes or (partly and not own.enough),
         ambiguous=any(rivals(told[c.name], c.name) for c in causes[:1]),
         more=partly,
     )
-
-
-def _beaten_by(
-    known: Known, best: OdeHypothesis, share: float, free: Sequence[Free]
-) -> Free | None:
-    """Return the free function that takes the names away: clearly likelier, and removing more."""
-    own = known.evidence(best)
-    for f in free:
-        clearly = thresholds().clearly * temperature(max(own, f.evidence))
-        likelier = f.evidence - thresholds().price > known.score(best) + clearly
-        if likelier and share < f.share - thresholds().form:
-            return f
-    return None
 
 
 def _steps(known: Known, best: OdeHypothesis) -> dict[str, dict[str, float]]:

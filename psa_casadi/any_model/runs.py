@@ -10,7 +10,7 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.records.signals import Signals
+from psa_casadi.records.signals import Signals, unit_hint
 from psa_casadi.records.split import divided, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -92,7 +92,7 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
         if name not in s.columns:
             problems.add(
                 f"signals '{s.name}' lack the input '{name}' of the model '{model.name}'; they have"
-                f" {sorted(s.columns)}. Name the column so."
+                f" {sorted(s.columns)}. Name the column so.{unit_hint(s.columns)}"
             )
         elif not np.isfinite(s.columns[name]).all():
             problems.add(
@@ -103,7 +103,7 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
     if not any(np.isfinite(s.columns[n]).sum() >= 8 for n in there):
         problems.add(
             f"signals '{s.name}' have no output of the model '{model.name}' with eight samples or"
-            f" more; it shows {model.output_names}."
+            f" more; it shows {model.output_names}.{unit_hint(s.columns)}"
         )
 
 

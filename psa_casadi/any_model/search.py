@@ -92,6 +92,19 @@ class Known:
 
     def worth(self, h: OdeHypothesis) -> bool:
         """Whether every cause is itself, removes what can be told, and held-out data confirm it."""
+        return self.stands(h) and not self.slight(h)
+
+    def slight(self, h: OdeHypothesis) -> tuple[str, ...]:
+        """Name the causes that remove too little beside the others to be told from their form."""
+        less = [(c.name, self.found.get(h.names - {c.name})) for c in h.causes]
+        return tuple(
+            name
+            for name, before in less
+            if before and before.causes and self._share(h, before) <= thresholds().further
+        )
+
+    def stands(self, h: OdeHypothesis) -> bool:
+        """Whether every cause is itself, and held-out data confirm it."""
         for cause in h.causes:
             if not inside_ranges(h.fit.model.values, cause):
                 return False
@@ -100,8 +113,6 @@ class Known:
                 continue
             gained = self.score(h) - self.score(before)
             if not held_out_confirms(h, before, self.runs, self.colour, gained):
-                return False
-            if before.causes and self._share(h, before) <= thresholds().further:
                 return False
         return True
 

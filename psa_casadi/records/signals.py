@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from psa_casadi.errors import InputError, Problems
 FloatArray = npt.NDArray[np.float64]
 #: What stands for the samples of one experiment: `Signals`, a table with a column `time`, a CSV.
 OneSignals = "Signals | Mapping[str, Any] | str | os.PathLike[str] | Any"
+
+_WITH_UNIT = re.compile(r"[^\[]+\[[^\]]*\]\s*")
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -129,9 +132,21 @@ def _of_table(table: Mapping[str, Any], name: str) -> Signals:
     if "time" not in table:
         raise InputError(
             f"{name} has the columns {sorted(table)} and none named 'time'; name the times [s] so."
+            + unit_hint(table)
         )
     return Signals(
         name=name, time=table["time"], columns={n: v for n, v in table.items() if n != "time"}
+    )
+
+
+def unit_hint(names: Iterable[str]) -> str:
+    """Return what to do where names of columns hold units, such as "speed [rad/s]"; else ""."""
+    found = next((n for n in map(str, names) if _WITH_UNIT.fullmatch(n)), None)
+    if found is None:
+        return ""
+    return (
+        f" Write the names without units ('{found.split('[')[0].strip()}' for '{found}') and the"
+        " values in the units of the model."
     )
 
 

@@ -16,7 +16,6 @@ from psa_casadi.identification.identify import Identification
 from psa_casadi.posterior.result import Posterior
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
-from psa_casadi.report.page.own_model_page import write_own_fit_report, write_own_report
 from psa_casadi.report.plots.figure import (
     diagnosis_figure,
     fit_figure,
@@ -55,12 +54,8 @@ def page(
     still: bool = False,
 ) -> None:
     """Write the page of a result, one HTML file. Raises InputError when that cannot be."""
-    if isinstance(result, Diagnosis):
+    if isinstance(result, Diagnosis | OdeDiagnosis):
         write_report(result, path, still=still)
-    elif isinstance(result, OdeDiagnosis):
-        write_own_report(result, path)
-    elif isinstance(result, OdeIdentification):
-        write_own_fit_report(result, path)
     else:
         write_fit_report(result, path, still=still)
 

@@ -165,7 +165,7 @@ def _described(
     if not chosen and (archive.directory / MODEL_ENTRY).is_file():
         yield count("model inside", _read_model, archive, chosen, effects)
     if chosen:
-        chosen[:] = [_as_exported(archive, chosen[0])]
+        chosen[:] = [as_exported(archive, chosen[0])]
         for name, compared in _ORIGIN.items():
             yield count(name, compared, archive, chosen[0])
         if chosen[0].evidence is not None and fixed_step_of(archive.directory) is None:
@@ -196,16 +196,36 @@ def _read_model(
         yield str(error)
 
 
-def _as_exported(archive: Archive, model: Model) -> Model:
+def as_exported(archive: Archive, model: Model) -> Model:
     """Return the model as the exporter took it: whole, or without sensor and environment.
 
     And with the output that tells how far a run is outside of what the records have shown.
     """
-    whole = set(model.output_names) <= set(archive.names("output"))
-    exported = model if whole else model.plant()
+    exported = model.plant() if _left_out(archive, model) else model
     if VALIDITY in archive.names("output") and exported.evidence is not None:
         exported = with_validity(exported)
     return published_as(archive, exported)
+
+
+def _left_out(archive: Archive, model: Model) -> bool:
+    """Whether an FMU has nothing of what only sensor and environment have.
+
+    Told by all their variables: a sensor's effect need not have an output of its own.
+    """
+    inside, apart = (
+        {n for c in model.components if c.in_plant is plant for n in _names(c)}
+        for plant in (True, False)
+    )
+    own = apart - inside
+    return bool(own) and own.isdisjoint(v.name for v in archive.description.modelVariables)
+
+
+def _names(component: Component) -> Iterator[str]:
+    """Yield the names of a component's variables."""
+    yield from (p.name for p in component.parameters)
+    yield from (s.name for s in (*component.states, *component.sampled))
+    yield from (q.name for q in component.inputs)
+    yield from (y.name for y in component.outputs)
 
 
 #: What the runs of a model need, imported ahead.

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 
+from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_write
 from psa_casadi.report.page.budget_part import add_budget
@@ -10,6 +11,7 @@ from psa_casadi.report.page.cause_part import add_causes, add_evidence
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import add_live, live_diagnosis
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
+from psa_casadi.report.page.own_model_page import write_own_report
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.words.phrases import (
     OWN_VOLTAGES,
@@ -38,7 +40,7 @@ from psa_casadi.report.words.tables import (
 
 
 def write_report(
-    diagnosis: Diagnosis,
+    diagnosis: Diagnosis | OdeDiagnosis,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -48,10 +50,14 @@ def write_report(
 
     `origin`, "measured" or "synthetic", is what the page calls the records. Unless it is to be
     `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
-    page is below 1.5 MB; where scripts are off it has one still picture.
+    page is below 1.5 MB; where scripts are off it has one still picture. That of a model of one's
+    own holds no model that runs.
 
     Raises InputError when `path` cannot be written to.
     """
+    if isinstance(diagnosis, OdeDiagnosis):
+        write_own_report(diagnosis, path)
+        return
     d, series = diagnosis, series_of(diagnosis)
     live = None if still else live_diagnosis(d, series)  # compiles beside what follows
     page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin))

@@ -5,11 +5,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.certainty.profile import Profile, profile_sentences
 from psa_casadi.identification.identify import Identification
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import LiveModel, add_live, live_fit
+from psa_casadi.report.page.own_model_page import write_own_fit_report
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.page.record_part import add_records, add_still
 from psa_casadi.report.plots.finding_plots import correlation_plot, determinacy_plot
@@ -33,7 +35,7 @@ from psa_casadi.report.words.tables import (
 
 
 def write_fit_report(
-    found: Identification,
+    found: Identification | OdeIdentification,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -44,10 +46,14 @@ def write_fit_report(
 
     It shows what the records determine, measured and model, and what the residual is.
     `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. Unless it is to be `still`, the model
-    runs in the page.
+    beside the determinacy. Unless it is to be `still`, the model runs in the page; that of one's
+    own does not.
+
     Raises InputError when `path` cannot be written to.
     """
+    if isinstance(found, OdeIdentification):
+        write_own_fit_report(found, path)
+        return
     series = series_of_fit(found)
     live = None if still else live_fit(found, series)
     with one_unit(_scale(series)):

@@ -9,12 +9,16 @@ from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
+    VERDICTS,
+    added,
+    interval_text,
     listing,
     naming_sentence,
     number,
     percent,
     plain,
     prefixed_scale,
+    rest_sentence,
     with_unit,
     within,
 )
@@ -85,6 +89,27 @@ def _spans(d: OdeDiagnosis) -> dict[str, float]:
 
 def _cause(c: PortCause) -> str:
     return f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
+
+
+def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
+    """Return the lines of a terminal's story: a label and what is told."""
+    lines = [("verdict", f"{VERDICTS[d.verdict]}. {own_verdict_sentence(d)}")]
+    lines += [("records", listing([f"{r.name} ({len(r.time)} samples)" for r in d.runs]))]
+    for e in d.errors:
+        shown = [with_its_unit(v, e.unit) for v in (e.base, e.extended, e.noise)]
+        extended = f", {shown[1]} of the extended model" if added(d) else ""
+        text = f"{e.output}: held-out rms {shown[0]} of the base{extended}; noise {shown[2]}"
+        lines.append(("error", text))
+    for c in d.causes:
+        sizes = [
+            f"{n} = {with_unit(number(e.value), e.unit)} ({interval_text(*e.interval)})"
+            for n, e in c.parameters.items()
+        ]
+        lines.append(("cause", f"{_cause(c)}: {', '.join(sizes)}"))
+        if c.cannot_be_told_from:
+            rivals = listing([plain(n) for n in c.cannot_be_told_from], "or")
+            lines.append(("rivals", f"these data cannot distinguish it from {rivals}"))
+    return [*lines, ("remains", rest_sentence(d)), *(("note", n) for n in d.notes)]
 
 
 def own_budget_table(d: OdeDiagnosis) -> Table:

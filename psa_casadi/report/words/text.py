@@ -6,12 +6,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out.errors import Errors
 from psa_casadi.diagnosis.result import Cause, Diagnosis
+from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import Identification
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.budget_words import budget_sentence
+from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
     VERDICTS,
     Scale,
@@ -42,8 +45,23 @@ _FIRST = re.compile(r"(?<=\.) ")
 _EXPLAINS = re.compile(r"; this(?: view)? explains (\d+ %) of the excess(?=\.)")
 
 
-def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
-    """Return a diagnosis in ten to fifteen lines: verdict with gain, errors, cause, rest."""
+def story(d: Diagnosis | OdeDiagnosis, *, origin: str = "measured", width: int = 100) -> str:
+    """Return a diagnosis in ten to fifteen lines: verdict with gain, errors, cause, rest.
+
+    `origin` is what a stack's records are called. Raises InputError for what is no diagnosis.
+    """
+    if isinstance(d, OdeDiagnosis):
+        lines = own_lines(d)
+    elif isinstance(d, Diagnosis):
+        lines = _lines(d, origin)
+    else:
+        raise InputError(
+            f"`story` tells a diagnosis, and this is of type {type(d).__name__}; print it."
+        )
+    return "\n".join(labelled(label, text, width) for label, text in lines)
+
+
+def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     scale = _scale(d.experiments, d.base_errors.holdout_rms_m)
     lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
     wrong = _EXPLAINS.sub(r" (\1 of the excess)", strongest_sentence(d.misfit))
@@ -68,7 +86,7 @@ def story(d: Diagnosis, *, origin: str = "measured", width: int = 100) -> str:
     lines.append(("blind to", _blind(d)))
     lines.append(("next", d.next_experiment.why))
     lines.extend(("note", _FIRST.split(note, maxsplit=1)[0]) for note in d.notes)
-    return "\n".join(labelled(label, text, width) for label, text in lines)
+    return lines
 
 
 def _cause(d: Diagnosis, cause: Cause) -> str:
