@@ -7,16 +7,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
 import psa_casadi as psa
+from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import block_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.table import effects_of
 from psa_casadi.any_model.runs import runs_of
-from psa_casadi.any_model.sizes import sizes_of
+from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.from_casadi.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
@@ -255,6 +257,35 @@ def _quiet(model: psa.Model) -> Signals:
 def test_a_rate_that_is_another_state_is_no_port() -> None:
     places = {(p.kind, p.variable) for p in ports_of(oscillator())}
     assert places == {("input", "force"), ("rate", "v"), ("output", "position")}
+
+
+def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
+    x, v, u, k = (ca.SX.sym(n) for n in ("x", "v", "u", "k"))
+    model = psa.ode_model(
+        {"x": [x, v], "u": u, "p": k, "y": x, "ode": [v, u - k * x]},
+        name="any", outputs=["y"], values={"k": 1.0},
+    )  # fmt: skip
+    ones = dict.fromkeys(("x", "v", "u", "y"), 1.0)
+    text = (ROOT / "docs/howto/own_model.md").read_text("utf-8")
+    shown = []
+    for effect in effects_of(model, Sizes(ones, ones, ones, ones, sample=1.0, duration=1.0)):
+        kind, c = re.split("_of_|_in_", effect.name)[0], effect.component
+        if kind not in shown:
+            shown.append(kind)
+            fitted = [p for p in c.parameters if p.fitted]
+            said = "; ".join(
+                f"`{p.name.removeprefix(f'{c.name}_')}` {p.description}" for p in fitted
+            )
+            law = re.sub(r"\|(\w+)\|", r"abs(\1)", c.equation_text)
+            what = c.description.removeprefix(f"{effect.port.words}: ")
+            assert f"\n| `{c.name}` | {what} | `{law}` | {said} |\n" in text
+    assert len(shown) == text.count("\n| `") == 14
+
+
+def test_the_help_of_both_faces_tells_of_own_models() -> None:
+    for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
+        assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
+        assert str(face.__doc__).count(word) >= 2  # in the signature and in words
 
 
 def test_the_stiffness_of_an_own_model_is_not_that_of_a_stack() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import wraps
+from inspect import signature
 from typing import Any, overload
 
 from psa_casadi.any_model.diagnose import diagnose_ode
@@ -24,6 +25,17 @@ from psa_casadi.simulation.ways import output_of
 Progress = Callable[[str], None]
 
 
+def _told_of(own: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add to a function's help what it is for a model of one's own."""
+
+    def told(face: Callable[..., Any]) -> Callable[..., Any]:
+        words = f"Of a model of your own, {face.__name__}{signature(own)}:\n\n    {own.__doc__}"
+        face.__doc__ = f"{face.__doc__}\n    {words}"
+        return face
+
+    return told
+
+
 @overload
 def identify(
     records: Records,
@@ -43,6 +55,7 @@ def identify(
     zeros: Sequence[str] = (),
     known_start: bool = False,
 ) -> OdeIdentification: ...
+@_told_of(identify_ode)
 @wraps(stack.identify)
 def identify(*given: Any, **words: Any) -> Any:
     """Identify a stack from its records, or a model of one's own, given first, from its."""
@@ -77,6 +90,7 @@ def diagnose(
     known_start: bool = False,
     progress: Progress = ...,
 ) -> OdeDiagnosis: ...
+@_told_of(diagnose_ode)
 @wraps(stacks.diagnose)
 def diagnose(*given: Any, **words: Any) -> Any:
     """Diagnose a stack's records, or a model of one's own, given first, on its records."""
