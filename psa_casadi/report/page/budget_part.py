@@ -5,7 +5,8 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.patch_plot import patch_plot
 from psa_casadi.report.words.budget_words import budget_table, patch_text
-from psa_casadi.report.words.phrases import added, length_scale
+from psa_casadi.report.words.phrases import length_scale
+from psa_casadi.report.words.verdict_words import added
 
 
 def add_budget(page: Document, d: Diagnosis) -> None:

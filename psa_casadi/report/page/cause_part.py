@@ -10,13 +10,8 @@ from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.finding_plots import evidence_plot
 from psa_casadi.report.plots.signature_figure import size_sentence
 from psa_casadi.report.plots.view_plots import signature_plot, view_named
-from psa_casadi.report.words.phrases import (
-    alternative_sentence,
-    cause_size,
-    listing,
-    percent,
-    plain,
-)
+from psa_casadi.report.words.phrases import listing, percent, plain
+from psa_casadi.report.words.verdict_words import alternative_sentence, cause_size
 
 #: Causes whose signatures are drawn.
 _DRAWN = 3

@@ -19,7 +19,8 @@ from psa_casadi.report.words.comparison_words import (
     file_table,
     verdict_table,
 )
-from psa_casadi.report.words.phrases import VERDICTS, number, one_unit
+from psa_casadi.report.words.phrases import number, one_unit
+from psa_casadi.report.words.verdict_words import VERDICTS
 
 #: More devices than this are a population.
 MOST = 20

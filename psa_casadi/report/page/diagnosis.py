@@ -14,10 +14,6 @@ from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
 from psa_casadi.report.page.own_model_page import write_own_report
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.words.phrases import (
-    OWN_VOLTAGES,
-    VERDICTS,
-    added,
-    gain_sentence,
     in_page_unit,
     length_scale,
     listing,
@@ -25,7 +21,6 @@ from psa_casadi.report.words.phrases import (
     one_unit,
     percent,
     rest_sentence,
-    verdict_sentence,
 )
 from psa_casadi.report.words.residuals import residual_figures
 from psa_casadi.report.words.series import Series, most_telling, series_of
@@ -36,6 +31,13 @@ from psa_casadi.report.words.tables import (
     error_table,
     parameter_table,
     record_table,
+)
+from psa_casadi.report.words.verdict_words import (
+    OWN_VOLTAGES,
+    VERDICTS,
+    added,
+    gain_sentence,
+    verdict_sentence,
 )
 
 

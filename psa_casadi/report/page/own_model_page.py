@@ -25,16 +25,11 @@ from psa_casadi.report.words.own_words import (
     own_verdict_sentence,
     with_its_unit,
 )
-from psa_casadi.report.words.phrases import (
-    VERDICTS,
-    added,
-    percent,
-    plain,
-    rest_sentence,
-)
+from psa_casadi.report.words.phrases import percent, plain, rest_sentence
 from psa_casadi.report.words.residuals import residual_figures
 from psa_casadi.report.words.series import Series, most_telling
 from psa_casadi.report.words.tables import candidate_table, parameter_table, record_table
+from psa_casadi.report.words.verdict_words import VERDICTS, added
 
 #: Outputs that have a tile of their own, series whose residual is told at once, effects with bars.
 _TILES, _TOLD, _BARS = 4, 4, 16

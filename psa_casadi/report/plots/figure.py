@@ -15,13 +15,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_path
 from psa_casadi.identification.identify import Identification
-from psa_casadi.report.words.phrases import (
-    in_brackets,
-    length_scale,
-    plain,
-    share_text,
-    verdict_sentence,
-)
+from psa_casadi.report.words.phrases import in_brackets, length_scale, plain, share_text
 from psa_casadi.report.words.series import (
     EXTENDED_COLOUR,
     HELD_OUT_COLOUR,
@@ -37,6 +31,7 @@ from psa_casadi.report.words.series import (
     spans,
     telling_window,
 )
+from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 
 #: What all pictures share.

@@ -3,8 +3,9 @@
 from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.report.words.phrases import Scale, added, listing, number, plain
+from psa_casadi.report.words.phrases import Scale, listing, number, plain
 from psa_casadi.report.words.tables import Table
+from psa_casadi.report.words.verdict_words import added
 
 #: Ports that these records cannot distinguish.
 _OPEN = "; these data cannot distinguish it from {}"

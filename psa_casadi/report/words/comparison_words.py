@@ -5,18 +5,10 @@ from collections.abc import Sequence
 from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import BudgetShare, Finding
 from psa_casadi.population.parameters import Estimates, display_unit
-from psa_casadi.report.words.phrases import (
-    VERDICTS,
-    Scale,
-    handy_scale,
-    listing,
-    number,
-    percent,
-    plain,
-    within,
-)
+from psa_casadi.report.words.phrases import Scale, handy_scale, listing, number, percent, plain
 from psa_casadi.report.words.population_words import p_text
 from psa_casadi.report.words.tables import Table
+from psa_casadi.report.words.verdict_words import VERDICTS, within
 from psa_casadi.units import convert
 
 

@@ -9,8 +9,9 @@ from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import Run, varied
 from psa_casadi.model.compose import Model
-from psa_casadi.report.words.phrases import added, in_brackets
+from psa_casadi.report.words.phrases import in_brackets
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, Series
+from psa_casadi.report.words.verdict_words import added
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -9,21 +9,18 @@ from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
-    VERDICTS,
-    added,
     interval_text,
     listing,
-    naming_sentence,
     number,
     percent,
     plain,
     prefixed_scale,
     rest_sentence,
     with_unit,
-    within,
 )
 from psa_casadi.report.words.series import FloatArray, Series
 from psa_casadi.report.words.tables import Table
+from psa_casadi.report.words.verdict_words import VERDICTS, added, naming_sentence, within
 
 #: Outputs that a sentence names one by one.
 _NAMED = 4

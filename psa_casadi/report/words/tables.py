@@ -15,7 +15,6 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.grades import grade
 from psa_casadi.report.words.phrases import (
     Scale,
-    added,
     interval_text,
     number,
     plain,
@@ -25,6 +24,7 @@ from psa_casadi.report.words.phrases import (
     with_unit,
 )
 from psa_casadi.report.words.residuals import ResidualFigures
+from psa_casadi.report.words.verdict_words import added
 from psa_casadi.units import convert
 
 if TYPE_CHECKING:  # which take long to load

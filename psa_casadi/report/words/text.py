@@ -16,12 +16,7 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
-    VERDICTS,
     Scale,
-    added,
-    alternative_sentence,
-    cause_size,
-    column_sentence,
     length_scale,
     listing,
     number,
@@ -30,9 +25,16 @@ from psa_casadi.report.words.phrases import (
     probability_text,
     rest_sentence,
     strongest_sentence,
-    verdict_sentence,
 )
 from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
+from psa_casadi.report.words.verdict_words import (
+    VERDICTS,
+    added,
+    alternative_sentence,
+    cause_size,
+    column_sentence,
+    verdict_sentence,
+)
 
 if TYPE_CHECKING:  # which take long to load
     from psa_casadi.export.check.check import CheckReport

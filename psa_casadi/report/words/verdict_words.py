@@ -1,0 +1,171 @@
+"""The verdict of a diagnosis in sentences: what is named, how sure it is, and what it removes."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
+from psa_casadi.report.words.phrases import (
+    interval_text,
+    length_scale,
+    listing,
+    number,
+    percent,
+    plain,
+    shown_in,
+    with_unit,
+)
+from psa_casadi.units import convert
+
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.any_model.result import OdeDiagnosis
+
+VERDICTS = {
+    "adequate": "adequate",
+    "cause_named": "cause named",
+    "partly_explained": "partly explained",
+    "ambiguous": "ambiguous",
+    "unexplained": "unexplained",
+    "not_driven": "not driven",
+}
+
+
+def added(d: "Diagnosis | OdeDiagnosis") -> bool:
+    """Say whether the extended model differs from the base."""
+    return bool(d.causes or (isinstance(d, Diagnosis) and d.kept))
+
+
+#: What an interval of the gain from blocks of few records says.
+OWN_VOLTAGES = (
+    "The interval is taken over blocks of the held-out samples and holds for these voltages only;"
+    " for other voltages hold out four records or more (--holdout)."
+)
+
+
+def gain_sentence(d: Diagnosis) -> str:
+    """Say how far the held-out error falls."""
+    gain = d.gain.holdout_rms_reduction_percent
+    low, high = d.gain.interval
+    if gain <= 0:
+        return "the held-out error does not fall"
+    return f"the held-out error falls by {gain:.0f} % (95 % interval {low:.0f} to {high:.0f} %)"
+
+
+_PLAIN = {
+    "adequate": "Nothing beyond the noise is missing from the base model",
+    "not_driven": "The displacement does not follow the voltage: nothing can be diagnosed",
+}
+
+
+def verdict_sentence(d: Diagnosis) -> str:
+    """Say the verdict in one sentence, with confidence and gain."""
+    if d.doubt:
+        seen = (
+            "Nothing beyond the noise is seen to be missing"
+            if d.verdict == "adequate"
+            else "Something is missing, and no cause is named"
+        )
+        return f"{seen}; {d.doubt}."
+    error = (
+        f"the base model's held-out error is {number(d.base_errors.holdout_nrmse_percent, 2)} %"
+        " of the range"
+    )
+    if d.verdict in _PLAIN:
+        return f"{_PLAIN[d.verdict]}; {error}."
+    if d.verdict == "unexplained" or not d.causes:
+        return (
+            "Something is missing, and no effect in the table explains it: no cause is named; "
+            f"{_kept(d)}{_unnamed(d)}{error}."
+        )
+    share = None if d.budget is None else d.budget.together.share
+    return naming_sentence(d, [_cause(c) for c in d.causes], gain_sentence(d), share)
+
+
+def naming_sentence(
+    d: "Diagnosis | OdeDiagnosis", causes: Sequence[str], gain: str, share: float | None
+) -> str:
+    """Say the verdict of a diagnosis that names: its `causes` in words, and what they remove.
+
+    `gain` is what they do to the error, `share` what they remove of its power above the noise.
+    """
+    if d.verdict == "ambiguous":
+        first = d.causes[0]
+        rivals = listing([plain(n) for n in (first.effect, *first.cannot_be_told_from)], "or")
+        together = listing([plain(c.effect) for c in d.causes])
+        return (
+            f"Something is missing, and these data do not decide whether it is {rivals}; with"
+            f" {together}, {gain}."
+        )
+    are = f"{'cause is' if len(causes) == 1 else 'causes are'} {listing(causes)}"
+    if d.verdict == "partly_explained":
+        of = "" if share is None else f" ({percent(within(share))} of its power above the noise)"
+        return f"The closest known {are}: {gain}{of}; more than noise remains."
+    return f"The {are}: {gain}."
+
+
+def within(share: float) -> float:
+    """Return a share as it is shown, from 0 to 1."""
+    return max(0.0, min(1.0, share))
+
+
+def _kept(d: Diagnosis) -> str:
+    """Say what the extended model of a diagnosis without a cause holds, "" where nothing."""
+    if d.budget is None or not d.kept:
+        return ""
+    share = percent(within(d.budget.together.share))
+    return (
+        f"{listing([plain(name) for name in d.kept])} removes {share} of the error above the noise"
+        " and is kept in the extended model without being a cause; "
+    )
+
+
+def _unnamed(d: Diagnosis) -> str:
+    """Say what the unnamed correction would remove, "" without one."""
+    if d.patch is None or d.budget is None or d.budget.unnamed is None:
+        return ""
+    share = percent(within(d.budget.unnamed.share))
+    more = "a further " if added(d) else ""
+    return f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
+
+
+def _cause(cause: Cause) -> str:
+    return f"{plain(cause.effect)} ({cause.belongs_to}, confidence {percent(cause.confidence)})"
+
+
+def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
+    """Say which of two causes an exported plant holds, and what that makes of its displacement."""
+    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
+    apart = length_scale(a.plant_differs_m, counts=counts).text(a.plant_differs_m, 2)
+    inside = any(c.name == a.cause for c in d.model.plant().components)
+    holds = "holds" if inside else "leaves out"
+    return (
+        f"an exported plant {holds} the {plain(a.cause)}; with {plain(a.instead)} in its place its"
+        f" displacement differs by up to {apart} ({number(a.plant_differs_percent, 2)} % of range),"
+        " which these data do not decide"
+    )
+
+
+def column_sentence(d: Diagnosis, c: Decision) -> str:
+    """Say what a further column decided, and what the models miss of it in held-out samples."""
+    if c.base_rms is None or c.noise is None or c.extended_rms is None:
+        return c.sentence
+    after = f", extended {number(c.extended_rms)}" if added(d) else ""
+    errors = f"base {number(c.base_rms)}{after}, noise {number(c.noise)}"
+    return f"{c.sentence} Held-out rms: {with_unit(errors, c.unit)}."
+
+
+def cause_size(d: Diagnosis, cause: Cause) -> str:
+    """Return "name = value unit (low to high)" for every parameter of a cause.
+
+    Of one that is several of a kind, and has many, at which frequencies they are.
+    """
+    several = next((c for c in d.model.components if c.name == cause.effect and c.count > 1), None)
+    if several is not None:
+        tones = sorted(d.model.values[p.name] for p in several.parameters if p.unit == "Hz")
+        return f"at {', '.join(number(v) for v in tones)} Hz"
+    texts = []
+    for name, e in cause.parameters.items():
+        unit, display = shown_in(d.model, name)
+        value, low, high = (convert(v, unit, display) for v in (e.value, *e.interval))
+        estimate = with_unit(number(value), display)
+        texts.append(f"{name} = {estimate} ({interval_text(low, high)})")
+    return ", ".join(texts)
