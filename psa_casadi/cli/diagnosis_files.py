@@ -32,11 +32,13 @@ def noted(d: "Diagnosis", left_out: Sequence[str]) -> "Diagnosis":
 
 def models(d: "Diagnosis", output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
+    from psa_casadi.report.words.verdict_words import added
+
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"
         for a, path in alternatives(d, output)
     ]
-    if output is not None and not (d.causes or d.kept):
+    if output is not None and not added(d):
         lines.append(f"nothing was added: {output} holds the base model")
     return lines
 

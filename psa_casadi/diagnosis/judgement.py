@@ -134,14 +134,18 @@ def withdrawn_names(
 
     An unnamed correction has `beaten` all of them, or some have beaten each of them (`vague`).
     """
-    names = ", ".join(s.cause.name for s in steps if s.chosen is not None)
+    names = [s.cause.name for s in steps if s.chosen is not None]
     if not names:
         return ()
-    found = (
-        f"{names}: found with a ln of the Bayes factor over the base of {weighed.evidence:.0f},"
-        f" {{}} {100 * max(0.0, weighed.share):.0f} % of the held-out error above the noise"
-    )
-    would = found.format("would remove")
+
+    def found(remove: str) -> str:
+        return (
+            f"{', '.join(names)}: found with a ln of the Bayes factor over the base of"
+            f" {weighed.evidence:.0f}, {remove} {100 * max(0.0, weighed.share):.0f} % of the"
+            " held-out error above the noise"
+        )
+
+    would = found("would remove")
     if doubt:
         return (f"{would}; not named, because {doubt}.",)
     if beaten is not None:
@@ -154,8 +158,9 @@ def withdrawn_names(
         return (f"{would}; not named: {_each(vague)}.",)
     little = f"that is less than {100 * thresholds().enough:.0f} % and much remains"
     if weighed.adds:
-        removes = found.format("in the extended model, where it removes")
-        return (f"{removes}; not named, because {little}.",)
+        they = "it removes" if len(names) == 1 else "they remove"
+        kept = found(f"in the extended model, where {they}")
+        return (f"{kept}; not named, because {little}.",)
     return (f"{would}; not named, because {little}.",)
 
 

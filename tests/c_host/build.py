@@ -22,7 +22,7 @@ import numpy.typing as npt
 import pytest
 
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.platforms import PLATFORMS, RUNTIME, Platform, windows_alone
+from psa_casadi.export.fmu.platforms import PLATFORMS, RUNTIME, Platform, runtime, windows_alone
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.simulation.compiler import OPTIMISE, run_compiler, zig_command
 from tests.fmu_models import model_named
@@ -101,8 +101,7 @@ def host(platform: Platform) -> Path:
     libraries = ["-ldl"]
     if windows:
         options += [*windows_alone(), "-Wl,-e,mainCRTStartup"]
-        libraries = [*RUNTIME, *(f"-lapi-ms-win-crt-{n}-l1-1-0" for n in ("convert", "runtime"))]
-        libraries += ["-lkernel32"]
+        libraries = [*RUNTIME, *runtime("convert", "runtime"), "-lkernel32"]
     command = [*zig_command(), *target, *options, *sources, *libraries, "-o", str(program)]
     run_compiler(command, Path(_FOLDER.name))
     return program

@@ -87,8 +87,8 @@ def _budget(evidence: Evidence) -> Iterator[Said]:
         return
     yield Said("base", f"{micrometres(b.base_m)} rms above the noise, without the causes")
     yield Said("noise", f"{micrometres(b.noise_m)} rms")
-    for cause in b.causes:
-        yield Said("effect", f"{cause.what}: {_share(cause.share, cause.interval)}")
+    for effect in b.causes:
+        yield Said("effect", f"{effect.what}: {_share(effect.share, effect.interval)}")
     if b.unnamed is not None:
         share = _share(b.unnamed.share, b.unnamed.interval)
         yield Said("unnamed correction outside", f"{b.unnamed.what}: {share}; the model lacks it")

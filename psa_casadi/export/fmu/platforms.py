@@ -52,10 +52,14 @@ class Platform:
 _PIC = ("-fPIC", "-Wl,-s")
 _ARMHF = (*_PIC, "-mcpu=generic+v7a+vfp3d16-d32-neon")
 
-#: The parts of the universal C runtime of Windows that a library takes from.
-RUNTIME = tuple(
-    f"-lapi-ms-win-crt-{part}-l1-1-0" for part in ("heap", "math", "private", "stdio", "string")
-)
+
+def runtime(*parts: str) -> tuple[str, ...]:
+    """Return the flags that link parts of the universal C runtime of Windows."""
+    return tuple(f"-lapi-ms-win-crt-{part}-l1-1-0" for part in parts)
+
+
+#: The parts that a library of an FMU takes from.
+RUNTIME = runtime("heap", "math", "private", "stdio", "string")
 
 PLATFORMS: dict[str, Platform] = {
     p.name: p

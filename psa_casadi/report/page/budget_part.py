@@ -19,7 +19,7 @@ def add_budget(page: Document, d: Diagnosis) -> None:
     page.section("Where the error goes")
     page.paragraph(
         f"The base model's held-out error above the noise is {scale.text(b.excess_rms_m)} rms."
-        " Shares are of its power; each cause's is what the model fitted again without it would"
+        " Shares are of its power; each effect's is what the model fitted again without it would"
         " leave more."
     )
     page.table(budget_table(d, scale))

@@ -58,7 +58,7 @@ def budget_table(d: Diagnosis, scale: Scale) -> Table:
         return Table(("", "share", "95 % interval"), ())
     rows = [share_row(plain(c.what), c) for c in b.causes]
     if len(b.causes) > 1:
-        rows.append(share_row("all causes together", b.together))
+        rows.append(share_row("all causes together" if d.causes else "all together", b.together))
     if b.unnamed is not None and d.patch is not None:
         rows.append(share_row(f"unnamed: {d.patch.name}", b.unnamed))
     remains = number(scale.factor * b.remains_rms_m)

@@ -9,7 +9,6 @@ from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
-    interval_text,
     listing,
     number,
     percent,
@@ -20,7 +19,13 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.series import FloatArray, Series
 from psa_casadi.report.words.tables import Table
-from psa_casadi.report.words.verdict_words import VERDICTS, added, naming_sentence, within
+from psa_casadi.report.words.verdict_words import (
+    VERDICTS,
+    added,
+    cause_size,
+    naming_sentence,
+    within,
+)
 
 #: Outputs that a sentence names one by one.
 _NAMED = 4
@@ -98,11 +103,7 @@ def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
         text = f"{e.output}: held-out rms {shown[0]} of the base{extended}; noise {shown[2]}"
         lines.append(("error", text))
     for c in d.causes:
-        sizes = [
-            f"{n} = {with_unit(number(e.value), e.unit)} ({interval_text(*e.interval)})"
-            for n, e in c.parameters.items()
-        ]
-        lines.append(("cause", f"{_cause(c)}: {', '.join(sizes)}"))
+        lines.append(("cause", f"{_cause(c)}: {cause_size(d, c)}"))
         if c.cannot_be_told_from:
             rivals = listing([plain(n) for n in c.cannot_be_told_from], "or")
             lines.append(("rivals", f"these data cannot distinguish it from {rivals}"))

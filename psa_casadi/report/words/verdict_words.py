@@ -17,7 +17,7 @@ from psa_casadi.report.words.phrases import (
 from psa_casadi.units import convert
 
 if TYPE_CHECKING:  # which take long to load
-    from psa_casadi.any_model.result import OdeDiagnosis
+    from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 
 VERDICTS = {
     "adequate": "adequate",
@@ -112,10 +112,12 @@ def _kept(d: Diagnosis) -> str:
     if d.budget is None or not d.kept:
         return ""
     share = percent(within(d.budget.together.share))
-    return (
-        f"{listing([plain(name) for name in d.kept])} removes {share} of the error above the noise"
-        " and is kept in the extended model without being a cause; "
-    )
+    effects = listing([plain(name) for name in d.kept])
+    if len(d.kept) == 1:
+        said = f"{effects} removes {share} of the error above the noise and is kept in the"
+        return f"{said} extended model without being a cause; "
+    said = f"{effects} remove {share} of the error above the noise and are kept in the"
+    return f"{said} extended model without being causes; "
 
 
 def _unnamed(d: Diagnosis) -> str:
@@ -153,7 +155,7 @@ def column_sentence(d: Diagnosis, c: Decision) -> str:
     return f"{c.sentence} Held-out rms: {with_unit(errors, c.unit)}."
 
 
-def cause_size(d: Diagnosis, cause: Cause) -> str:
+def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str:
     """Return "name = value unit (low to high)" for every parameter of a cause.
 
     Of one that is several of a kind, and has many, at which frequencies they are.
