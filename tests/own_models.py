@@ -68,3 +68,49 @@ def pair() -> psa.Model:
         outputs=["y1", "y2"],
         parameters=[_parameter(n, v, "1") for n, v in (("k", 80.0), ("kc", 30.0), ("c", 0.5))],
     )
+
+
+def cylinder(dead_zone: float = 0.0) -> psa.Model:
+    """Return a hydraulic cylinder; `dead_zone` is a known one of its valve [V]."""
+    p, v, x, u, kq, c, leak, b, ks = (
+        ca.SX.sym(n) for n in ("p", "v", "x", "u", "Kq", "C", "leak", "b", "ks")
+    )
+    volt = ca.sign(u) * ca.fmax(ca.fabs(u) - dead_zone, 0.0) if dead_zone else u
+    return psa.ode_model(
+        {
+            "x": [p, v, x], "u": u, "p": [kq, c, leak, b, ks], "y": [x, p],
+            "ode": [
+                (kq * volt - 1.2e-3 * v - leak * p) / c, (1.2e-3 * p - b * v - ks * x) / 85.0, v
+            ],
+        },
+        name="cylinder",
+        inputs=[psa.Input("u", "V", "voltage of the valve")],
+        outputs=[psa.Output("position", "m", "position"), psa.Output("pressure", "Pa", "pressure")],
+        parameters=[
+            _parameter("Kq", 4e-5, "m3/(s.V)"),
+            _parameter("C", 2e-13, "m3/Pa"),
+            _parameter("leak", 1e-12, "m3/(s.Pa)"),
+            _parameter("b", 900.0, "N.s/m"),
+            _parameter("ks", 4e4, "N/m"),
+        ],
+    )  # fmt: skip
+
+
+def oven() -> psa.Model:
+    wall, air, heater, cw, c_a, h1, h2 = (
+        ca.SX.sym(n) for n in ("tw", "ta", "heater", "Cw", "Ca", "h1", "h2")
+    )
+    return psa.ode_model(
+        {
+            "x": [wall, air], "u": heater, "p": [cw, c_a, h1, h2], "y": [wall, air],
+            "ode": [(heater - h1 * (wall - air)) / cw, (h1 * (wall - air) - h2 * air) / c_a],
+        },
+        name="oven",
+        outputs=[psa.Output(n, "K", f"{n} above the room") for n in ("wall", "air")],
+        parameters=[
+            _parameter("Cw", 2000.0, "J/K"),
+            _parameter("Ca", 400.0, "J/K"),
+            _parameter("h1", 15.0, "W/K"),
+            _parameter("h2", 5.0, "W/K"),
+        ],
+    )  # fmt: skip

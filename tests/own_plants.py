@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from psa_casadi.records.signals import Signals
 
@@ -132,3 +133,55 @@ def pair(seed: int) -> Signals:
     e = 0.004 * rng.standard_normal((2, len(t)))
     columns = {"f1": f1, "f2": f2, "y1": q[0] + e[0], "y2": q[2] + e[1]}
     return Signals(name="pair", time=t, columns=columns)
+
+
+def cylinder(seed: int) -> list[Signals]:
+    """Three records of a hydraulic cylinder whose valve does nothing within 0.6 V.
+
+    p' = (Kq w - A v - leak p)/C,  m v' = A p - b v - ks x,  x' = v; w is u less 0.6 V. The noise is
+    0.2 % of each record's own range.
+    """
+    t = np.arange(4000, dtype=np.float64) * 0.005
+    tones = ((0.3, 0.7, 1.1, 1.9, 3.1), np.random.default_rng(seed).uniform(0.0, 6.28, 5))
+    way = np.random.default_rng(seed + 1).uniform(-4.0, 4.0, 27)
+    driven = (
+        3.0 * np.sin(np.pi * t) + 1.2 * np.sin(4.6 * np.pi * t + 1.0),
+        sum(1.2 * np.sin(2.0 * np.pi * f * t + p) for f, p in zip(*tones, strict=True)),
+        np.interp(t, 0.8 * np.arange(27), way),
+    )
+    return [_cylinder(seed + 2 + k, t, np.asarray(u), k + 1) for k, u in enumerate(driven)]
+
+
+def _cylinder(seed: int, t: FloatArray, u: FloatArray, number: int) -> Signals:
+    rng = np.random.default_rng(seed)
+
+    def rates(s: float, q: Any) -> list[float]:
+        p, v, x = q
+        volt = float(np.interp(s, t, u))
+        flow = 4.2e-5 * np.sign(volt) * max(abs(volt) - 0.6, 0.0)
+        force = 1.2e-3 * p - 880.0 * v - 4.1e4 * x
+        return [(flow - 1.2e-3 * v - 3e-12 * p) / 2.1e-13, force / 85.0, v]
+
+    p, _, x = _solved(rates, t, [0.0, 0.0, 0.0], 0.005)
+    true = {"position": x, "pressure": p}
+    shown = {n: y + 2e-3 * np.ptp(y) * rng.standard_normal(len(t)) for n, y in true.items()}
+    return Signals(name=f"cylinder_{number}", time=t, columns={"u": u, **shown})
+
+
+def oven(seed: int) -> Signals:
+    """An oven above its room [K], heated in held steps [W]; the air's sensor lags by 25 s."""
+    rng, step = np.random.default_rng(seed), 2.0
+    power = np.repeat(rng.choice([0.0, 150.0, 300.0, 500.0, 700.0], 30), 50)
+    rates = np.array(
+        [[-14.0 / 2100, 14.0 / 2100, 0, 1 / 2100], [14.0 / 380, -19.2 / 380, 0, 0],
+         [0, 1 / 25, -1 / 25, 0], [0, 0, 0, 0]]
+    )  # fmt: skip
+    kept, state, rows = expm(rates * step), np.zeros(3), []
+    for heat in power:
+        rows.append(state)
+        state = (kept @ np.array([*state, heat]))[:3]
+    wall, _, air = np.array(rows).T
+    e = 0.05 * rng.standard_normal((2, len(power)))
+    columns = {"heater": power, "wall": wall + e[0], "air": air + e[1]}
+    time = step * np.arange(len(power), dtype=np.float64)
+    return Signals(name="oven", time=time, columns=columns, hold="zero")

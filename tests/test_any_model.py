@@ -113,7 +113,8 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert document["causes"][0]["port"] == "the rate of v"
     low, high = document["budget"]["causes"][0]["interval"]
     assert 0.9 < low < d.explained_share < high
-    shown = rf"hysteresis of x in v {d.explained_share:.0%}"[:-1] + rf" % {100 * low:.0f} to 100 %"
+    own = [f"{100 * x:.2f}" for x in (d.explained_share, low, 1.0)]
+    shown = f"hysteresis of x in v {own[0]} % {own[1]} to {own[2]} %"
     assert shown in page.text  # cut, as no share is above 100 %
     assert find_browser(tmp_path).serious_faults(path, DARK) == []
 
@@ -181,7 +182,7 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     )
     assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
     assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
-    assert f"{share.shown[0]:.0%} ({share.shown[1]:.0%} to " in repr(d)
+    assert f"it removes {share.text} of the held-out error" in repr(d)
     _is_adequate_without_friction(names["model"])
 
 
@@ -316,7 +317,7 @@ def test_records_that_do_not_fit_are_refused_in_sentences(tmp_path: Path) -> Non
     path.write_text("time,force,position\n" + "0,1,x\n" * 9)
     with pytest.raises(psa.InputError, match=r"'x' is no number"):
         psa.identify(oscillator(), path)
-    with pytest.raises(psa.InputError, match=r"'zero_off', which begins no effect"):
+    with pytest.raises(psa.InputError, match=r"'zero_off', which begins the name of no effect"):
         psa.diagnose(
             oscillator(),
             {"time": t, "force": t, "position": t**2},

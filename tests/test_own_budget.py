@@ -34,7 +34,7 @@ def _drawn(
         outputs[rng.random(SAMPLES) < 0.3, 1] = np.nan  # the second sensor is slower
         held = time % 4 == 3 if records < 4 else np.full(SAMPLES, k > 0)
         signals = Signals(name=f"run {k}", time=time, columns={"y": outputs[:, 0]})
-        runs.append(Run(signals, time, np.zeros((SAMPLES, 0)), outputs, ~held, held))
+        runs.append(Run(signals, time, np.zeros((SAMPLES, 0)), outputs, ~held, held, np.ones(2)))
         one.append(ONE * rng.standard_normal((SAMPLES, 2)))
         other.append(OTHER * rng.standard_normal((SAMPLES, 2)))
     return runs, one, other
@@ -98,9 +98,23 @@ def test_an_output_that_no_held_out_sample_shows_is_judged_by_its_fitted_ones() 
 def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power() -> None:
     assert Share("worse", -0.2, (-0.5, 0.1)).shown == (0.0, 0.0, 0.1)
     assert Share("all", 1.01, (0.9, 1.2)).shown == (1.0, 0.9, 1.0)
+    assert Share("half", 0.5, (0.4, 0.62)).text == "50 % (40 to 62 %)"
+    assert Share("all", 0.9995, (0.9992, 0.9999)).text == "99.95 % (99.92 to 99.99 %)"
+    assert Share("nothing", 0.0004, (0.0, 0.005)).percents == ("under 0.1", "0.0", "0.5")
+    assert Share("little", 0.004, (0.0, 0.02)).text == "under 1 % (0 to 2 %)"
     runs, one, _ = _drawn(np.random.default_rng(2), 1)
     (run,) = runs
-    quiet = [Run(run.signals, run.time, run.inputs, np.zeros((SAMPLES, 2)), run.used, run.held_out)]
+    quiet = [
+        Run(
+            run.signals,
+            run.time,
+            run.inputs,
+            np.zeros((SAMPLES, 2)),
+            run.used,
+            run.held_out,
+            run.noise,
+        )
+    ]
     left = removed_from(quiet, (0, 1), one, (0.0, 0.0)).share("half", one, [0.5 * one[0]])
     assert left.share == pytest.approx(0.75, rel=1e-9)
     still = removed_from(quiet, (0, 1), [0.0 * one[0]], (0.0, 0.0)).share("none", one, one)

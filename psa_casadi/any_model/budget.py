@@ -44,7 +44,7 @@ def removed_from(
 def _judged_errors(
     runs: Sequence[Run], outputs: Sequence[int], predicted: Sequence[FloatArray]
 ) -> list[FloatArray]:
-    """Return measured minus predicted (n, outputs) where any output is judged, else nan.
+    """Return the errors (n, outputs) where any output is judged, else nan.
 
     An output of which no sample is held out is judged by its fitted ones.
     """
@@ -54,6 +54,6 @@ def _judged_errors(
         which = np.column_stack(
             [r.judged(j) if own else r.fitted(j) for j, own in zip(outputs, held, strict=True)]
         )
-        errors = np.where(which, (r.outputs - y)[:, outputs], np.nan)
+        errors = np.where(which, r.errors(y)[:, outputs], np.nan)
         parts.append(errors[which.any(axis=1)])
     return parts

@@ -60,6 +60,8 @@ def certainty(fit: OdeFit) -> Certainty:
             else Interval(value - half, value + half)
         )
         low, high = fit.unknowns.low[k], fit.unknowns.high[k]
+        own = intervals[name]
+        intervals[name] = Interval(max(own.low, float(low)), min(own.high, float(high)))
         edge = 1e-6 * (high - low) if np.isfinite(high - low) else 0.0
         if value <= low + edge or value >= high - edge:
             on_bound.append(name)

@@ -1,20 +1,23 @@
 """Diagnose any model: fit it, search for causes at its ports, judge."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
 from typing import Any
 
 from psa_casadi.any_model.effects.table import effects_of
 from psa_casadi.any_model.fit import refuse_unfit
 from psa_casadi.any_model.identify import free_of, known_zeros, search_starts
 from psa_casadi.any_model.judge import judged
+from psa_casadi.any_model.levels import reweighted, unlike, with_noise
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import runs_of
+from psa_casadi.any_model.runs import held_as_lines, runs_of
 from psa_casadi.any_model.search import search
 from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.any_model.trials import Table
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.records.signals import signals_given
+from psa_casadi.records.signals import Hold, signals_given
 
 
 def diagnose_ode(
@@ -27,6 +30,7 @@ def diagnose_ode(
     starts: int = 8,
     zeros: Sequence[str] = (),
     known_start: bool = False,
+    hold: Hold | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> OdeDiagnosis:
     """Find what a model gets wrong on its records, name the cause and its place, measure the gain.
@@ -46,11 +50,12 @@ def diagnose_ode(
         raise InputError(
             f"The model '{model.name}' has effects already ({names}); diagnose it without them."
         )
-    held = signals_given(holdout) if _any(holdout) else []
-    runs = runs_of(model, signals_given(records), held)
+    given = signals_given(records, hold)
+    held = signals_given(holdout, hold, len(given) + 1) if _any(holdout) else []
+    runs = runs_of(model, given, held)
     shifted = known_zeros(model, zeros)
     progress("fitting the model from several starts")
-    base, _ = search_starts(
+    base, runs, _ = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts, zeros=shifted,
         known_start=known_start,
     )  # fmt: skip
@@ -62,8 +67,13 @@ def diagnose_ode(
     _refuse_unknown(leave_out, [e.name for e in every])
     table = Table(base.model, tuple(e for e in every if not e.name.startswith(gone)))
     known = search(base, runs, table, progress)
+    runs = with_noise(known.best().fit, runs)
+    if unlike(runs, known.runs):
+        progress("searching again with the noise that the best model leaves in every record")
+        known = search(reweighted(base, runs), runs, table, progress)
     progress("judging")
-    return judged(known)
+    found = judged(known)
+    return replace(found, notes=(*found.notes, *held_as_lines(model, runs)))
 
 
 def _any(given: Any) -> bool:
@@ -73,4 +83,8 @@ def _any(given: Any) -> bool:
 def _refuse_unknown(leave_out: Sequence[str], names: Sequence[str]) -> None:
     for name in leave_out:
         if not any(n.startswith(name) for n in names):
-            raise InputError(f"`leave_out` has '{name}', which begins no effect of {list(names)}.")
+            near = get_close_matches(name, names, 3, 0.3) or names
+            raise InputError(
+                f"`leave_out` has '{name}', which begins the name of no effect; of the {len(names)}"
+                f" there are, the nearest are {', '.join(near)}."
+            )

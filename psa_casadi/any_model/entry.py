@@ -19,6 +19,7 @@ from psa_casadi.identification.start.form import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.read.reading import Records
+from psa_casadi.records.signals import Hold
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.ways import output_of
 
@@ -54,6 +55,7 @@ def identify(
     starts: int = 8,
     zeros: Sequence[str] = (),
     known_start: bool = False,
+    hold: Hold | None = None,
 ) -> OdeIdentification: ...
 @_told_of(identify_ode)
 @wraps(stack.identify)
@@ -61,7 +63,7 @@ def identify(*given: Any, **words: Any) -> Any:
     """Identify a stack from its records, or a model of one's own, given first, from its."""
     model, records = _models_first(given, words)
     if model is None or _is_stack(model):
-        return stack.identify(records, model=model, **words)
+        return stack.identify(records, model=model, **_known(words, stack.identify))
     return _own(identify_ode, model, records, words)
 
 
@@ -88,6 +90,7 @@ def diagnose(
     starts: int = 8,
     zeros: Sequence[str] = (),
     known_start: bool = False,
+    hold: Hold | None = None,
     progress: Progress = ...,
 ) -> OdeDiagnosis: ...
 @_told_of(diagnose_ode)
@@ -96,14 +99,24 @@ def diagnose(*given: Any, **words: Any) -> Any:
     """Diagnose a stack's records, or a model of one's own, given first, on its records."""
     model, records = _models_first(given, words)
     if model is None or _is_stack(model):
-        return stacks.diagnose(records, model=model, **words)
+        return stacks.diagnose(records, model=model, **_known(words, stacks.diagnose))
     return _own(diagnose_ode, model, records, words)
 
 
 @interruptible_work()
 @one_thread_of_algebra()
 def _own(work: Callable[..., Any], model: Model, records: Any, words: dict[str, Any]) -> Any:
-    return work(model, records, **words)
+    return work(model, records, **_known(words, work))
+
+
+def _known(words: dict[str, Any], work: Callable[..., Any]) -> dict[str, Any]:
+    """Return the words for a piece of work. Raises InputError for one that it does not take."""
+    own = [n for n in signature(work).parameters if n not in ("model", "records")]
+    for word in words:
+        if word not in own:
+            what = "a model of your own" if "known_start" in own else "a stack"
+            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(own)}.")
+    return words
 
 
 def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model | None, Any]:

@@ -27,9 +27,10 @@ STRAIGHT = 2e-5
 class FittedOutput:
     """The fit of one output: the used samples of all experiments that measured it, stacked.
 
-    `residuals` (n,) are measured minus predicted, `jacobian` (n, size) d prediction / d theta;
-    `level` weighted them, `straight` is the rms below which they tell nothing, all in the output's
-    unit. `lengths` are the samples of each of the `runs` that have some; `basis` has no columns.
+    `residuals` (n,) are measured minus predicted, `jacobian` (n, size) d prediction / d theta,
+    both over the experiments' shares of noise (`Run.noise`); `level` weighted them, `straight` is
+    the rms below which they tell nothing, all in the output's unit. `lengths` are the samples of
+    each of the `runs` that have some; `basis` has no columns.
     """
 
     column: str
@@ -50,6 +51,11 @@ class FittedOutput:
     def rms(self) -> float:
         """Root mean square of the residuals."""
         return float(np.sqrt(np.mean(self.residuals**2)))
+
+    @property
+    def parts(self) -> list[FloatArray]:
+        """The residuals of each of the `runs`."""
+        return np.split(self.residuals, np.cumsum(self.lengths)[:-1])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,7 +138,8 @@ def fit_ode(
 ) -> OdeFit:
     """Fit the free parameters and every experiment's initial state to the used samples.
 
-    Minimises sum(((measured - predicted)/level)^2) + sum((theta/prior)^2) over all measured outputs
+    Minimises sum(((measured - predicted)/(level share))^2) + sum((theta/prior)^2) over all measured
+    outputs, each with its level, and experiments, each with its share of the noise (`Run.noise`),
     by Levenberg and Marquardt's method within the parameters' bounds. `starts` are deviations of
     the initial states to begin from; with `known_start` they stay at the declared ones. `zeros` are
     outputs whose zero is unknown in each experiment. Raises SimulationError where the start cannot
@@ -182,15 +189,18 @@ class _Problem:
         return [(j, k) for j in self.places for k, r in enumerate(self.runs) if r.fitted(j).any()]
 
     def parts(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-        """Return residuals (predicted - measured) and Jacobian of every task. Raises PsaError."""
+        """Return residuals (predicted - measured) and Jacobian of every task, over its noise.
+
+        Raises PsaError.
+        """
 
         def one(task: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
             j, k = task
             run = self.runs[k]
             used = run.fitted(j)
             shown, slopes = output_of(self.model, run, self.unknowns, theta, k, j, self.rtol)
-            own = used[: run.stop]
-            return shown[own] - run.outputs[used, j], slopes[own]
+            own, share = used[: run.stop], run.noise[j]
+            return (shown[own] - run.outputs[used, j]) / share, slopes[own] / share
 
         return side_by_side(one, self.tasks)
 
@@ -243,13 +253,6 @@ class _Problem:
         )
 
 
-def first_levels(runs: Sequence[Run]) -> tuple[float, ...]:
-    """Return levels to begin with: a tenth of every measured output's standard deviation."""
-    places = measured_outputs(runs)
-    every = np.vstack([np.where(r.used[:, None], r.outputs, np.nan) for r in runs])
-    return tuple(0.1 * float(np.nanstd(every[:, j])) for j in places)
-
-
 def refitted(
     before: OdeFit,
     runs: Sequence[Run],
@@ -273,17 +276,6 @@ def refitted(
         starts=before.starts(), evaluations=evaluations, tolerance=tolerance, rtol=before.rtol,
         goal=goal, zeros=before.zeros, known_start=before.known_start,
     )  # fmt: skip
-
-
-def relevelled(fit: OdeFit, runs: Sequence[Run], rounds: int = 4) -> OdeFit:
-    """Fit again with every output's residual as its noise level, until that stays the same."""
-    for _ in range(rounds if len(fit.outputs) > 1 else 1):
-        levels = tuple(max(o.rms, o.straight, 1e-300) for o in fit.outputs)
-        change = np.max(np.abs(np.log(np.array(levels) / np.array(fit.levels))))
-        if change < 0.02 or fit.interrupted:
-            break
-        fit = refitted(fit, runs, levels=levels)
-    return fit
 
 
 def refuse_unfit(model: Model) -> None:

@@ -176,7 +176,7 @@ def _decrease(known: Known, view: OdeView, attached: Attached) -> float:
             begun = start_of(model, run.inputs[0], starts[k])
             none = np.zeros((len(model.state_names), len(names)))
             slopes = traced(model, run, begun.x, names, none, o.column, fit.rtol)[1]
-            parts.append(slopes[run.fitted(o.index)[: run.stop]])
+            parts.append(slopes[run.fitted(o.index)[: run.stop]] / run.noise[o.index])
         columns.append(np.vstack(parts))
     whole = colour.whiten_all(columns[0], columns[1:])
     basis = independent(whitened_jacobian(fit, colour))

@@ -32,8 +32,8 @@ _STARTS = 2
 class OdeHypothesis:
     """A model with causes, fitted; `predicted` (n, ny) are whole experiments.
 
-    `held` and `train` are the rms errors of every measured output in held-out and in used samples,
-    `final` says that the fit went on to its end.
+    `held` and `train` are the rms `Run.errors` of every measured output in held-out and in used
+    samples, `final` says that the fit went on to its end.
     """
 
     causes: tuple[Component, ...]
@@ -75,12 +75,9 @@ def errors_at(
     output: int,
     which: Callable[[Run, int], npt.NDArray[np.bool_]],
 ) -> FloatArray:
-    """Return measured minus predicted of an output, at the chosen samples of all experiments."""
-    parts = [
-        (r.outputs[:, output] - y[:, output])[which(r, output)]
-        for r, y in zip(runs, predicted, strict=True)
-    ]
-    return np.concatenate(parts)
+    """Return `Run.errors` of an output, at the chosen samples of all experiments."""
+    both = zip(runs, predicted, strict=True)
+    return np.concatenate([r.errors(y)[which(r, output), output] for r, y in both])
 
 
 def rms_of(

@@ -8,20 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.certainty import Certainty, certainty
-from psa_casadi.any_model.fit import (
-    OdeFit,
-    first_levels,
-    fit_ode,
-    refitted,
-    refuse_unfit,
-    relevelled,
-)
-from psa_casadi.any_model.runs import Run, runs_of
+from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted, refuse_unfit
+from psa_casadi.any_model.levels import first_levels, relevelled, reweighted, unlike, with_noise
+from psa_casadi.any_model.runs import Run, held_as_lines, noise_share, runs_of
 from psa_casadi.any_model.sizes import sized
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import first_order_noise
-from psa_casadi.records.signals import signals_given
+from psa_casadi.records.signals import Hold, signals_given
 from psa_casadi.shown import StillReported, frame
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Parameter, Provenance
@@ -38,6 +32,8 @@ _DECADES, _CHANGES = 2.3, 2.0
 _SEED = 29
 #: A residual above so many times its own fast noise shows that the model misses something.
 MISSED = 1.5
+#: A fit that leaves this share of an output's standard deviation explains nothing of it.
+_ALL = 0.8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,8 +42,8 @@ class OdeIdentification(StillReported):
 
     `errors` are the parameters' standard errors, `intervals` their 95 % intervals in
     `model.provenance`; `rms` is what is left of every measured output and `noise` the fast part of
-    that, in the outputs' units. `costs` are those of the starts, nan for one that failed; `agreed`
-    of them led to the same minimum. `runs` are the records.
+    that over all records, in the outputs' units. `costs` are those of the starts, nan for one that
+    failed; `agreed` of them led to the same minimum. `runs` are the records.
     """
 
     model: Model
@@ -96,23 +92,25 @@ def identify_ode(
     starts: int = 8,
     zeros: Sequence[str] = (),
     known_start: bool = False,
+    hold: Hold | None = None,
 ) -> OdeIdentification:
     """Fit the parameters of a model to all samples of all its records.
 
     `records` are `Signals`, tables with a column `time`, or CSV files, whose columns bear the names
-    of the model's inputs and outputs. Maximum likelihood over all outputs, each with the noise
-    level that it leaves; the parameters stay within their bounds. `free` names the parameters to
-    fit, all that are `fitted` by default. The initial state of every record is estimated too,
-    unless it is known to be the declared one (`known_start`). `zeros` names outputs whose zero is
-    unknown in each record. The search begins at the declared values and at `starts` - 1 random
-    ones within the bounds, and follows the best two to their end.
+    of the model's inputs and outputs. Between samples inputs are straight lines, or constant with
+    `hold="zero"`. Maximum likelihood over all outputs, each with the noise level that it leaves,
+    and where the noise of records differs, each with its own; the parameters stay within their
+    bounds. `free` names the parameters to fit, all that are `fitted` by default. The initial state
+    of every record is estimated too, unless it is known to be the declared one (`known_start`).
+    `zeros` names outputs whose zero is unknown in each record. The search begins at the declared
+    values and at `starts` - 1 random ones within the bounds, and follows the best two to their end.
 
     Raises InputError for records or names that do not fit, SimulationError where the model cannot
     be simulated at its values.
     """
     refuse_unfit(model)
-    runs = runs_of(model, signals_given(records), judged=False)
-    fit, costs = search_starts(
+    runs = runs_of(model, signals_given(records, hold), judged=False)
+    fit, runs, costs = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts,
         zeros=known_zeros(model, zeros), known_start=known_start,
     )  # fmt: skip
@@ -147,10 +145,11 @@ def search_starts(
     starts: int,
     zeros: tuple[str, ...],
     known_start: bool,
-) -> tuple[OdeFit, tuple[float, ...]]:
-    """Return the best fit from several starts, and the costs of all of them.
+) -> tuple[OdeFit, tuple[Run, ...], tuple[float, ...]]:
+    """Return the best fit from several starts, the experiments with their noise, and all costs.
 
-    Raises SimulationError where none can be simulated.
+    The costs are those of the starts with the same noise in all experiments. Raises SimulationError
+    where none can be simulated.
     """
     levels, found = first_levels(runs), []
     costs: list[float] = []
@@ -176,12 +175,15 @@ def search_starts(
         )
     found.sort(key=lambda f: f.cost)
     if found[-1].interrupted or found[0].interrupted:
-        return replace(found[0], interrupted=True, converged=False), tuple(costs)
+        return replace(found[0], interrupted=True, converged=False), tuple(runs), tuple(costs)
     ended = [refitted(f, runs, evaluations=100) for f in found[:_FOLLOWED]]
     for quick, end in zip(found, ended, strict=False):
         costs[costs.index(quick.cost)] = end.cost
-    best = min(ended, key=lambda f: f.cost)
-    return relevelled(best, runs), tuple(costs)
+    best = relevelled(min(ended, key=lambda f: f.cost), runs)
+    weighted = with_noise(best, runs)
+    if unlike(weighted, runs):
+        best = reweighted(best, weighted)
+    return best, weighted, tuple(costs)
 
 
 def seen_starts(model: Model, runs: Sequence[Run]) -> list[dict[str, float]]:
@@ -244,8 +246,11 @@ def with_told(
 
 def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIdentification:
     sure = certainty(fit)
-    noise = {o.column: first_order_noise(o.residuals)[0] for o in fit.outputs}
-    rms = {o.column: o.rms for o in fit.outputs}
+    noise, rms = {}, {}
+    for o in fit.outputs:
+        noise[o.column] = first_order_noise(o.residuals)[0] * noise_share(runs, o.index)
+        left = [p * runs[k].noise[o.index] for k, p in zip(o.runs, o.parts, strict=True)]
+        rms[o.column] = float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
     good = [c for c in costs if np.isfinite(c)]
     agreed = sum(c <= (1.0 + _SAME) * min(good) for c in good)
     said = []
@@ -263,11 +268,19 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         f"'{n}' sits on a bound of its range; its interval means nothing." for n in sure.on_bound
     ]
     said += [
-        f"'{n}' is missed by {rms[n] / noise[n]:.2g} times its noise: the model lacks something;"
-        " psa.diagnose looks for the cause."
+        f"'{n}' is missed by {rms[n] / noise[n]:.2g} times its noise: the model lacks something, so"
+        " that the values bend to it, and their errors are too small; psa.diagnose looks for the"
+        " cause."
         for n in rms
         if noise[n] > 0 and rms[n] > MISSED * noise[n]
     ]
+    said += [
+        f"'{o.column}' is left with {100 * share:.0f} % of its own movement: see that its column,"
+        " and those of the inputs, are in the model's units."
+        for o in fit.outputs
+        if (share := rms[o.column] / _movement(runs, o.index)) > _ALL
+    ]
+    said += held_as_lines(fit.model, runs)
     return OdeIdentification(
         model=with_told(fit.model, runs, sure, fit.interrupted),
         fit=fit,
@@ -280,3 +293,8 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         agreed=agreed,
         warnings=tuple(said),
     )
+
+
+def _movement(runs: Sequence[Run], output: int) -> float:
+    """Return the standard deviation of an output over the fitted samples of all experiments."""
+    return float(np.std(np.concatenate([r.outputs[r.fitted(output), output] for r in runs])))

@@ -9,7 +9,9 @@ from psa_casadi.any_model.certainty import certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView
 from psa_casadi.any_model.identify import with_told
+from psa_casadi.any_model.levels import noise_told
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
+from psa_casadi.any_model.runs import missed_rms
 from psa_casadi.any_model.search import Known, with_cause, without
 from psa_casadi.any_model.weighing import (
     Weighed,
@@ -118,6 +120,8 @@ def _diagnosis(
 ) -> OdeDiagnosis:
     root = known.found[frozenset()]
     sure = certainty(named.fit)
+    seen = known.view(named).screening.colour
+    runs, noise = noise_told(named.fit, (seen, *seen.further), known.runs)
     partly = known.view(named).test.alarm
     shares = {c.name: _own_share(known, named, c, removed) for c in named.causes}
     least = least_share([s.share for s in shares.values()])
@@ -152,17 +156,18 @@ def _diagnosis(
         candidates=_candidates(known, removed, told, named),
         errors=tuple(
             OutputError(
-                o.column, known.base.model.structure.outputs[o.index].unit, floor,
-                root.errors[k], named.errors[k],
+                o.column, known.base.model.structure.outputs[o.index].unit,
+                level,
+                *(missed_rms(known.runs, h.predicted, o.index) for h in (root, named)),
             )
-            for k, (o, floor) in enumerate(zip(named.fit.outputs, removed.noise, strict=True))
+            for o, level in zip(named.fit.outputs, noise, strict=True)
         ),
         remaining=_remaining(known.view(named)),
         notes=(*notes, *(SMALL_NOTE.format(n, 100 * shares[n].shown[0]) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
         extended_fit=named.fit,
-        runs=known.runs,
+        runs=runs,
         base=root.predicted,
         extended=named.predicted,
         missed=_remaining(known.view(root)),

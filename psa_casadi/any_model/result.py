@@ -20,8 +20,8 @@ FORMAT = "psa_casadi.own_model_diagnosis/1"
 
 _SAID: dict[Verdict, str] = {
     "adequate": "what the model leaves cannot be distinguished from noise",
-    "cause_named": "a cause is named, and nothing else is left",
-    "partly_explained": "a cause is named, and more is left",
+    "cause_named": "{} named, and nothing else is left",
+    "partly_explained": "{} named, and more is left",
     "ambiguous": "a cause is found that these records cannot tell from others",
     "unexplained": "something is missing that no effect of the table explains",
 }
@@ -116,27 +116,43 @@ class OdeDiagnosis(StillReported):
         """The share of the base's held-out error above the noise that all causes remove."""
         return self.budget.together.share
 
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """What the base model's parameters became where the causes move them out of intervals."""
+        before, after = self.base_fit.model.values, self.model.values
+        told = self.model.provenance.intervals
+        return tuple(
+            f"{n} = {after[n]:.4g}{_after(self.model.parameter(n).unit)}"
+            f" ({i.low:.4g} to {i.high:.4g}), without the cause{'s' * (len(self.causes) > 1)}"
+            f" {before[n]:.4g}"
+            for n, i in told.items()
+            if self.causes and n in before and not i.low <= before[n] <= i.high
+        )
+
     def __repr__(self) -> str:
         """Return the verdict, the causes with their sizes, the errors and what remains."""
-        lines = [f"{self.verdict}: {_SAID[self.verdict]}"]
+        several = len(self.causes) > 1
+        named = f"{len(self.causes)} causes are" if several else "a cause is"
+        lines = [f"{self.verdict}: {_SAID[self.verdict].format(named)}"]
         for c, removed in zip(self.causes, self.budget.causes, strict=True):
-            share, low, high = removed.shown
             lines.append(
-                f"  {c.effect} ({c.confidence:.0%} sure), {c.description}; it removes"
-                f" {share:.0%} ({low:.0%} to {high:.0%}) of the held-out error above the noise"
+                f"  {c.effect} ({c.confidence:.0%} sure; {c.belongs_to}), {c.description}; it"
+                f" removes {removed.text} of the held-out error above the noise"
             )
             lines += [
-                f"    {n} = {e.value:.4g} ({e.interval[0]:.4g} to {e.interval[1]:.4g}) {e.unit}"
+                f"    {n} = {e.value:.4g} ({e.interval[0]:.4g} to {e.interval[1]:.4g})"
+                f"{_after(e.unit)}"
                 for n, e in c.parameters.items()
             ]
             if c.cannot_be_told_from:
                 lines.append(f"    may as well be {', '.join(c.cannot_be_told_from)}")
         for o in self.errors:
-            unit = "" if o.unit == "1" else f" {o.unit}"
+            unit = _after(o.unit)
             lines.append(
                 f"  {o.output}: held-out rms {o.base:.3g}{unit} of the base,"
                 f" {o.extended:.3g}{unit} of the extended model, noise {o.noise:.3g}{unit}"
             )
+        lines += [f"  {line}" for line in self.moved]
         lines += [
             f"  {self.remaining.where}",
             *(f"  {n}" for n in (*self.notes, self.unnamed) if n),
@@ -177,3 +193,7 @@ class OdeDiagnosis(StillReported):
             columns[f"{name}_base"] = np.concatenate([y[:, k] for y in self.base])
             columns[f"{name}_extended"] = np.concatenate([y[:, k] for y in self.extended])
         return frame(columns)
+
+
+def _after(unit: str) -> str:
+    return "" if unit in ("", "1") else f" {unit}"

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.records.signals import Signals, unit_hint
+from psa_casadi.records.signals import Signals, stairs, unit_hint
 from psa_casadi.records.split import divided, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,7 +23,8 @@ class Run:
 
     `time` (n,) [s] counts from the first sample; `inputs` (n, nu) and `outputs` (n, ny) are in the
     order of the model's, in its units, nan where an output was not measured; `used` and `held_out`
-    (n,) are the samples that are fitted and those that judge.
+    (n,) are the samples that are fitted and those that judge. `noise` (ny,) is the noise of its
+    outputs over what is usual in all experiments, 1 where nothing else is known.
     """
 
     signals: Signals
@@ -32,6 +33,7 @@ class Run:
     outputs: FloatArray
     used: BoolArray
     held_out: BoolArray
+    noise: FloatArray
 
     @property
     def name(self) -> str:
@@ -53,6 +55,30 @@ class Run:
         found: BoolArray = self.held_out & np.isfinite(self.outputs[:, output])
         return found
 
+    def errors(self, predicted: FloatArray) -> FloatArray:
+        """Return measured minus predicted outputs (n, ny), over the experiment's share of noise."""
+        return np.asarray((self.outputs - predicted) / self.noise)
+
+
+def noise_share(runs: Sequence[Run], output: int) -> float:
+    """Return the rms of an output's `noise` over the samples that judge, else over the fitted."""
+    counts = [int(c.sum()) for c in _counted(runs, output)]
+    squares = [r.noise[output] ** 2 for r in runs]
+    return float(np.sqrt(np.average(squares, weights=counts)))
+
+
+def missed_rms(runs: Sequence[Run], predicted: Sequence[FloatArray], output: int) -> float:
+    """Return the rms of measured minus predicted of an output, in its unit, over these samples."""
+    rows = zip(runs, predicted, _counted(runs, output), strict=True)
+    errors = np.concatenate([(r.outputs - y)[c, output] for r, y, c in rows])
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def _counted(runs: Sequence[Run], output: int) -> list[BoolArray]:
+    """Return the samples of an output that judge, the fitted ones where none does."""
+    judged = [r.judged(output) for r in runs]
+    return judged if any(j.any() for j in judged) else [r.fitted(output) for r in runs]
+
 
 def runs_of(
     model: Model,
@@ -71,20 +97,46 @@ def runs_of(
     problems = Problems()
     for s in (*given, *holdout):
         _check(model, s, problems)
+    _refuse_twins(given, holdout, problems)
     problems.raise_if_any()
     shadows = [[_shadow(model, s) for s in part] for part in (given, holdout)]
     experiments = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
     both = zip((*given, *holdout), experiments, strict=True)
     return tuple(
-        Run(s, s.time - s.time[0], _inputs(model, s), _outputs(model, s), e.used, e.held_out)
+        Run(
+            s, s.time - s.time[0], _inputs(model, s), _outputs(model, s), e.used, e.held_out,
+            np.ones(len(model.output_names)),
+        )
         for s, e in both
-    )
+    )  # fmt: skip
 
 
 def varied(run: Run) -> int | None:
     """Return the input that moves most, over its own size; None where none does."""
     spans = [_moves(column) for column in run.inputs.T]
     return int(np.argmax(spans)) if spans and max(spans) > 0 else None
+
+
+def held_as_lines(model: Model, runs: Sequence[Run]) -> tuple[str, ...]:
+    """Say which inputs look as if they were held between samples, and are read as lines."""
+    lines = [r.signals for r in runs if r.signals.hold == "linear"]
+    names = sorted({n for s in lines for n in stairs(s, model.input_names)})
+    return tuple(
+        f"The input '{n}' stands still between jumps, and each jump is read as a ramp of one"
+        " sampling interval; if it is held between samples, as by a digital controller, give"
+        ' hold="zero".'
+        for n in names
+    )
+
+
+def _refuse_twins(given: Sequence[Signals], holdout: Sequence[Signals], problems: Problems) -> None:
+    fitted = {s.sha256: s.name for s in given}
+    for s in holdout:
+        if s.sha256 in fitted:
+            problems.add(
+                f"signals '{s.name}' of `holdout` are those of '{fitted[s.sha256]}', which is"
+                " fitted; held-out samples must be others."
+            )
 
 
 def _check(model: Model, s: Signals, problems: Problems) -> None:
@@ -103,7 +155,7 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
     if not any(np.isfinite(s.columns[n]).sum() >= 8 for n in there):
         problems.add(
             f"signals '{s.name}' have no output of the model '{model.name}' with eight samples or"
-            f" more; it shows {model.output_names}.{unit_hint(s.columns)}"
+            f" more; the model's are {model.output_names}.{unit_hint(s.columns)}"
         )
 
 

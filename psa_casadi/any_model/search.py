@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted, relevelled
+from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted
 from psa_casadi.any_model.hypothesis import (
     OdeHypothesis,
     OdeView,
@@ -18,6 +18,7 @@ from psa_casadi.any_model.hypothesis import (
     hypothesis_of,
     look,
 )
+from psa_casadi.any_model.levels import relevelled
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.trials import Table
 from psa_casadi.component import Component
@@ -106,7 +107,7 @@ class Known:
     def stands(self, h: OdeHypothesis) -> bool:
         """Whether every cause is itself, and held-out data confirm it."""
         for cause in h.causes:
-            if not inside_ranges(h.fit.model.values, cause):
+            if not inside_ranges(h.fit.model.values, cause, self.table.attached(cause).ideal):
                 return False
             before = self.found.get(h.names - {cause.name})
             if before is None:
@@ -259,7 +260,7 @@ def _quick(
 ) -> OdeFit | None:
     """Fit with more effects from their trial values and gains; at a third of these if that fails.
 
-    None where both fail.
+    A fit that is worse than the one without them has failed. None where both fail.
     """
     model = known.table.with_effects(before, [*h.causes, *(e for e, _, _ in added)])
     free = [*before.unknowns.names, *(n for e, _, _ in added for n in e.fitted)]
@@ -277,7 +278,8 @@ def _quick(
         except PsaError:
             continue
         _raise_if(fit)
-        return fit
+        if fit.cost < before.cost:
+            return fit
     return None
 
 

@@ -7,8 +7,9 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.any_model.coordinates import zero_name
 from psa_casadi.any_model.effects.attached import Attached, extended
-from psa_casadi.any_model.fit import OdeFit
+from psa_casadi.any_model.fit import FittedOutput, OdeFit
 from psa_casadi.any_model.predict import traced
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.start import start_of
@@ -107,22 +108,20 @@ def _moved(
             wanted: list[str | int] = [] if step else [gain]
             s0 = begun.by_parameter[:, [column]][:, : len(wanted)]
             shown, slopes = traced(current, run, begun.x, wanted, s0, o.column, fit.rtol)
-            moved = shown if step else slopes[:, 0] * scale
-            parts.append(moved[run.fitted(o.index)[: run.stop]])
-        whole = np.concatenate(parts)
-        if step:
-            whole = whole - _shown(fit, o.index, runs)
-        found.append(whole)
+            used = run.fitted(o.index)
+            moved = (shown if step else slopes[:, 0] * scale)[used[: run.stop]]
+            if step:
+                moved = moved - _shown(fit, o, run, k)
+            parts.append(moved / run.noise[o.index])
+        found.append(np.concatenate(parts))
     return found
 
 
-def _shown(fit: OdeFit, index: int, runs: Sequence[Run]) -> FloatArray:
-    """Return the fit's own predictions of an output's used samples, without unknown zeros."""
-    output = next(o for o in fit.outputs if o.index == index)
-    zero = f"zero of {output.column}"
-    starts = fit.starts()
-    measured = [
-        runs[k].outputs[runs[k].fitted(index), index] - starts[k].get(zero, 0.0)
-        for k in output.runs
-    ]
-    return np.concatenate(measured) - output.residuals
+def _shown(fit: OdeFit, output: FittedOutput, run: Run, index: int) -> FloatArray:
+    """Return a fit's own predictions of an output's used samples, without an unknown zero."""
+    j, (part,) = (
+        output.index,
+        [p for k, p in zip(output.runs, output.parts, strict=True) if k == index],
+    )
+    zero = fit.starts()[index].get(zero_name(output.column), 0.0)
+    return np.asarray(run.outputs[run.fitted(j), j] - zero - part * run.noise[j])

@@ -33,9 +33,9 @@ def dumps(model: Model) -> str:
     if foreign:
         raise InputError(
             f"The model '{model.name}' cannot be saved as MODEL.json: the file names components of"
-            f" this package and of modules with own effects, and {', '.join(foreign)} is neither"
-            " (made by ode_model or connect?). Keep the script that makes the model, or export the"
-            " model as an FMU."
+            f" this package and of modules with own effects, and neither holds"
+            f" {', '.join(foreign)} (made by ode_model or connect?). Keep the script that makes the"
+            " model, or export the model as an FMU."
         )
     origin = model.provenance
     parameters = {}

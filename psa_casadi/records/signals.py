@@ -5,7 +5,7 @@ import hashlib
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,10 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, Problems
 
 FloatArray = npt.NDArray[np.float64]
+#: What an input does between two samples.
+Hold = Literal["linear", "zero"]
+#: So many jumps, and such a share of all moves, make a staircase.
+_JUMPS, _NEARLY_ALL = 2, 0.8
 #: What stands for the samples of one experiment: `Signals`, a table with a column `time`, a CSV.
 OneSignals = "Signals | Mapping[str, Any] | str | os.PathLike[str] | Any"
 
@@ -39,7 +43,7 @@ class Signals:
     name: str
     time: FloatArray
     columns: Mapping[str, FloatArray]
-    hold: Literal["linear", "zero"] = "linear"
+    hold: Hold = "linear"
     sha256: str = ""
 
     def __post_init__(self) -> None:
@@ -90,11 +94,13 @@ class Signals:
         return float(self.time[-1] - self.time[0])
 
 
-def signals_given(given: Any) -> list[Signals]:
+def signals_given(given: Any, hold: Hold | None = None, first: int = 1) -> list[Signals]:
     """Return the experiments that a user gave: one or several of `Signals`, tables, CSV files.
 
     A table (a mapping of arrays, a data frame) has a column `time`, and so has a CSV file with its
-    names in the first line; all in the units of the model. Raises InputError.
+    names in the first line; all in the units of the model. `hold` is what inputs do between samples
+    (None: what `Signals` say, else "linear"), `first` the number of the first one without a name.
+    Raises InputError.
     """
     if _is_one(given):
         given = [given]
@@ -103,10 +109,27 @@ def signals_given(given: Any) -> list[Signals]:
             f"A {type(given).__name__} is no record; give Signals, a mapping with 'time', a data"
             " frame, the path of a CSV file, or several of these."
         )
-    found = [_one(g, k + 1) for k, g in enumerate(given)]
+    found = [_one(g, k) for k, g in enumerate(given, first)]
     if not found:
         raise InputError("There are no records; give one or more.")
-    return found
+    return found if hold is None else [replace(s, hold=hold) for s in found]
+
+
+def stairs(signals: Signals, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns that stand still between jumps, each within one sampling interval.
+
+    Nearly all their moves are such jumps, of which a straight line makes a ramp. An edge drawn by
+    two samples close together is none.
+    """
+    steps = np.diff(signals.time)
+    wide, found = steps > 0.5 * float(np.median(steps)), []
+    for name in names:
+        moves = np.diff(signals.columns[name]) != 0.0
+        alone = (moves & wide)[1:-1] & ~moves[:-2] & ~moves[2:]
+        jumps = int(np.count_nonzero(alone))
+        if jumps >= _JUMPS and jumps >= _NEARLY_ALL * np.count_nonzero(moves):
+            found.append(name)
+    return tuple(found)
 
 
 def _is_one(given: Any) -> bool:

@@ -20,11 +20,15 @@ Law = Callable[[Symbols, Own], tuple[dict[str, Expression], Expression]]
 
 @dataclass(frozen=True)
 class Attached:
-    """An effect, the port that it is at, and further ports whose sums it reads."""
+    """An effect, the port that it is at, and further ports whose sums it reads.
+
+    Parameters that are `ideal` may be at the lower ends of their ranges: a corner that is sharp.
+    """
 
     component: Component
     port: Port
     reads: tuple[Port, ...] = ()
+    ideal: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -51,6 +55,7 @@ def at_port(
     belongs_to: str = "plant",
     signal: str = "q",
     reads: tuple[Port, ...] = (),
+    ideal: tuple[str, ...] = (),
 ) -> Attached:
     """Return an effect that adds a term to a port's sum; its parameters begin with its name.
 
@@ -80,7 +85,7 @@ def at_port(
         looks_like=looks,
         belongs_to=belongs_to,
     )
-    return Attached(component, port, reads)
+    return Attached(component, port, reads, tuple(f"{name}_{short}" for short in ideal))
 
 
 def extended(base: Model, effects: Iterable[Attached]) -> Model:
@@ -93,9 +98,13 @@ def extended(base: Model, effects: Iterable[Attached]) -> Model:
 
 def scale_of(name: str, value: float, unit: str, what: str) -> Parameter:
     """Return the parameter of a size that is not fitted: the equations divide by it."""
-    rounded = float(f"{value:.2g}")
     words = f"largest {what} in the records, a scale only"
-    return Parameter(name, rounded, unit, (0.0, float("inf")), words, fitted=False)
+    return Parameter(name, rounded(value), unit, (0.0, float("inf")), words, fitted=False)
+
+
+def rounded(size: float) -> float:
+    """Return the size of a signal with two digits: no more is known of how large it can be."""
+    return float(f"{size:.2g}")
 
 
 def gain_of(name: str, unit: str, size: float, what: str, *, positive: bool = False) -> Parameter:

@@ -11,28 +11,29 @@ from psa_casadi.any_model.effects.attached import (
     Own,
     at_port,
     gain_of,
+    rounded,
     scale_of,
 )
-from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond
+from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of
 from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.effects.bend import ANGLES
 from psa_casadi.model.compose import Model
-from psa_casadi.model.from_casadi.ports import Port, ports_of
+from psa_casadi.model.from_casadi.ports import Port, ports_of, rate_unit, state_unit
 from psa_casadi.smooth import magnitude_power, signed_power, smooth_magnitude
 from psa_casadi.variables import Parameter, State
 
 #: A rate below this share of its size has no direction.
 _STILL = 1e-3
-#: Stiffest stop, over the largest rate at one range beyond it; and width of its rounded corner.
+#: Stiffest stop, over the largest rate at one range beyond it; width of its corner over the range.
 _STIFF, _CORNER = 1e4, 0.005
 
 
 def rate_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
     """Return the effects in the rate of one state of a model."""
     seen = _seen_by(model, port.variable)
-    found = [_constant(port, sizes), _loss(port, sizes), _friction(port, sizes), _drag(port, sizes)]
-    found += [make(port, sizes, n) for n in seen for make in (_curve, _stop)]
+    found = [make(model, port, sizes) for make in (_constant, _loss, _friction, _drag)]
+    found += [make(model, port, sizes, n) for n in seen for make in (_curve, _stop)]
     ways = _ways(model, port.variable, seen)
     return (*found, *(_hysteresis(model, port, sizes, n) for n in ways))
 
@@ -57,7 +58,7 @@ def _speed(model: Model, state: str) -> str | None:
     return str(rate.name()) if rate.is_symbolic() and rate.name() in model.state_names else None
 
 
-def _constant(port: Port, sizes: Sizes) -> Attached:
+def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
     name = f"constant_in_{port.variable}"
     size = sizes.rates[port.variable]
     return at_port(
@@ -73,7 +74,7 @@ def _constant(port: Port, sizes: Sizes) -> Attached:
     )  # fmt: skip
 
 
-def _loss(port: Port, sizes: Sizes) -> Attached:
+def _loss(model: Model, port: Port, sizes: Sizes) -> Attached:
     name, v = f"loss_in_{port.variable}", port.variable
     return at_port(
         port, name, lambda s, own: ({}, -own("size") * getattr(s, v) / own("range")),
@@ -86,17 +87,17 @@ def _loss(port: Port, sizes: Sizes) -> Attached:
         ),
         parameters=(
             gain_of(f"{name}_size", port.unit, sizes.rates[v], "loss at the largest state"),
-            _range(name, port, sizes),
+            _range(name, model, sizes, v),
         ),
     )  # fmt: skip
 
 
-def _friction(port: Port, sizes: Sizes) -> Attached:
+def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
     name, v = f"friction_in_{port.variable}", port.variable
+    size = rounded(sizes.states[v])
 
     def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
-        part = getattr(s, v) / own("range")
-        return {}, -own("size") * part / ca.sqrt(part**2 + own("width") ** 2)
+        return {}, -own("size") * getattr(s, v) / ca.sqrt(getattr(s, v) ** 2 + own("width") ** 2)
 
     return at_port(
         port, name, law,
@@ -104,7 +105,7 @@ def _friction(port: Port, sizes: Sizes) -> Attached:
         words=(
             "dry friction holds against the motion",
             "Coulomb's friction, smooth about rest",
-            f"Q loses size r/sqrt(r^2 + width^2),  r = {v}/range",
+            f"Q loses size {v}/sqrt({v}^2 + width^2)",
             "what stands still needs a push to move; small motions are missed most",
         ),
         parameters=(
@@ -112,16 +113,16 @@ def _friction(port: Port, sizes: Sizes) -> Attached:
                 f"{name}_size", port.unit, sizes.rates[v], "friction, as a rate", positive=True
             ),
             Parameter(
-                f"{name}_width", 0.02, "1", (5e-4, 0.7), "speed, over the range, below which it"
-                " fades", log=True
+                f"{name}_width", 0.02 * size, state_unit(model, v), (5e-4 * size, 0.7 * size),
+                f"{v} below which it fades", log=True
             ),
-            _range(name, port, sizes),
         ),
-        probe={"width": (0.01, 0.05)},
+        probe={"width": (0.01 * size, 0.05 * size)},
+        ideal=("width",),
     )  # fmt: skip
 
 
-def _drag(port: Port, sizes: Sizes) -> Attached:
+def _drag(model: Model, port: Port, sizes: Sizes) -> Attached:
     name, v = f"drag_in_{port.variable}", port.variable
 
     def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
@@ -139,12 +140,12 @@ def _drag(port: Port, sizes: Sizes) -> Attached:
         ),
         parameters=(
             gain_of(f"{name}_size", port.unit, sizes.rates[v], "loss at the largest state"),
-            _range(name, port, sizes),
+            _range(name, model, sizes, v),
         ),
     )  # fmt: skip
 
 
-def _curve(port: Port, sizes: Sizes, x: str) -> Attached:
+def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
     name = f"curve_of_{x}_in_{port.variable}"
 
     def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
@@ -165,19 +166,19 @@ def _curve(port: Port, sizes: Sizes, x: str) -> Attached:
                 "deviation from the line at the range's end"
             ),
             angle_of(f"{name}_angle"),
-            scale_of(f"{name}_range", sizes.states[x], "1", x),
+            _range(name, model, sizes, x),
         ),
         probe={"angle": ANGLES},
     )  # fmt: skip
 
 
-def _stop(port: Port, sizes: Sizes, x: str) -> Attached:
+def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
     name = f"stop_of_{x}_in_{port.variable}"
-    size = sizes.rates[port.variable]
+    force, size = sizes.rates[port.variable], rounded(sizes.states[x])
 
     def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
-        part = getattr(s, x) / own("range")
-        return {}, -own("size") * beyond(part, own("level"), _CORNER)
+        excess = beyond(getattr(s, x), own("level"), _CORNER * own("range"))
+        return {}, -own("size") * excess / own("range")
 
     return at_port(
         port,
@@ -187,7 +188,7 @@ def _stop(port: Port, sizes: Sizes, x: str) -> Attached:
         words=(
             f"a stop or an overflow holds {x} at a level",
             "contact with an elastic stop; softplus: Dugas et al., NIPS 13 (2000)",
-            f"Q loses size (excess of r over +-level),  r = {x}/range",
+            f"Q loses size (excess of {x} over +-level)/range",
             "flat tops at one level, and shocks or a lag where it is left",
         ),
         parameters=(
@@ -195,14 +196,14 @@ def _stop(port: Port, sizes: Sizes, x: str) -> Attached:
                 f"{name}_size",
                 0.0,
                 port.unit,
-                (0.0, _STIFF * size),
+                (0.0, _STIFF * force),
                 "force of the stop, as a rate, at one range beyond it",
-                scale=size,
+                scale=force,
             ),
-            Parameter(f"{name}_level", 0.8, "1", (0.02, 2.0), "level over the range", scale=0.05),
-            scale_of(f"{name}_range", sizes.states[x], "1", x),
+            level_of(f"{name}_level", 0.8, (0.02, 2.0), size, state_unit(model, x)),
+            _range(name, model, sizes, x),
         ),
-        probe={"level": (0.5, 0.7, 0.85, 0.95)},
+        probe={"level": tuple(share * size for share in (0.5, 0.7, 0.85, 0.95))},
     )
 
 
@@ -243,8 +244,10 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
             Parameter(
                 f"{name}_n", 1.0, "1", (0.2, 8.0), "sharpness of the loop's turns", log=True
             ),
-            scale_of(f"{name}_range", sizes.states[x], "1", x),
-            scale_of(f"{name}_rate", fastest, "1/s", f"rate of {x}"),
+            _range(name, model, sizes, x),
+            scale_of(
+                f"{name}_rate", fastest, rate_unit(state_unit(model, x)), f"rate of {x}"
+            ),
         ),
         states=(
             State(f"{name}_state", "1", "memory of the way", 0.5, memory=True, settles=False),
@@ -266,5 +269,5 @@ def _is_rate(port: Port, state: str) -> bool:
     return port.kind == "rate" and port.variable == state
 
 
-def _range(name: str, port: Port, sizes: Sizes) -> Parameter:
-    return scale_of(f"{name}_range", sizes.states[port.variable], "1", port.variable)
+def _range(name: str, model: Model, sizes: Sizes, x: str) -> Parameter:
+    return scale_of(f"{name}_range", sizes.states[x], state_unit(model, x), x)

@@ -16,6 +16,7 @@ from psa_casadi.any_model.effects.attached import (
     at_port,
     gain_of,
     plain_gain,
+    rounded,
     scale_of,
     time_of,
 )
@@ -26,8 +27,9 @@ from psa_casadi.model.from_casadi.ports import Port, true_output
 from psa_casadi.smooth import pade_section, softplus
 from psa_casadi.variables import Parameter, State
 
-#: Width of the rounded corner of a saturation or a dead zone, over the signal's size.
-_CORNER = 0.01
+#: Width of the rounded corner of a saturation or a dead zone, over the signal's size: usual, and
+#: the least and the most that a fit may reach. A wider corner is a bend.
+_CORNER, _SHARPEST, _ROUNDEST = 0.01, 1e-4, 0.1
 #: Smallest time of a filter over the sampling interval: keeps it defined at a time of 0.
 _FLOOR = 0.02
 
@@ -43,7 +45,7 @@ def signal_effects(port: Port, sizes: Sizes) -> tuple[Attached, ...]:
 
 
 def _size(port: Port, sizes: Sizes) -> float:
-    return (sizes.inputs if port.kind == "input" else sizes.outputs)[port.variable]
+    return rounded((sizes.inputs if port.kind == "input" else sizes.outputs)[port.variable])
 
 
 def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
@@ -143,8 +145,7 @@ def _saturation(port: Port, sizes: Sizes) -> Attached:
     name, size = f"saturation_of_{port.variable}", _size(port, sizes)
 
     def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
-        level, width = own("level") * own("range"), _CORNER * own("range")
-        return {}, -own("gain") * beyond(q, level, width)
+        return {}, -own("gain") * beyond(q, own("level"), own("corner"))
 
     return _made(
         port, "saturation", law,
@@ -152,15 +153,16 @@ def _saturation(port: Port, sizes: Sizes) -> Attached:
         words=(
             "it goes no further than a level, to either side",
             "end stops, limited supply; softplus: Dugas et al., NIPS 13 (2000)",
-            "Q = q - gain (excess of q over +-level range);  gain = 1 is a hard stop",
+            "Q = q - gain (excess of q over +-level);  gain = 1 is a hard stop",
             "flat tops at one level",
         ),
         parameters=(
             plain_gain(f"{name}_gain", "share of the excess that is lost"),
-            _level(f"{name}_level", 0.7, (0.05, 1.2)),
-            scale_of(f"{name}_range", size, port.unit, port.variable),
+            level_of(f"{name}_level", 0.7, (0.05, 1.2), size, port.unit),
+            _corner(f"{name}_corner", size, port.unit),
         ),
-        probe={"level": (0.4, 0.6, 0.75, 0.9)},
+        probe={"level": tuple(share * size for share in (0.4, 0.6, 0.75, 0.9))},
+        ideal=("corner",),
     )  # fmt: skip
 
 
@@ -168,8 +170,7 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
     name, size = f"dead_zone_of_{port.variable}", _size(port, sizes)
 
     def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
-        level, width = own("level") * own("range"), _CORNER * own("range")
-        return {}, -own("gain") * (q - beyond(q, level, width))
+        return {}, -own("gain") * (q - beyond(q, own("level"), own("corner")))
 
     return _made(
         port, "dead_zone", law,
@@ -177,15 +178,16 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
         words=(
             "small values of it do nothing",
             "overlap of a valve, stiction of an actuator",
-            "Q = q - gain (q within +-level range);  gain = 1 is a true dead zone",
+            "Q = q - gain (q within +-level);  gain = 1 is a true dead zone",
             "nothing moves about zero, and all else is offset by the zone's width",
         ),
         parameters=(
             plain_gain(f"{name}_gain", "share of the small values that is lost"),
-            _level(f"{name}_level", 0.1, (2e-3, 0.9)),
-            scale_of(f"{name}_range", size, port.unit, port.variable),
+            level_of(f"{name}_level", 0.1, (2e-3, 0.9), size, port.unit),
+            _corner(f"{name}_corner", size, port.unit),
         ),
-        probe={"level": (0.04, 0.1, 0.25)},
+        probe={"level": tuple(share * size for share in (0.04, 0.1, 0.25))},
+        ideal=("corner",),
     )  # fmt: skip
 
 
@@ -240,11 +242,20 @@ def beyond(q: Expression, level: Expression, width: Expression) -> Expression:
     return above - below
 
 
-def _level(name: str, value: float, bounds: tuple[float, float]) -> Parameter:
-    return Parameter(name, value, "1", bounds, "level over the range", scale=0.05)
+def level_of(
+    name: str, value: float, bounds: tuple[float, float], size: float, unit: str
+) -> Parameter:
+    """Return the parameter of a level, from its value and bounds over the size of its signal."""
+    low, high = (bound * size for bound in bounds)
+    return Parameter(name, value * size, unit, (low, high), "level", scale=0.05 * size)
+
+
+def _corner(name: str, size: float, unit: str) -> Parameter:
+    bounds = (_SHARPEST * size, _ROUNDEST * size)
+    words = "width over which the corner at the level is rounded"
+    return Parameter(name, _CORNER * size, unit, bounds, words, log=True)
 
 
 def _floor(name: str, value: float) -> Parameter:
     words = "smallest time of the filter, a scale only"
-    rounded = float(f"{value:.2g}")
-    return Parameter(name, rounded, "s", (0.0, float("inf")), words, fitted=False)
+    return Parameter(name, rounded(value), "s", (0.0, float("inf")), words, fitted=False)

@@ -41,6 +41,27 @@ class Share:
         share, low, high = (min(max(v, 0.0), 1.0) for v in (self.share, *self.interval))
         return share, low, high
 
+    @property
+    def percents(self) -> tuple[str, str, str]:
+        """The same as percentages without their sign, with decimals where all are near 0 or 1.
+
+        A share that is not 0 is never told as 0.
+        """
+        share, low, high = self.shown
+        off = min(1.0 - low, high)
+        digits = 0 if off > 0.01 else 1 if off > 0.001 else 2
+        least = 10.0**-digits
+        told = f"{100 * share:.{digits}f}"
+        if 0.0 < 100 * share < 0.5 * least:
+            told = f"under {least:.{digits}f}"
+        return told, f"{100 * low:.{digits}f}", f"{100 * high:.{digits}f}"
+
+    @property
+    def text(self) -> str:
+        """The share with its interval, such as "62 % (58 to 66 %)"."""
+        share, low, high = self.percents
+        return f"{share} % ({low} to {high} %)"
+
 
 @dataclass(frozen=True, eq=False)
 class Removed:

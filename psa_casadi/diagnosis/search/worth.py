@@ -1,6 +1,6 @@
 """Which hypotheses may be the answer: what a cause must remove, and what held-out data must say."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -95,12 +95,17 @@ def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) 
     return inside_ranges(values, cause)
 
 
-def inside_ranges(values: Mapping[str, float], cause: Component) -> bool:
-    """Whether no parameter of a cause but its gain was pushed to the end of its range."""
+def inside_ranges(
+    values: Mapping[str, float], cause: Component, ideal: Collection[str] = ()
+) -> bool:
+    """Whether no parameter of a cause but its gain was pushed to the end of its range.
+
+    Those named `ideal` may be at their lower end, where the cause is its own limit.
+    """
     for p in cause.parameters:
         if not p.fitted or p.name == cause.gain:
             continue
-        low, high = p.bounds
+        low, high = p.bounds if p.name not in ideal else (0.0, p.bounds[1])
         margin = 1e-3 * (high - low) if not p.log else 0.0
         value = values[p.name]
         if p.log and (value < 1.01 * low or value > high / 1.01):

@@ -93,6 +93,11 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
     return replace(component, equations=_opened(component, own), balances=tuple(balances))
 
 
+def state_unit(model: Model, name: str) -> str:
+    """Return the SI unit of a state."""
+    return next(_si(q.unit) for q in model.structure.states if q.name == name)
+
+
 def rate_unit(unit: str) -> str:
     """Return the SI unit of the rate of something in a unit: "m" gives "m/s", "m/s" "m/s2"."""
     si = _si(unit)

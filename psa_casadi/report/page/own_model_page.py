@@ -12,7 +12,6 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.plots.patch_plot import free_plot
-from psa_casadi.report.words.budget_words import share_with_interval
 from psa_casadi.report.words.fit_words import whiteness_sentence
 from psa_casadi.report.words.own_series import own_fit_series, own_series
 from psa_casadi.report.words.own_words import (
@@ -148,11 +147,14 @@ def _causes(page: Document, d: OdeDiagnosis) -> None:
         page.heading(f"{plain(cause.effect)} ({cause.belongs_to})")
         page.paragraph(
             f"Confidence {percent(cause.confidence)}. In {cause.description}. It removes"
-            f" {share_with_interval(share)} of the held-out error above the noise."
+            f" {share.text} of the held-out error above the noise."
         )
         _law(page, d, cause)
         page.table(parameter_table(d.model, only=cause.parameters))
         add_rivals(page, cause)
+    if d.moved:
+        page.heading("What that changes in the base model's parameters")
+        page.bullets(d.moved)
 
 
 def _law(page: Document, d: OdeDiagnosis, cause: PortCause) -> None:

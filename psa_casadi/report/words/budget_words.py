@@ -18,12 +18,6 @@ def share_percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def share_with_interval(s: Share) -> str:
-    """Return "62 % (58 to 66 %)"."""
-    share, low, high = s.shown
-    return f"{share_percent(share)} ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
 def patch_text(patch: Patch) -> str:
     """Say what the unnamed correction is, and what else it may be."""
     rest = _OPEN.format(listing(patch.open_to, "or")) if patch.open_to else ""
@@ -37,13 +31,12 @@ def budget_sentence(d: Diagnosis, scale: Scale) -> str:
         return ""
     parts = [f"of {scale.text(b.excess_rms_m)} rms above the noise"]
     if added(d):
-        each = [f"{plain(c.what)} removes {share_with_interval(c)}" for c in b.causes]
+        each = [f"{plain(c.what)} removes {c.text}" for c in b.causes]
         parts.append(listing(each))
     if b.unnamed is not None and d.patch is not None:
         more = "a further" if added(d) else "of it"
         parts.append(
-            f"an unnamed correction would remove {more} {share_with_interval(b.unnamed)}:"
-            f" {patch_text(d.patch)}"
+            f"an unnamed correction would remove {more} {b.unnamed.text}: {patch_text(d.patch)}"
         )
     if added(d):
         left = f"{scale.text(b.remains_rms_m)} ({number(b.remains_percent, 2)} % of the range)"
@@ -69,5 +62,5 @@ def budget_table(d: Diagnosis, scale: Scale) -> Table:
 
 def share_row(what: str, s: Share) -> tuple[str, str, str]:
     """Return a row of the budget: what removes, its share, and the 95 % interval."""
-    share, low, high = s.shown
-    return (what, share_percent(share), f"{100 * low:.0f} to {100 * high:.0f} %")
+    share, low, high = s.percents
+    return (what, f"{share} %", f"{low} to {high} %")

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import Run, varied
+from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import in_brackets
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, Series
@@ -42,6 +42,7 @@ def _series(
     curves: Sequence[tuple[str, str, Sequence[FloatArray]]],
 ) -> Iterator[Series]:
     outputs = model.structure.outputs
+    shares = [noise_share(runs, k) if o.name in noise else 1.0 for k, o in enumerate(outputs)]
     for i, run in enumerate(runs):
         moving = varied(run)
         inputs = model.structure.inputs
@@ -56,7 +57,7 @@ def _series(
                 measured=run.outputs[:, k],
                 curves=tuple(Curve(name, c, y[i][:, k]) for name, c, y in curves),
                 held_out=run.judged(k),
-                noise=noise[o.name],
+                noise=noise[o.name] * float(run.noise[k]) / shares[k],
                 counts=False,
                 quantity=o.name,
                 unit=o.unit or "1",

@@ -1,0 +1,77 @@
+"""The noise levels that weight the outputs and the experiments of a fit."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from psa_casadi.any_model.fit import OdeFit, measured_outputs, refitted
+from psa_casadi.any_model.runs import Run, noise_share
+from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, uncertain
+from psa_casadi.records.quality.noise import first_order_noise
+
+#: Noise is estimated from so many samples or more, and differs from so many standard errors on.
+_TELLING, _SURE = 32, 3.0
+
+
+def first_levels(runs: Sequence[Run]) -> tuple[float, ...]:
+    """Return levels to begin with: a tenth of every measured output's standard deviation."""
+    places = measured_outputs(runs)
+    every = np.vstack([np.where(r.used[:, None], r.outputs, np.nan) for r in runs])
+    return tuple(0.1 * float(np.nanstd(every[:, j])) for j in places)
+
+
+def relevelled(fit: OdeFit, runs: Sequence[Run], rounds: int = 4) -> OdeFit:
+    """Fit again with every output's residual as its noise level, until that stays the same."""
+    for _ in range(rounds if len(fit.outputs) > 1 else 1):
+        levels = tuple(max(o.rms, o.straight, 1e-300) for o in fit.outputs)
+        change = np.max(np.abs(np.log(np.array(levels) / np.array(fit.levels))))
+        if change < 0.02 or fit.interrupted:
+            break
+        fit = refitted(fit, runs, levels=levels)
+    return fit
+
+
+def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
+
+    Of every output, over the usual one of all experiments (the geometric mean by samples). A share
+    that cannot be told from 1 is 1.
+    """
+    shares = [r.noise.copy() for r in runs]
+    for o in fit.outputs:
+        found = [(k, p) for k, p in zip(o.runs, o.parts, strict=True) if len(p) >= _TELLING]
+        if len(found) < 2:
+            continue
+        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in found]
+        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in found])
+        for (k, part), own in zip(found, over, strict=True):
+            if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
+                shares[k][o.index] *= float(np.exp(own))
+    return tuple(replace(r, noise=share) for r, share in zip(runs, shares, strict=True))
+
+
+def unlike(runs: Sequence[Run], others: Sequence[Run]) -> bool:
+    """Whether the shares of the noise differ."""
+    return any(np.any(a.noise != b.noise) for a, b in zip(runs, others, strict=True))
+
+
+def reweighted(fit: OdeFit, runs: Sequence[Run]) -> OdeFit:
+    """Fit again with other shares of the noise."""
+    return relevelled(refitted(fit, runs, evaluations=100), runs)
+
+
+def noise_told(
+    fit: OdeFit, colours: Sequence[Colour], runs: Sequence[Run]
+) -> tuple[tuple[Run, ...], tuple[float, ...]]:
+    """Return the experiments and every output's noise over them, in its unit, as a fit leaves it.
+
+    What a search has weighted by is from the base's residual, which holds more than noise.
+    """
+    told, levels = with_noise(fit, runs), []
+    for o, colour in zip(fit.outputs, colours, strict=True):
+        j = o.index
+        rows = zip(o.runs, o.parts, strict=True)
+        own = np.concatenate([p * (runs[k].noise[j] / told[k].noise[j]) for k, p in rows])
+        levels.append(noise_rms(own, colour) * noise_share(told, j))
+    return told, tuple(levels)
