@@ -100,9 +100,9 @@ def _tiles(d: OdeDiagnosis) -> list[tuple[str, str, str]]:
         error = with_its_unit(e.extended, e.unit)
         tiles.append((f"{e.output}: held-out rms", error, noise))
     if added(d):
-        share, low, high = d.budget.together.shown
-        said = f"of its power above the noise, held out ({100 * low:.0f} to {100 * high:.0f} %)"
-        tiles.append(("removed of the error", percent(share), said))
+        share, low, high = d.budget.together.percents
+        said = f"of its power above the noise, held out ({low} to {high} %)"
+        tiles.append(("removed of the error", f"{share} %", said))
     return tiles
 
 
