@@ -42,7 +42,7 @@ _STILL_INCHES, _STILL_DPI, _STILL_POINTS = (12.0, 6.4), 80, 4000
 _STILL_ROOM = {
     "left": 0.075,
     "right": 0.99,
-    "top": 0.95,
+    "top": 0.935,
     "bottom": 0.09,
     "hspace": 0.42,
     "wspace": 0.3,
@@ -80,9 +80,14 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
     above = grid[0, :2] if s.against else grid[0, :]
-    _time(figure.add_subplot(above), s, slice(None), origin, None)
+    time = figure.add_subplot(above)
+    _time(time, s, slice(None), origin, None)
+    time.legend(
+        fontsize=FONT - 1.5, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.98), frameon=False,
+        columnspacing=1.2, handlelength=1.4,
+    )  # fmt: skip
     if s.against:
-        _loop(figure.add_subplot(grid[0, 2]), s, origin)
+        _loop(figure.add_subplot(grid[0, 2]), s, origin, told=True)
     _residual(figure.add_subplot(grid[1, :]), s, origin)
     return figure
 
@@ -191,7 +196,8 @@ def _time(axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None) -
         axes.legend(fontsize=FONT - 1, framealpha=0.85)
 
 
-def _loop(axes: Axes, s: Series, origin: str) -> None:
+def _loop(axes: Axes, s: Series, origin: str, *, told: bool = False) -> None:
+    """Draw a record over its voltage, with a legend unless the curves are told beside it."""
     scale = s.scale
     axes.plot(
         s.voltage, scale.factor * s.measured, color=MEASURED_COLOUR, linewidth=2.2, label=origin
@@ -200,7 +206,8 @@ def _loop(axes: Axes, s: Series, origin: str) -> None:
         values = scale.factor * curve.values
         axes.plot(s.voltage, values, color=curve.colour, linewidth=0.9, label=curve.label)
     style(axes, "Loop", s.against, s.label)
-    axes.legend(fontsize=FONT - 1, framealpha=0.85, loc="upper left")
+    if not told:
+        axes.legend(fontsize=FONT - 1, framealpha=0.85, loc="upper left")
 
 
 def _residual(axes: Axes, s: Series, origin: str) -> None:
