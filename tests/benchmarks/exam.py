@@ -12,6 +12,7 @@ from pathlib import Path
 
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.task import Method
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable
@@ -50,11 +51,18 @@ class Marked:
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
-    """Make, diagnose and mark the records, side by side on all cores."""
-    records = RECORDS[::QUICK] if quick else RECORDS
+    """Make, diagnose and mark the records."""
+    found = sat(RECORDS[::QUICK] if quick else RECORDS, progress)
+    return Outcome((answers(found), counts(found)))
+
+
+def sat(
+    records: Sequence[Record], progress: Progress, method: Method | None = None
+) -> list[Marked]:
+    """Return the marks of records in their order, worked on side by side on all cores."""
     found: list[Marked] = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        for job in as_completed([pool.submit(marked, record) for record in records]):
+        for job in as_completed([pool.submit(marked, record, method) for record in records]):
             one = job.result()
             found.append(one)
             progress(
@@ -63,17 +71,17 @@ def run(progress: Progress, quick: bool) -> Outcome:
             )
     places = {record.name: place for place, record in enumerate(records)}
     found.sort(key=lambda one: places[one.record.name])
-    return Outcome((answers(found), counts(found)))
+    return found
 
 
-def marked(record: Record) -> Marked:
+def marked(record: Record, method: Method | None = None) -> Marked:
     """Make a record as a file, diagnose the file, and mark what is said."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{record.name}.csv"
         write(record, path)
         read = read_record(path)
     begin = time.process_time()
-    answer = _answer(diagnose([read]))
+    answer = _answer(diagnose([read], method=method))
     return Marked(record, answer, mark(record, answer), time.process_time() - begin)
 
 

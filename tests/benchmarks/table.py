@@ -117,6 +117,11 @@ BENCHES: dict[str, Bench] = {
             "plants of another author: six kinds of hysteresis, causes in other forms, with marks",
         ),
         _later(
+            "exam_constants",
+            "exam_constants",
+            "hard records of the exam with each deciding constant halved and doubled",
+        ),
+        _later(
             "ablation",
             "ablation",
             "the diagnosis without each of its steps, and with each deciding constant moved",
