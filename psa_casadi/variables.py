@@ -40,9 +40,10 @@ class State:
     """A state (FMI: local, initial exact), continuous, or discrete where a component samples it.
 
     A state with `memory` remembers a history that the record does not show (hysteresis, creep): its
-    deviation from rest at the start of a record is unknown and is estimated; all others start at
-    rest. A memory that `settles` (creep) has an equilibrium; one that does not (hysteresis) rests
-    at any value.
+    deviation from rest at the start of a record is unknown and is estimated; all others of a stack
+    start at rest. Those of a model of one's own are all estimated, as deviations from `start`,
+    unless the start is said to be known. A memory that `settles` (creep) has an equilibrium; one
+    that does not (hysteresis) rests at any value.
     `nominal` is the size the state usually has, a number or a function of the parameter values.
     """
 

@@ -11,7 +11,7 @@ from psa_casadi.any_model.identify import free_of, known_zeros, search_starts
 from psa_casadi.any_model.judge import judged
 from psa_casadi.any_model.levels import reweighted, unlike, with_noise
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import held_as_lines, runs_of
+from psa_casadi.any_model.runs import runs_of, told_of_columns
 from psa_casadi.any_model.search import search
 from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.any_model.trials import Table
@@ -73,7 +73,7 @@ def diagnose_ode(
         known = search(reweighted(base, runs), runs, table, progress)
     progress("judging")
     found = judged(known)
-    return replace(found, notes=(*found.notes, *held_as_lines(model, runs)))
+    return replace(found, notes=(*found.notes, *told_of_columns(model, runs)))
 
 
 def _any(given: Any) -> bool:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from psa_casadi.any_model.certainty import Certainty, certainty
 from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted, refuse_unfit
 from psa_casadi.any_model.levels import first_levels, relevelled, reweighted, unlike, with_noise
-from psa_casadi.any_model.runs import Run, held_as_lines, noise_share, runs_of
+from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
 from psa_casadi.any_model.sizes import sized
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
@@ -280,7 +280,7 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         for o in fit.outputs
         if (share := rms[o.column] / _movement(runs, o.index)) > _ALL
     ]
-    said += held_as_lines(fit.model, runs)
+    said += told_of_columns(fit.model, runs)
     return OdeIdentification(
         model=with_told(fit.model, runs, sure, fit.interrupted),
         fit=fit,

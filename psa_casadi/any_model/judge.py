@@ -7,14 +7,13 @@ import numpy as np
 from psa_casadi.any_model.budget import OdeBudget, removed_from
 from psa_casadi.any_model.certainty import certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
-from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView
-from psa_casadi.any_model.identify import with_told
+from psa_casadi.any_model.hypothesis import OdeHypothesis
+from psa_casadi.any_model.identify import MISSED, with_told
 from psa_casadi.any_model.levels import noise_told
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
-from psa_casadi.any_model.runs import missed_rms
+from psa_casadi.any_model.runs import Run, missed_rms
 from psa_casadi.any_model.search import Known, with_cause, without
 from psa_casadi.any_model.weighing import (
-    Weighed,
     beaten_by,
     left_out,
     weighed,
@@ -32,6 +31,10 @@ from psa_casadi.records.checks import FEWEST_SAMPLES
 
 _FEW = (
     "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
+)
+_HELD = (
+    "The fitted samples leave no more than noise, but the held-out ones of {} {:.1f} times their"
+    " noise: these records do not say the same, or their inputs are not read alike (see `hold`)."
 )
 _UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
 
@@ -53,7 +56,16 @@ def judged(known: Known) -> OdeDiagnosis:
     free = free_functions(known, first) if first.test.alarm or best.causes else ()
     beaten = beaten_by(known, best, own, free, floors) if best.causes else None
     told = _steps(known, best)
-    verdict = _verdict(first, last, own, told, withdrawn=bool(beaten) or few)
+    left = {h.names: _remaining(known, h) for h in (root, best)}
+    verdict = verdict_by(
+        missing=not left[root.names].white or bool(best.causes),
+        withdrawn=bool(beaten)
+        or few
+        or not best.causes
+        or (not left[best.names].white and not own.enough),
+        ambiguous=any(rivals(told[c.name], c.name) for c in best.causes[:1]),
+        more=not left[best.names].white,
+    )
     named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
     notes = [_FEW.format(held, FEWEST_SAMPLES)] if few else []
     names = " and ".join(c.name for c in best.causes)
@@ -62,24 +74,6 @@ def judged(known: Known) -> OdeDiagnosis:
     if not few:
         notes += left_out(known, best)
     return _diagnosis(known, verdict, named, removed, told, notes, free)
-
-
-def _verdict(
-    first: OdeView,
-    last: OdeView,
-    own: Weighed,
-    told: Mapping[str, Mapping[str, float]],
-    *,
-    withdrawn: bool,
-) -> Verdict:
-    causes = last.of.causes
-    partly = last.test.alarm
-    return verdict_by(
-        missing=first.test.alarm or bool(causes),
-        withdrawn=withdrawn or not causes or (partly and not own.enough),
-        ambiguous=any(rivals(told[c.name], c.name) for c in causes[:1]),
-        more=partly,
-    )
 
 
 def _steps(known: Known, best: OdeHypothesis) -> dict[str, dict[str, float]]:
@@ -120,8 +114,7 @@ def _diagnosis(
 ) -> OdeDiagnosis:
     root = known.found[frozenset()]
     sure = certainty(named.fit)
-    seen = known.view(named).screening.colour
-    runs, noise = noise_told(named.fit, (seen, *seen.further), known.runs)
+    runs, noise = _noise(known, named)
     partly = known.view(named).test.alarm
     shares = {c.name: _own_share(known, named, c, removed) for c in named.causes}
     least = least_share([s.share for s in shares.values()])
@@ -162,7 +155,7 @@ def _diagnosis(
             )
             for o, level in zip(named.fit.outputs, noise, strict=True)
         ),
-        remaining=_remaining(known.view(named)),
+        remaining=_remaining(known, named),
         notes=(*notes, *(SMALL_NOTE.format(n, 100 * shares[n].shown[0]) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
@@ -170,7 +163,7 @@ def _diagnosis(
         runs=runs,
         base=root.predicted,
         extended=named.predicted,
-        missed=_remaining(known.view(root)),
+        missed=_remaining(known, root),
         budget=OdeBudget(
             removed.share("together", root.predicted, named.predicted),
             tuple(shares[c.effect] for c in causes),
@@ -230,8 +223,21 @@ def _candidates(
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 
 
-def _remaining(view: OdeView) -> Remaining:
+def _noise(known: Known, h: OdeHypothesis) -> tuple[tuple[Run, ...], tuple[float, ...]]:
+    seen = known.view(h).screening.colour
+    return noise_told(h.fit, (seen, *seen.further), known.runs)
+
+
+def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
+    """Say what a model leaves: of fitted samples by its test, of held-out ones by their size."""
+    test = known.view(h).test
     where = "What remains cannot be distinguished from noise."
-    if view.test.alarm:
-        where = f"{view.test.where} {100 * view.test.excess:.0f} % of its power is above the noise."
-    return Remaining(not view.test.alarm, view.test.p_value, where)
+    if test.alarm:
+        where = f"{test.where} {100 * test.excess:.0f} % of its power is above the noise."
+        return Remaining(False, test.p_value, where)
+    for o, noise in zip(h.fit.outputs, _noise(known, h)[1], strict=True):
+        held = any(r.judged(o.index).any() for r in known.runs)
+        rms = missed_rms(known.runs, h.predicted, o.index)
+        if held and rms > MISSED * noise:
+            return Remaining(False, test.p_value, _HELD.format(o.column, rms / noise))
+    return Remaining(True, test.p_value, where)

@@ -122,9 +122,8 @@ class OdeDiagnosis(StillReported):
         before, after = self.base_fit.model.values, self.model.values
         told = self.model.provenance.intervals
         return tuple(
-            f"{n} = {after[n]:.4g}{_after(self.model.parameter(n).unit)}"
-            f" ({i.low:.4g} to {i.high:.4g}), without the cause{'s' * (len(self.causes) > 1)}"
-            f" {before[n]:.4g}"
+            f"{n} = {_told(after[n], i.low, i.high)}{_after(self.model.parameter(n).unit)}, without"
+            f" the cause{'s' * (len(self.causes) > 1)} {before[n]:.4g}"
             for n, i in told.items()
             if self.causes and n in before and not i.low <= before[n] <= i.high
         )
@@ -136,16 +135,17 @@ class OdeDiagnosis(StillReported):
         lines = [f"{self.verdict}: {_SAID[self.verdict].format(named)}"]
         for c, removed in zip(self.causes, self.budget.causes, strict=True):
             lines.append(
-                f"  {c.effect} ({c.confidence:.0%} sure; {c.belongs_to}), {c.description}; it"
-                f" removes {removed.text} of the held-out error above the noise"
+                f"  {c.effect} ({c.confidence:.0%} sure), {c.description}; it removes"
+                f" {removed.text} of the held-out error above the noise"
             )
             lines += [
-                f"    {n} = {e.value:.4g} ({e.interval[0]:.4g} to {e.interval[1]:.4g})"
-                f"{_after(e.unit)}"
+                f"    {n} = {_told(e.value, *e.interval)}{_after(e.unit)}"
                 for n, e in c.parameters.items()
             ]
             if c.cannot_be_told_from:
                 lines.append(f"    may as well be {', '.join(c.cannot_be_told_from)}")
+        if several:
+            lines.append(f"  together they remove {self.budget.together.text} of it")
         for o in self.errors:
             unit = _after(o.unit)
             lines.append(
@@ -197,3 +197,12 @@ class OdeDiagnosis(StillReported):
 
 def _after(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
+
+
+def _told(value: float, low: float, high: float) -> str:
+    """Return a value with its interval, in as many digits as tell them apart, four at least."""
+    half = max(high - value, value - low)
+    digits = 4
+    if 0.0 < half < abs(value):
+        digits = max(4, min(9, 1 + int(np.ceil(np.log10(abs(value) / half)))))
+    return f"{value:.{digits}g} ({low:.{digits}g} to {high:.{digits}g})"

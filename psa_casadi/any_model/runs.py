@@ -117,16 +117,20 @@ def varied(run: Run) -> int | None:
     return int(np.argmax(spans)) if spans and max(spans) > 0 else None
 
 
-def held_as_lines(model: Model, runs: Sequence[Run]) -> tuple[str, ...]:
-    """Say which inputs look as if they were held between samples, and are read as lines."""
+def told_of_columns(model: Model, runs: Sequence[Run]) -> tuple[str, ...]:
+    """Say which inputs look held between samples and are read as lines, and which outputs lack."""
     lines = [r.signals for r in runs if r.signals.hold == "linear"]
-    names = sorted({n for s in lines for n in stairs(s, model.input_names)})
-    return tuple(
-        f"The input '{n}' stands still between jumps, and each jump is read as a ramp of one"
-        " sampling interval; if it is held between samples, as by a digital controller, give"
-        ' hold="zero".'
-        for n in names
-    )
+    held = {n: [s.name for s in lines if n in stairs(s, (n,))] for n in model.input_names}
+    notes = [
+        f"The input '{n}' stands still between jumps in {', '.join(records)}, and each jump is read"
+        " as a ramp of one sampling interval; if it is held between samples, as by a digital"
+        ' controller, say so of these records: psa.Signals(..., hold="zero").'
+        for n, records in held.items()
+        if records
+    ]
+    absent = [n for n in model.output_names if not any(n in r.signals.columns for r in runs)]
+    notes += [f"No record has a column '{n}'; that output is not compared." for n in absent]
+    return tuple(notes)
 
 
 def _refuse_twins(given: Sequence[Signals], holdout: Sequence[Signals], problems: Problems) -> None:
