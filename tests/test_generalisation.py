@@ -125,3 +125,23 @@ def test_a_model_that_fails_on_the_held_out_record_is_not_adequate(tmp_path: Pat
     assert diagnose([loops], holdout=[again], effects=effects).verdict == "adequate"
     named = diagnose([loops, jumps], effects=effects)
     assert [c.effect for c in named.causes] == ["current_limit"]
+
+
+@slow
+def test_a_named_cause_does_not_hide_that_the_held_out_record_is_another(tmp_path: Path) -> None:
+    """After its first tenth the sensor shows 0.5 % more: the creep is named, and more is left."""
+    path, shown_again = tmp_path / "creeping.csv", tmp_path / "again.csv"
+    truth = make_record("slow_creep", 11, path, visible=(1.0, 2.0))
+    play_again(truth, 1, shown_again)
+    record, again = read_record(path), read_record(shown_again)
+    effects = [EFFECTS["slow_creep"]]
+    same = diagnose([record], holdout=[again], effects=effects)
+    assert same.verdict == "cause_named"
+    assert same.remaining.white
+    later = again.time > again.time[0] + 0.15 * again.duration
+    gain = np.where(later, 1.005, 1.0)
+    scaled = replace(again, displacement=np.asarray(gain * again.displacement, dtype=np.float64))
+    unlike = diagnose([record], holdout=[scaled], effects=effects)
+    assert unlike.verdict == "partly_explained"
+    assert [c.effect for c in unlike.causes] == ["slow_creep"]
+    assert "held-out samples' error is" in unlike.remaining.where

@@ -86,6 +86,9 @@ def conclude(
     noise = noise_floor([e.record for e in experiments], errors)
     floor = pooled_level(noise, errors, colour)
     beyond = held_out_excess(first.fit, experiments, first.predicted, first.screening.colour, noise)
+    unseen = Excess()
+    if last is not first:
+        unseen = held_out_excess(last.fit, experiments, last.predicted, colour, noise)
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
     balance = Balance(experiments, Scale(first.fit, colour, thresholds().price), floor)
     weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
@@ -103,6 +106,7 @@ def conclude(
             missing=missing,
             withdrawn=bool(beaten or doubt),
             share=weighed.share,
+            unseen=bool(unseen),
             unnamed=vague,
         )
     )
@@ -145,7 +149,7 @@ def conclude(
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
         blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
-        remaining=_remaining(final, Excess() if kept else beyond),
+        remaining=_remaining(final, unseen if kept else beyond),
         next_experiment=_next_experiment(
             causes,
             verdict,

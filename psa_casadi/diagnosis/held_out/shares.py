@@ -48,7 +48,8 @@ class Share:
         A share that is not 0 is never told as 0.
         """
         share, low, high = self.shown
-        off = min(1.0 - low, high)
+        off = min(1.0 - self.interval[0], self.interval[1])
+        off = 1.0 if off < 0.0 else off  # beyond what is shown
         digits = 0 if off > 0.01 else 1 if off > 0.001 else 2
         least = 10.0**-digits
         told = f"{100 * share:.{digits}f}"
