@@ -42,7 +42,8 @@ def test_every_record_has_the_noise_of_its_own() -> None:
 @hydraulic
 def test_the_dead_zone_of_a_valve_is_found_in_volts_and_nothing_else_is_left() -> None:
     *fitted, last = plants.cylinder(20)
-    d = psa.diagnose(cylinder(), fitted, holdout=[last])
+    memories = ["hysteresis", "stop", "curve", "zero", "drift"]  # half of what there is to compile
+    d = psa.diagnose(cylinder(), fitted, holdout=[last], leave_out=memories)
     assert d.verdict == "cause_named"
     assert [c.effect for c in d.causes] == ["dead_zone_of_u"]
     level = d.causes[0].parameters["dead_zone_of_u_level"]
