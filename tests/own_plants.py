@@ -63,8 +63,11 @@ def bouc_wen(seed: int, noise: float = 8e-6) -> Signals:
     return Signals(name="multisine", time=t, columns={"force": u, "position": measured})
 
 
-def motor(seed: int, friction: float = 0.012) -> Signals:
-    """A DC motor with dry friction [N.m] at its shaft: voltage, speed [rad/s] and current [A]."""
+def motor(seed: int, friction: float = 0.012, noise: float = 1.0) -> Signals:
+    """A DC motor with dry friction [N.m] at its shaft: voltage, speed [rad/s] and current [A].
+
+    `noise` is over that of ordinary sensors.
+    """
     rng, t = np.random.default_rng(seed), np.arange(3000, dtype=np.float64) * 1e-3
     tones = ((6.0, 1.1, 0.0), (4.0, 3.7, 1.0), (2.0, 0.4, 0.0))
     u = sum(a * np.sin(2.0 * np.pi * f * t + p) for a, f, p in tones)
@@ -77,8 +80,8 @@ def motor(seed: int, friction: float = 0.012) -> Signals:
     i, w = _solved(rates, t, [0.0, 0.0], 1e-3)
     columns = {
         "voltage": u,
-        "w": w + 0.3 * rng.standard_normal(len(t)),
-        "i": i + 0.005 * rng.standard_normal(len(t)),
+        "w": w + noise * 0.3 * rng.standard_normal(len(t)),
+        "i": i + noise * 0.005 * rng.standard_normal(len(t)),
     }
     return Signals(name="drive", time=t, columns=columns)
 

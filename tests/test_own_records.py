@@ -105,6 +105,20 @@ def test_an_input_that_is_held_is_read_so_and_a_staircase_read_as_lines_is_told(
     assert again.model.values == psa.identify(oven(), held, known_start=True).model.values
 
 
+@pytest.mark.slow
+def test_a_record_without_noise_hides_nothing_and_shows_what_is_hidden() -> None:
+    """A simulation errs by its tolerance, which is no cause; what is rounded is no cause either."""
+    leave_out = ["hysteresis", "stop", "curve", "delay"]
+    clean = plants.motor(2, friction=0.0, noise=0.0)
+    rounded = {n: np.round(y, 3) for n, y in clean.columns.items()}
+    for columns in (clean.columns, {**rounded, "voltage": clean.columns["voltage"]}):
+        d = psa.diagnose(motor(), {"time": clean.time, **columns}, leave_out=leave_out)
+        assert d.verdict == "adequate", d
+    d = psa.diagnose(motor(), plants.motor(1, noise=0.0), leave_out=leave_out)
+    assert d.causes[0].effect == "friction_in_speed"
+    assert d.model.values["friction_in_speed_size"] == pytest.approx(0.012 / 3e-5, rel=0.02)
+
+
 def test_an_edge_of_two_samples_and_a_smooth_input_are_no_staircase() -> None:
     t = np.arange(40.0)
     steps = np.repeat([0.0, 1.0, -1.0, 2.0], 10)

@@ -104,10 +104,12 @@ class OdeView:
     def shows(self) -> bool:
         """Whether a further effect is above the screening's threshold and could be told.
 
-        Beside a cause the test must alarm too, as in a stack's diagnosis.
+        Beside a cause the test must alarm too, as in a stack's diagnosis. Errors of every output
+        below what can be told of a device show nothing.
         """
         best = max((s.decrease for s in self.screening.scores), default=0.0)
-        seen = best >= self.screening.threshold
+        told = any(o.rms > o.straight for o in self.of.fit.outputs)
+        seen = told and best >= self.screening.threshold
         return seen and (self.test.alarm or not self.of.causes)
 
     def estimated(self) -> dict[str, float]:
@@ -171,6 +173,12 @@ def _along(runs: Sequence[Run], output: FittedOutput) -> list[FloatArray]:
     whole = np.vstack(parts)
     moving = [whole[:, j] for j in range(whole.shape[1]) if np.ptp(whole[:, j]) > 0]
     return moving or [np.zeros(len(whole))]
+
+
+def can_be_told(of: OdeHypothesis, before: OdeHypothesis) -> bool:
+    """Whether a hypothesis removes more of some output's error than what cannot be told of it."""
+    rows = zip(of.fit.outputs, before.train, of.train, strict=True)
+    return any(old**2 - new**2 > o.straight**2 for o, old, new in rows)
 
 
 def held_out_confirms(

@@ -238,6 +238,6 @@ def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
     for o, noise in zip(h.fit.outputs, _noise(known, h)[1], strict=True):
         held = any(r.judged(o.index).any() for r in known.runs)
         rms = missed_rms(known.runs, h.predicted, o.index)
-        if held and rms > MISSED * noise:
+        if held and rms > MISSED * float(np.hypot(noise, o.straight)):
             return Remaining(False, test.p_value, _HELD.format(o.column, rms / noise))
     return Remaining(True, test.p_value, where)

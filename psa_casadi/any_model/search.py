@@ -14,6 +14,7 @@ from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted
 from psa_casadi.any_model.hypothesis import (
     OdeHypothesis,
     OdeView,
+    can_be_told,
     held_out_confirms,
     hypothesis_of,
     look,
@@ -105,13 +106,15 @@ class Known:
         )
 
     def stands(self, h: OdeHypothesis) -> bool:
-        """Whether every cause is itself, and held-out data confirm it."""
+        """Whether every cause is itself, can be told, and is confirmed by held-out data."""
         for cause in h.causes:
             if not inside_ranges(h.fit.model.values, cause, self.table.attached(cause).ideal):
                 return False
             before = self.found.get(h.names - {cause.name})
             if before is None:
                 continue
+            if not can_be_told(h, before):
+                return False
             gained = self.score(h) - self.score(before)
             if not held_out_confirms(h, before, self.runs, self.colour, gained):
                 return False
