@@ -15,8 +15,8 @@ from tests.exam.records import RECORDS
 
 #: Of the records with a full mark and of the others so many, those that take the least time.
 FULL, OTHERS = 8, 12
-#: A quick run moves one of so many constants.
-_QUICK = 8
+#: A quick run moves one of so many constants; one move takes 34 times as long as the method.
+_QUICK, _TOO_LONG = 8, "most_causes = 6"
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -24,7 +24,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     whole = chosen(sat(RECORDS, progress))
     moved = moved_constants()
     rows = []
-    for name in list(moved)[:: _QUICK if quick else 1]:
+    for name in [n for n in moved if n != _TOO_LONG][:: _QUICK if quick else 1]:
         progress(name)
         found = sat([one.record for one in whole], progress, moved[name])
         rows.append((name, *changes(whole, found)))
