@@ -1,7 +1,7 @@
 """The error budget of any model: shares and intervals against draws whose shares are known."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -104,17 +104,7 @@ def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power(
     assert Share("little", 0.004, (0.0, 0.02)).text == "under 1 % (0 to 2 %)"
     runs, one, _ = _drawn(np.random.default_rng(2), 1)
     (run,) = runs
-    quiet = [
-        Run(
-            run.signals,
-            run.time,
-            run.inputs,
-            np.zeros((SAMPLES, 2)),
-            run.used,
-            run.held_out,
-            run.noise,
-        )
-    ]
+    quiet = [replace(run, outputs=np.zeros((SAMPLES, 2)))]
     left = removed_from(quiet, (0, 1), one, (0.0, 0.0)).share("half", one, [0.5 * one[0]])
     assert left.share == pytest.approx(0.75, rel=1e-9)
     still = removed_from(quiet, (0, 1), [0.0 * one[0]], (0.0, 0.0)).share("none", one, one)

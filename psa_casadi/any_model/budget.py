@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.runs import Run
+from psa_casadi.any_model.runs import Run, counted
 from psa_casadi.diagnosis.held_out.shares import Removed, Share
 
 FloatArray = npt.NDArray[np.float64]
@@ -49,11 +49,9 @@ def _judged_errors(
     An output of which no sample is held out is judged by its fitted ones.
     """
     parts = []
-    held = [any(r.judged(j).any() for r in runs) for j in outputs]
-    for r, y in zip(runs, predicted, strict=True):
-        which = np.column_stack(
-            [r.judged(j) if own else r.fitted(j) for j, own in zip(outputs, held, strict=True)]
-        )
+    told = zip(*(counted(runs, j) for j in outputs), strict=True)
+    for r, y, own in zip(runs, predicted, told, strict=True):
+        which = np.column_stack(own)
         errors = np.where(which, r.errors(y)[:, outputs], np.nan)
         parts.append(errors[which.any(axis=1)])
     return parts

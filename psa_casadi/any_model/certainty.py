@@ -1,6 +1,5 @@
 """How sure the parameters of a fit are: standard errors under noise of its own colour."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +23,8 @@ _WHITE = 0.05
 class Certainty:
     """Standard errors and 95 % intervals of the parameters by name, and what is wrong with some.
 
-    The interval of a parameter that spans decades is that of its logarithm. `undetermined` are not
+    The interval of a parameter that spans decades is that of its logarithm; none goes beyond the
+    parameter's bounds. `undetermined` are not
     told by the records, `on_bound` sit on a bound of their range.
     """
 
@@ -54,14 +54,11 @@ def certainty(fit: OdeFit) -> Certainty:
         errors[name] = error
         factor = float(np.exp(min(_NORMAL * spread[k], 300.0)))
         half = _NORMAL * error
-        intervals[name] = (
-            Interval(value / factor, value * factor)
-            if fit.unknowns.log[k]
-            else Interval(value - half, value + half)
-        )
-        low, high = fit.unknowns.low[k], fit.unknowns.high[k]
-        own = intervals[name]
-        intervals[name] = Interval(max(own.low, float(low)), min(own.high, float(high)))
+        low, high = float(fit.unknowns.low[k]), float(fit.unknowns.high[k])
+        least, most = value - half, value + half
+        if fit.unknowns.log[k]:
+            least, most = value / factor, value * factor
+        intervals[name] = Interval(max(least, low), min(most, high))
         edge = 1e-6 * (high - low) if np.isfinite(high - low) else 0.0
         if value <= low + edge or value >= high - edge:
             on_bound.append(name)
@@ -70,15 +67,14 @@ def certainty(fit: OdeFit) -> Certainty:
 
 
 def _whitened(output: FittedOutput, columns: FloatArray) -> FloatArray:
-    r = _correlation(output.residuals, output.lengths)
+    r = _correlation(output)
     if r < _WHITE:
         return columns
     parts = np.split(columns, np.cumsum(output.lengths)[:-1])
     return np.vstack([filtered([1.0, -r], [1.0], part)[1:] for part in parts])
 
 
-def _correlation(residuals: FloatArray, lengths: Sequence[int]) -> float:
+def _correlation(output: FittedOutput) -> float:
     """Return the correlation of neighbours within the experiments, 0.98 at most."""
-    parts = np.split(residuals, np.cumsum(lengths)[:-1])
-    top = sum(float(p[1:] @ p[:-1]) for p in parts)
-    return min(top / max(float(residuals @ residuals), 1e-300), 0.98)
+    top = sum(float(p[1:] @ p[:-1]) for p in output.parts)
+    return min(top / max(float(output.residuals @ output.residuals), 1e-300), 0.98)

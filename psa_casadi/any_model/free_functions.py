@@ -19,6 +19,7 @@ from psa_casadi.any_model.budget import removed_from
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.any_model.fit import OdeFit, fit_ode
 from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of
+from psa_casadi.any_model.levels import noise_left
 from psa_casadi.any_model.predict import shown_by, states_of, traced
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
@@ -26,7 +27,6 @@ from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.any_model.start import start_of
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.diagnosis.held_out.shares import Share
-from psa_casadi.diagnosis.noise.colour import noise_rms
 from psa_casadi.diagnosis.screening.screen import independent, whitened_jacobian, without
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
@@ -144,9 +144,7 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
 
 def _removes(what: str, known: Known, h: OdeHypothesis, view: OdeView) -> Share:
     """Return what it removes of the base's held-out error above the noise that it leaves."""
-    colours = (view.screening.colour, *view.screening.colour.further)
-    noise = [noise_rms(o.residuals, c) for o, c in zip(h.fit.outputs, colours, strict=True)]
-    base = view.of.predicted
+    noise, base = noise_left(h.fit, view.screening.colour), view.of.predicted
     return removed_from(known.runs, h.fit.places, base, noise).share(what, base, h.predicted)
 
 

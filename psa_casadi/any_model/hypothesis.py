@@ -146,8 +146,8 @@ def tested(of: OdeHypothesis, runs: Sequence[Run], colour: Colour) -> Omnibus:
 
     With Bonferroni's correction for their number.
     """
-    colours, rows = (colour, *colour.further), []
-    for output, own in zip(of.fit.outputs, colours, strict=True):
+    rows = []
+    for output, own in zip(of.fit.outputs, colour.each, strict=True):
         for along in _along(runs, output):
             time = np.concatenate([runs[k].time[runs[k].fitted(output.index)] for k in output.runs])
             found = omnibus(
@@ -190,7 +190,7 @@ def held_out_confirms(
     log-likelihood and what is promised summed over the outputs; `score` is what is gained of it.
     """
     gained = promise = 0.0
-    for k, (o, own) in enumerate(zip(of.fit.outputs, (colour, *colour.further), strict=True)):
+    for k, (o, own) in enumerate(zip(of.fit.outputs, colour.each, strict=True)):
         old = errors_at(runs, before.predicted, o.index, Run.judged)
         new = errors_at(runs, of.predicted, o.index, Run.judged)
         if not old.size:

@@ -8,11 +8,11 @@ from psa_casadi.any_model.budget import OdeBudget, removed_from
 from psa_casadi.any_model.certainty import certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
-from psa_casadi.any_model.identify import MISSED, with_told
-from psa_casadi.any_model.levels import noise_told
+from psa_casadi.any_model.identify import with_told
+from psa_casadi.any_model.levels import noise_left, noise_told
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
 from psa_casadi.any_model.runs import Run, missed_rms
-from psa_casadi.any_model.search import Known, with_cause, without
+from psa_casadi.any_model.search import Known, Names, with_cause, without
 from psa_casadi.any_model.weighing import (
     beaten_by,
     left_out,
@@ -22,7 +22,6 @@ from psa_casadi.any_model.weighing import (
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out.shares import Removed, Share
 from psa_casadi.diagnosis.judgement import SMALL_NOTE, least_share, rivals, verdict_by
-from psa_casadi.diagnosis.noise.colour import noise_rms
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.diagnosis.screening.evidence import probabilities, temperature
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -43,12 +42,7 @@ def judged(known: Known) -> OdeDiagnosis:
     """Return the diagnosis of what a search found."""
     root, best = known.found[frozenset()], known.best()
     first, last = known.view(root), known.view(best)
-    floors = [
-        noise_rms(o.residuals, c)
-        for o, c in zip(
-            best.fit.outputs, (last.screening.colour, *last.screening.colour.further), strict=True
-        )
-    ]
+    floors = noise_left(best.fit, last.screening.colour)
     removed = removed_from(known.runs, root.fit.places, root.predicted, floors)
     own = weighed(root, best.errors, floors, removed.from_base(best.predicted))
     held = sum(int(r.held_out.sum()) for r in known.runs)
@@ -57,14 +51,12 @@ def judged(known: Known) -> OdeDiagnosis:
     beaten = beaten_by(known, best, own, free, floors) if best.causes else None
     told = _steps(known, best)
     left = {h.names: _remaining(known, h) for h in (root, best)}
+    more = not left[best.names].white
     verdict = verdict_by(
         missing=not left[root.names].white or bool(best.causes),
-        withdrawn=bool(beaten)
-        or few
-        or not best.causes
-        or (not left[best.names].white and not own.enough),
+        withdrawn=bool(beaten) or few or not best.causes or (more and not own.enough),
         ambiguous=any(rivals(told[c.name], c.name) for c in best.causes[:1]),
-        more=not left[best.names].white,
+        more=more,
     )
     named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
     notes = [_FEW.format(held, FEWEST_SAMPLES)] if few else []
@@ -73,7 +65,7 @@ def judged(known: Known) -> OdeDiagnosis:
         notes.append(why_not_named(names, own, beaten))
     if not few:
         notes += left_out(known, best)
-    return _diagnosis(known, verdict, named, removed, told, notes, free)
+    return _diagnosis(known, verdict, named, removed, told, left, notes, free)
 
 
 def _steps(known: Known, best: OdeHypothesis) -> dict[str, dict[str, float]]:
@@ -109,6 +101,7 @@ def _diagnosis(
     named: OdeHypothesis,
     removed: Removed,
     told: Mapping[str, Mapping[str, float]],
+    left: Mapping[Names, Remaining],
     notes: list[str],
     free: Sequence[Free],
 ) -> OdeDiagnosis:
@@ -155,7 +148,7 @@ def _diagnosis(
             )
             for o, level in zip(named.fit.outputs, noise, strict=True)
         ),
-        remaining=_remaining(known, named),
+        remaining=left[named.names],
         notes=(*notes, *(SMALL_NOTE.format(n, 100 * shares[n].shown[0]) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
@@ -163,7 +156,7 @@ def _diagnosis(
         runs=runs,
         base=root.predicted,
         extended=named.predicted,
-        missed=_remaining(known, root),
+        missed=left[root.names],
         budget=OdeBudget(
             removed.share("together", root.predicted, named.predicted),
             tuple(shares[c.effect] for c in causes),
@@ -224,8 +217,7 @@ def _candidates(
 
 
 def _noise(known: Known, h: OdeHypothesis) -> tuple[tuple[Run, ...], tuple[float, ...]]:
-    seen = known.view(h).screening.colour
-    return noise_told(h.fit, (seen, *seen.further), known.runs)
+    return noise_told(h.fit, known.view(h).screening.colour, known.runs)
 
 
 def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
@@ -238,6 +230,7 @@ def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
     for o, noise in zip(h.fit.outputs, _noise(known, h)[1], strict=True):
         held = any(r.judged(o.index).any() for r in known.runs)
         rms = missed_rms(known.runs, h.predicted, o.index)
-        if held and rms > MISSED * float(np.hypot(noise, o.straight)):
+        least = thresholds().unseen_ratio_of_records * float(np.hypot(noise, o.straight))
+        if held and rms > least:
             return Remaining(False, test.p_value, _HELD.format(o.column, rms / noise))
     return Remaining(True, test.p_value, where)

@@ -61,17 +61,23 @@ def reweighted(fit: OdeFit, runs: Sequence[Run]) -> OdeFit:
     return relevelled(refitted(fit, runs, evaluations=100), runs)
 
 
+def noise_left(fit: OdeFit, colour: Colour) -> list[float]:
+    """Return the noise in every output's residual, over the shares that weighted it."""
+    rows = zip(fit.outputs, colour.each, strict=True)
+    return [noise_rms(o.residuals, own) for o, own in rows]
+
+
 def noise_told(
-    fit: OdeFit, colours: Sequence[Colour], runs: Sequence[Run]
+    fit: OdeFit, colour: Colour, runs: Sequence[Run]
 ) -> tuple[tuple[Run, ...], tuple[float, ...]]:
     """Return the experiments and every output's noise over them, in its unit, as a fit leaves it.
 
     What a search has weighted by is from the base's residual, which holds more than noise.
     """
     told, levels = with_noise(fit, runs), []
-    for o, colour in zip(fit.outputs, colours, strict=True):
+    for o, own in zip(fit.outputs, colour.each, strict=True):
         j = o.index
         rows = zip(o.runs, o.parts, strict=True)
-        own = np.concatenate([p * (runs[k].noise[j] / told[k].noise[j]) for k, p in rows])
-        levels.append(noise_rms(own, colour) * noise_share(told, j))
+        left = np.concatenate([p * (runs[k].noise[j] / told[k].noise[j]) for k, p in rows])
+        levels.append(noise_rms(left, own) * noise_share(told, j))
     return told, tuple(levels)

@@ -62,19 +62,19 @@ class Run:
 
 def noise_share(runs: Sequence[Run], output: int) -> float:
     """Return the rms of an output's `noise` over the samples that judge, else over the fitted."""
-    counts = [int(c.sum()) for c in _counted(runs, output)]
+    counts = [int(c.sum()) for c in counted(runs, output)]
     squares = [r.noise[output] ** 2 for r in runs]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 
 def missed_rms(runs: Sequence[Run], predicted: Sequence[FloatArray], output: int) -> float:
     """Return the rms of measured minus predicted of an output, in its unit, over these samples."""
-    rows = zip(runs, predicted, _counted(runs, output), strict=True)
+    rows = zip(runs, predicted, counted(runs, output), strict=True)
     errors = np.concatenate([(r.outputs - y)[c, output] for r, y, c in rows])
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def _counted(runs: Sequence[Run], output: int) -> list[BoolArray]:
+def counted(runs: Sequence[Run], output: int) -> list[BoolArray]:
     """Return the samples of an output that judge, the fitted ones where none does."""
     judged = [r.judged(output) for r in runs]
     return judged if any(j.any() for j in judged) else [r.fitted(output) for r in runs]

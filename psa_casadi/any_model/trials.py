@@ -1,6 +1,6 @@
 """Trial directions of a model's effects: what each would add to every output."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -102,7 +102,7 @@ def _moved(
     column = model.parameter_names.index(gain)
     for o in fit.outputs:
         parts = []
-        for k in o.runs:
+        for k, residual in zip(o.runs, o.parts, strict=True):
             run = runs[k]
             begun = start_of(current, run.inputs[0], starts[k])
             wanted: list[str | int] = [] if step else [gain]
@@ -111,17 +111,15 @@ def _moved(
             used = run.fitted(o.index)
             moved = (shown if step else slopes[:, 0] * scale)[used[: run.stop]]
             if step:
-                moved = moved - _shown(fit, o, run, k)
+                moved = moved - _shown(o, residual, run, starts[k])
             parts.append(moved / run.noise[o.index])
         found.append(np.concatenate(parts))
     return found
 
 
-def _shown(fit: OdeFit, output: FittedOutput, run: Run, index: int) -> FloatArray:
+def _shown(
+    output: FittedOutput, residual: FloatArray, run: Run, start: Mapping[str, float]
+) -> FloatArray:
     """Return a fit's own predictions of an output's used samples, without an unknown zero."""
-    j, (part,) = (
-        output.index,
-        [p for k, p in zip(output.runs, output.parts, strict=True) if k == index],
-    )
-    zero = fit.starts()[index].get(zero_name(output.column), 0.0)
-    return np.asarray(run.outputs[run.fitted(j), j] - zero - part * run.noise[j])
+    j, zero = output.index, start.get(zero_name(output.column), 0.0)
+    return np.asarray(run.outputs[run.fitted(j), j] - zero - residual * run.noise[j])

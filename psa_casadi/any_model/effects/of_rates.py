@@ -97,7 +97,8 @@ def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
     size = rounded(sizes.states[v])
 
     def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
-        return {}, -own("size") * getattr(s, v) / ca.sqrt(getattr(s, v) ** 2 + own("width") ** 2)
+        state = getattr(s, v)
+        return {}, -own("size") * state / ca.sqrt(state**2 + own("width") ** 2)
 
     return at_port(
         port, name, law,

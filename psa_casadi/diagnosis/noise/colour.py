@@ -36,6 +36,11 @@ class Colour:
     further: tuple["Colour", ...] = ()
 
     @property
+    def each(self) -> tuple["Colour", ...]:
+        """This colour and those of the further columns."""
+        return (self, *self.further)
+
+    @property
     def inflation(self) -> float:
         """Factor by which the colour inflates the variance of a mean, over all records.
 

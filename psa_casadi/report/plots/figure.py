@@ -80,12 +80,7 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
     above = grid[0, :2] if s.against else grid[0, :]
-    time = figure.add_subplot(above)
-    _time(time, s, slice(None), origin, None)
-    time.legend(
-        fontsize=FONT - 1.5, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.98), frameon=False,
-        columnspacing=1.2, handlelength=1.4,
-    )  # fmt: skip
+    _time(figure.add_subplot(above), s, slice(None), origin, None, beside=True)
     if s.against:
         _loop(figure.add_subplot(grid[0, 2]), s, origin, told=True)
     _residual(figure.add_subplot(grid[1, :]), s, origin)
@@ -169,7 +164,10 @@ def _shade_held_out(axes: Axes, s: Series) -> None:
         axes.axvspan(s.time[first], s.time[last], color=HELD_OUT_COLOUR, label=label, zorder=0)
 
 
-def _time(axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None) -> None:
+def _time(
+    axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None, *, beside: bool = False
+) -> None:
+    """Draw a record or a part of it; its legend stands `beside` the title, or on the curves."""
     scale = s.scale
     time, dense = s.time[part], len(s.time[part]) > 400
     y = scale.factor * s.measured[part]
@@ -192,7 +190,12 @@ def _time(axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None) -
         title = f"{s.title} (box: the part on the right)"
     style(axes, title, "time [s]", s.label)
     axes.margins(x=0.01)
-    if zoom is None:
+    if beside:
+        axes.legend(
+            fontsize=FONT - 1.5, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 0.98),
+            frameon=False, columnspacing=1.2, handlelength=1.4,
+        )  # fmt: skip
+    elif zoom is None:
         axes.legend(fontsize=FONT - 1, framealpha=0.85)
 
 
