@@ -54,10 +54,11 @@ static column *slopes_of(const psa_state *state, int at) {
 
 #if PSA_DEVICE
 static const psa_level *level_of(psa_state *state, int step, int level) {
-    const int at = step * (state->run->finest + 1) + level;
-    if (state->held_at != at) fill_level(state->ladders + step, level, 0, state->scale[0], 0, &state->held);
-    state->held_at = at;
-    return &state->held;
+    const int at = step * (state->run->finest + 1) + level, place = at % PSA_HELD;
+    psa_level *const held = state->held + place;
+    if (state->held_at[place] != at) fill_level(state->ladders + step, level, 0, state->scale[0], 0, held);
+    state->held_at[place] = at;
+    return held;
 }
 #else
 static const psa_level *level_of(psa_state *state, int step, int level) {

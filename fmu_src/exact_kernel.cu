@@ -1,8 +1,9 @@
 /* Exact steps on a processor of which every thread runs one set of parameters by itself: CUDA C++.
 
-   A thread's state and the step under trial are its own; the matrices' ladder, which is read where the length
-   of the step changes, lies in a room of the memory that the caller gives. A set that cannot be integrated is
-   nan from there on, as in lanes. */
+   A thread's state, the step under trial and the matrices of the last lengths of step are its own: the threads
+   of a warp have theirs side by side in memory. So is the matrices' ladder where it is small; a larger one lies
+   in a room of the memory that the caller gives, where each thread reads by itself and a set-up takes five times
+   as long. A set that cannot be integrated is nan from there on, as in lanes. */
 #ifndef PSA_EXACT_KERNEL
 #define PSA_EXACT_KERNEL
 
@@ -16,7 +17,9 @@ typedef unsigned long long uint64_t;
 
 #include "exact.c"
 
-/* Bytes of a thread's room */
+#define OWN_ROOM 32768 /* bytes of a ladder that a thread has by itself */
+
+/* Bytes of a thread's room, 0 where it needs none beside its own */
 extern "C" __global__ void psa_exact_room(int lengths, int finest, long long *size) {
     psa_exact run;
     psa_state state;
@@ -25,7 +28,8 @@ extern "C" __global__ void psa_exact_room(int lengths, int finest, long long *si
     run.finest = finest;
     state.run = &run;
     state.thetas = 0;
-    *size = (long long)cut(&state, NULL);
+    const long long needed = (long long)cut(&state, NULL);
+    *size = needed > OWN_ROOM ? needed : 0;
 }
 
 /* What is kept of a displacement: least, largest and last value, sum of the squares of its distances from `meant` */
@@ -73,8 +77,9 @@ extern "C" __global__ void psa_exact_sets(
     memset(&pace, 0, sizeof pace);
     memset(&kept, 0, sizeof kept);
     state.run = &run;
-    state.held_at = -1;
-    cut(&state, rooms + set * room);
+    for (int i = 0; i < PSA_HELD; ++i) state.held_at[i] = -1;
+    double ladder[OWN_ROOM / sizeof(double)];
+    cut(&state, room > 0 ? rooms + set * room : (char *)ladder);
     int status = set_up(&state);
     state.t = t[0];
     if (status == 0) start_ports(&state, v);

@@ -18,6 +18,11 @@
 #define STILL 1e-9       /* of its nominal size: a driver's way along which nothing can be told */
 #define MOST_UNKNOWNS (EX_NP + EX_NX)
 
+#if PSA_DEVICE
+/* Levels that a thread holds, of 24 kB; all of one length of a small model are 13 */
+#define PSA_HELD ((int)(sizeof(psa_level) < 1536 ? 16 : sizeof(psa_level) < 24576 ? 24576 / sizeof(psa_level) : 1))
+#endif
+
 /* Factors of the matrices' derivatives beside L: inputs and their changes, 1, ports, chords */
 #define TAIL (2 * EX_NU + 1 + 3 * EX_NPORT + EX_NCH * (1 + EX_NDRIVE + 2 * EX_NU + 3 * EX_NFEED))
 
@@ -84,8 +89,8 @@ typedef struct {
     double *lin, *balanced;               /* those of one lane and of the unknown parameters */
     psa_block *terms;                     /* to build a ladder with */
 #if PSA_DEVICE
-    psa_level held;                       /* the last one that was asked for */
-    int held_at;                          /* which of [lengths][finest + 1] it is, -1: none */
+    psa_level held[PSA_HELD];             /* those that were asked for, each at its place */
+    int held_at[PSA_HELD];                /* which of [lengths][finest + 1] they are, -1: none */
 #else
     psa_level *levels;                    /* [lengths][finest + 1] */
     psa_level *mixed;                     /* of lanes whose levels differ; of one parameter's derivatives */

@@ -84,6 +84,22 @@ def test_what_is_kept_of_each_set() -> None:
         assert np.array_equal(thinned, rows[:, ::100])
 
 
+def test_sets_by_the_names_of_parameters() -> None:
+    model = stack("P-885.51")
+    given = sets(model, 5)
+    columns = {name: [values[name] for values in given] for name in given[0]}
+    rows = simulate_many(model, given, record())
+    assert np.array_equal(simulate_many(model, columns, record()), rows)
+    with pytest.raises(InputError, match=r"in arrays of one length; .*k_L \(5,\), n \(1,\)"):
+        simulate_many(model, {"k_L": columns["k_L"], "n": 1.5}, record())
+    with pytest.raises(InputError, match="there are: none"):
+        simulate_many(model, {}, record())
+    with pytest.raises(InputError, match="no parameter 'stiffness'"):
+        simulate_many(model, {"stiffness": [1.0]}, record())
+    with pytest.raises(InputError, match="outside its bounds"):
+        simulate_many(model, {"n": [1.5, -1.0]}, record())
+
+
 def test_uneven_records_run_in_the_stepper() -> None:
     model = stack("P-885.51")
     found = simulate_many(model, [{}, {"k_L": 1.1 * model.values["k_L"]}], record(uneven=True))

@@ -25,8 +25,8 @@ from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 
-#: Memory in which some of nine sets fit at a time.
-SMALL = 400_000
+#: Memory in which some of nine sets' displacements fit at a time.
+SMALL = 100_000
 
 
 @pytest.fixture
@@ -36,7 +36,10 @@ def host(monkeypatch: pytest.MonkeyPatch) -> HostCuda:
 
 
 def test_the_kernel_has_the_bits_of_the_lanes(host: HostCuda) -> None:
-    """Nine sets in batches, whole rows and what is kept of them; squares are summed otherwise."""
+    """Nine sets in batches, whole rows and what is kept of them; squares are summed otherwise.
+
+    The matrices' ladder is a thread's own.
+    """
     model, one = stack("P-885.51"), record()
     given = sets(model, 9)
     rows = simulate_many(model, given, one)
@@ -70,11 +73,12 @@ def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
 
 @slow
 def test_ports_that_feed_back_are_solved_alike(host: HostCuda) -> None:
+    """The matrices' ladder is too large for a thread's own memory."""
     model = stack("P-885.51").with_effect(EFFECTS["load_stiffness"], {"load_gain": 0.02})
     given = sets(model, 3)
     rows = simulate_many(model, given, record())
     np.testing.assert_array_equal(simulate_many(model, given, record(), device="cuda"), rows)
-    assert host.launches
+    assert host.launches[1:] == [128, 128, 128]  # one fits in the memory
 
 
 @pytest.mark.parametrize("effect", ["slow_creep", "structural_mode"])

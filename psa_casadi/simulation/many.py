@@ -30,22 +30,23 @@ _Reduce = Callable[[FloatArray], npt.ArrayLike]
 
 def simulate_many(
     model: Model,
-    sets: Sequence[Mapping[str, float]],
+    sets: Sequence[Mapping[str, float]] | Mapping[str, npt.ArrayLike],
     record: Record,
     *,
     rtol: float = 1e-6,
     reduce: ReductionName | _Reduce | None = None,
     device: Device = "cpu",
 ) -> FloatArray:
-    """Simulate a record under many sets of parameter values (SI units); returns (len(sets), n) [m].
+    """Simulate a record of n samples under m sets of parameter values (SI units): (m, n) [m].
 
-    Each set replaces values of the model. `rtol` is the tolerance of a step over the states' usual
-    sizes; the displacement errs by a few times that of its range. A row has the same bits whatever
-    stands beside it; it is nan from where its set cannot be simulated. Models and records that
-    exact steps do not fit run in the stepper, one after the other.
+    Each set replaces values of the model: one mapping a set, or one mapping of names to the values
+    (m,) that they have in all sets, which takes less time and memory. `rtol` is the tolerance of a
+    step over the states' usual sizes; the displacement errs by a few times that of its range. A row
+    has the same bits whatever stands beside it; it is nan from where its set cannot be simulated.
+    Models and records that exact steps do not fit run in the stepper, one after the other.
 
     `reduce` makes of each displacement (n,) [m] what is kept of it, a number or an array of one
-    shape, and the result is (len(sets), *shape): memory then holds a few displacements at a time,
+    shape, and the result is (m, *shape): memory then holds a few displacements at a time,
     where 10^4 sets of 10^4 samples take 0.8 GB. Several threads call it. By name there are "range",
     "peak" (the largest magnitude), "last" and "misfit" (root mean square of the distance from the
     record's displacement), all in metres.
@@ -55,9 +56,9 @@ def simulate_many(
     whole rows and other functions of them are for fewer sets. It takes models and records that
     exact steps fit.
 
-    Raises InputError for an unknown parameter, a value out of bounds, a model without output, a
-    name that `reduce` does not know, a record without what it needs, or a missing GPU; MachineError
-    where the GPU fails.
+    Raises InputError for an unknown parameter, a value out of bounds, values of unlike numbers, a
+    model without output, a name that `reduce` does not know, a record without what it needs, or a
+    missing GPU; MachineError where the GPU fails.
     """
     output = output_of(model)
     if output is None:
@@ -69,9 +70,9 @@ def simulate_many(
     kept = _named(reduce) if isinstance(reduce, str) else reduce
     meant = _meant(record) if reduce == "misfit" else np.zeros(record.n)
     t, u = record.time - record.time[0], record_inputs(model, record, record.n)
-    work = _Work(
-        model, sets, *_numbers(model, sets), Task(model.structure, output, t, u, meant, rtol)
-    )
+    p = _columns(model, sets) if isinstance(sets, Mapping) else _rows(model, sets)
+    _check_bounds(model, p)
+    work = _Work(model, p, Task(model.structure, output, t, u, meant, rtol))
     if device == "cuda":
         return _on_device(work, kept)
     return _on_cores(work, kept.beside(meant) if isinstance(kept, Reduction) else kept)
@@ -79,22 +80,31 @@ def simulate_many(
 
 @dataclass(frozen=True)
 class _Work:
-    """A task under sets of parameters p (np, m), with the sizes `nominal` (nx, m) of the states."""
+    """A task under sets of parameters p (np, m)."""
 
     model: Model
-    sets: Sequence[Mapping[str, float]]
     p: FloatArray
-    nominal: FloatArray
     task: Task
 
+    @property
+    def count(self) -> int:
+        """Return the number of sets."""
+        return int(self.p.shape[1])
+
     def numbers(self, which: range) -> Numbers:
-        """Return the numbers of some of the sets, with their starts."""
-        p, nominal = (a[:, which.start : which.stop] for a in (self.p, self.nominal))
+        """Return the numbers of some of the sets, with the sizes and the starts of the states."""
+        p = self.p[:, which.start : which.stop]
+        nominal = _sizes(self.model, p)
         return Numbers(p, starts_on(self.model, p, nominal, self.task.t, self.task.u), nominal)
 
+    def alone(self, which: int) -> Model:
+        """Return the model with the values of one set."""
+        names = self.model.parameter_names
+        return self.model.with_values(dict(zip(names, self.p[:, which].tolist(), strict=True)))
 
-def _numbers(model: Model, sets: Sequence[Mapping[str, float]]) -> tuple[FloatArray, FloatArray]:
-    """Return parameters (np, m) and usual sizes of states (nx, m); mistakes are told here.
+
+def _rows(model: Model, sets: Sequence[Mapping[str, float]]) -> FloatArray:
+    """Return parameters (np, m) of one mapping a set.
 
     It is `with_values` for each set, which takes three times as long.
     """
@@ -105,14 +115,43 @@ def _numbers(model: Model, sets: Sequence[Mapping[str, float]]) -> tuple[FloatAr
         if len(merged) > len(known):
             model.with_values(values)  # raises
         p[k] = [merged[name] for name in names]
+    return p.T
+
+
+def _columns(model: Model, sets: Mapping[str, npt.ArrayLike]) -> FloatArray:
+    """Return parameters (np, m) of one mapping of names to the values in all sets."""
+    given = {name: np.atleast_1d(np.asarray(v, dtype=np.float64)) for name, v in sets.items()}
+    lengths = {len(v) for v in given.values() if v.ndim == 1}
+    if len(lengths) != 1 or any(v.ndim != 1 for v in given.values()):
+        told = ", ".join(f"{name} {v.shape}" for name, v in given.items()) or "none"
+        raise InputError(
+            f"Every parameter needs one value for each set, in arrays of one length; there are:"
+            f" {told}. A parameter that all sets share belongs into the model (`with_values`)."
+        )
+    model.with_values({name: model.values.get(name, 0.0) for name in given})  # raises
+    count = lengths.pop()
+    return np.array([
+        given[name] if name in given else np.full(count, model.values[name])
+        for name in model.parameter_names
+    ])  # fmt: skip
+
+
+def _check_bounds(model: Model, p: FloatArray) -> None:
+    """Raise InputError for the first set that has a value out of bounds."""
     low, high = np.array([q.bounds for q in model.structure.parameters]).reshape(-1, 2).T
-    outside = ~np.all((low <= p) & (p <= high), axis=1)
+    outside = ~np.all((low[:, None] <= p) & (p <= high[:, None]), axis=0)
     for k in np.flatnonzero(outside)[:1]:
-        model.with_values(sets[k])  # raises
-    sizes = [s.nominal for s in model.structure.states]
-    given = (dict(zip(names, row, strict=True)) for row in p.tolist())
-    nominal = [[nominal_value(size, values) for size in sizes] for values in given]
-    return p.T, np.array(nominal).reshape(len(sets), len(sizes)).T
+        model.with_values(dict(zip(model.parameter_names, p[:, k].tolist(), strict=True)))  # raises
+
+
+def _sizes(model: Model, p: FloatArray) -> FloatArray:
+    """Return the usual sizes of states (nx, m); a function that several of them have runs once."""
+    names, nominals = model.parameter_names, [s.nominal for s in model.structure.states]
+    unlike = list(dict.fromkeys(nominals))
+    given = (dict(zip(names, row, strict=True)) for row in p.T.tolist())
+    sizes = [[nominal_value(size, values) for size in unlike] for values in given]
+    places = [unlike.index(size) for size in nominals]
+    return np.array(sizes).reshape(p.shape[1], len(unlike)).T[places]
 
 
 def _named(name: str) -> Reduction:
@@ -137,7 +176,7 @@ def _meant(record: Record) -> FloatArray:
 
 def _on_cores(work: _Work, reduce: _Reduce | None) -> FloatArray:
     """Run sets in lanes on all cores, or one by one in the stepper."""
-    task, count, n = work.task, len(work.sets), len(work.task.t)
+    task, count, n = work.task, work.count, len(work.task.t)
     whole = np.empty((count if reduce is None else 0, n))
 
     def kept(rows: FloatArray, which: range) -> list[FloatArray]:
@@ -155,7 +194,7 @@ def _on_cores(work: _Work, reduce: _Reduce | None) -> FloatArray:
         return kept(found.T, which)
 
     def alone(which: range) -> list[FloatArray]:
-        one = work.model.with_values(work.sets[which.start])
+        one = work.alone(which.start)
         way = Way(task.tolerance, task.tolerance, stepped=True)
         try:
             x0 = start_on(one, task.t, task.u).x
@@ -174,7 +213,7 @@ def _on_cores(work: _Work, reduce: _Reduce | None) -> FloatArray:
 
 def _on_device(work: _Work, reduce: Reduction | _Reduce | None) -> FloatArray:
     """Run sets on a GPU, one a thread."""
-    count, n = len(work.sets), len(work.task.t)
+    count, n = work.count, len(work.task.t)
     found: list[FloatArray] = [np.empty((0, n))] if reduce is None else []
     named = isinstance(reduce, Reduction)
     parts = partial(_parts, count)

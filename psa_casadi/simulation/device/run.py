@@ -150,7 +150,7 @@ class _Launch:
         """Launch the kernel for a batch; return the summary (4, m) and (n, m) on the device."""
         cupy, task, sets, n = self._cupy, self._task, numbers.p.shape[1], len(self._task.t)
         if self._rooms is None:  # the first batch is the largest
-            self._rooms = cupy.empty(sets * self._room, np.int8)
+            self._rooms = cupy.empty(max(1, sets * self._room), np.int8)
         summary = cupy.empty((4, sets))
         shown = cupy.empty((n, sets)) if self._whole else np.intp(0)  # NULL
         self._kernels.get_function("psa_exact_sets")(
