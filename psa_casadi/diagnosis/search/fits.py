@@ -29,6 +29,8 @@ from psa_casadi.simulation.side_by_side import side_by_side
 #: so many of one effect, and of any; there the gain begins at so many ordinary sizes.
 _BESIDE, _AFRESH = 12, 17
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
+#: Shares of their gains with which the causes begin that are left without another.
+_SHARES = (1.0, 0.3, 0.0)
 #: Tolerance of stepper and fit, and evaluations, to the end.
 _POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
 
@@ -190,17 +192,22 @@ def without(
 ) -> Hypothesis | None:
     """Fit without a cause from where the whole has led; None where that cannot be simulated.
 
-    It ends early where it will leave more than what is `known` without the cause.
+    Causes that hold each other may have no rest one without the other: then their gains begin at
+    less. It ends early where it will leave more than what is `known` without the cause.
     """
     least = known.fit.rms if known is not None else np.inf
     model = whole.fit.model.without([cause.name])
     names = [n for n in whole.fit.unknowns.names if n in model.values]
-    try:
-        found = refit(replace(whole.fit, model=model), experiments, names, least=least)
-    except PsaError:
-        return None
     causes = [c for c in whole.causes if c is not cause]
-    return hypothesis(causes, found, experiments, final=True)
+    gains = [c.gain for c in causes if c.gain]
+    for share in _SHARES:
+        start = model.with_values({n: share * model.values[n] for n in gains})
+        try:
+            found = refit(replace(whole.fit, model=start), experiments, names, least=least)
+        except PsaError:
+            continue
+        return hypothesis(causes, found, experiments, final=True)
+    return None
 
 
 def together(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
