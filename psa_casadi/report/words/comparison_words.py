@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 
+from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import BudgetShare, Finding
 from psa_casadi.population.parameters import Estimates, display_unit
 from psa_casadi.report.words.phrases import Scale, handy_scale, listing, number, percent, plain
 from psa_casadi.report.words.population_words import p_text
 from psa_casadi.report.words.tables import Table
-from psa_casadi.report.words.verdict_words import VERDICTS, within
+from psa_casadi.report.words.verdict_words import VERDICTS
 from psa_casadi.units import convert
 
 
@@ -87,10 +88,7 @@ def budget_table(findings: Sequence[Finding]) -> Table:
 
 
 def _share_text(s: BudgetShare | None) -> str:
-    if s is None:
-        return ""
-    share, low, high = (within(v) for v in (s.share, *s.interval))
-    return f"{percent(share)} ({100 * low:.0f} to {100 * high:.0f} %)"
+    return "" if s is None else Share(s.what, s.share, s.interval).text
 
 
 def difference_table(findings: Sequence[Finding], rows: Sequence[Difference]) -> Table:
