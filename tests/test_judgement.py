@@ -33,7 +33,9 @@ def test_little_is_not_named_beside_much() -> None:
 
 def test_the_largest_cause_is_always_named() -> None:
     assert too_small([_share("slow_creep", 0.04)]) == ()
-    assert too_small([_share("slow_creep", 0.04), _share("drift", 0.03)])[0].what == "drift"
+    assert too_small([_share("slow_creep", 0.04), _share("drift", 0.02)])[0].what == "drift"
+    assert too_small([_share("slow_creep", 0.04), _share("drift", 0.035)]) == ()  # as good
+    assert len(too_small([_share("slow_creep", -0.01), _share("drift", -0.03)])) == 1
     assert too_small([]) == ()
 
 

@@ -114,7 +114,8 @@ def rivals(probability: Mapping[str, float], cause: str) -> tuple[str, ...]:
 def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
     """Return causes that are not named where structure remains: the form of the others is wrong.
 
-    Each removes less of the base's excess than a form may miss. The largest is always named.
+    Each removes less of the base's excess than a form may miss, and less than `enough` of what the
+    largest does: that one is always named.
     """
     least = least_share([c.share for c in causes])
     return tuple(c for c in causes if c.share < least)
@@ -122,7 +123,8 @@ def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
 
 def least_share(shares: Collection[float]) -> float:
     """Return the share of the base's excess from which on a cause is named beside others."""
-    return min(thresholds().form, max(shares, default=0.0))
+    most = max(shares, default=0.0)
+    return min(thresholds().form, thresholds().enough * most if most > 0.0 else most)
 
 
 def withdrawn_names(

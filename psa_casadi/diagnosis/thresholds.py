@@ -38,7 +38,7 @@ class Thresholds:
       91 to 94 %.
     * `form`: share by which a form may miss a contribution: a correction that imitates all but so
       much of the causes is the same explanation; and where structure remains, a further cause that
-      removes less is in the model and not named.
+      removes less, and less than `enough` of what the largest does, is in the model and not named.
     * `held_out`: gain in log-likelihood that held-out samples must show, and all samples together.
     * `most_causes`: of one hypothesis.
     * `ringing`: a resonance near the band is tried where its ringing explains this share of what

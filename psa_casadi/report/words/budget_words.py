@@ -1,5 +1,6 @@
 """The error budget and the unnamed correction in words and as a table."""
 
+from psa_casadi.diagnosis.budget import Budget
 from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Diagnosis
@@ -31,8 +32,7 @@ def budget_sentence(d: Diagnosis, scale: Scale) -> str:
         return ""
     parts = [f"of {scale.text(b.excess_rms_m)} rms above the noise"]
     if added(d):
-        each = [f"{plain(c.what)} removes {c.text}" for c in b.causes]
-        parts.append(listing(each))
+        parts.append(_removed(b))
     if b.unnamed is not None and d.patch is not None:
         more = "a further" if added(d) else "of it"
         parts.append(
@@ -42,6 +42,18 @@ def budget_sentence(d: Diagnosis, scale: Scale) -> str:
         left = f"{scale.text(b.remains_rms_m)} ({number(b.remains_percent, 2)} % of the range)"
         parts.append(f"above the noise the extended model leaves {left}")
     return "; ".join(parts)
+
+
+def _removed(b: Budget) -> str:
+    """Say what the causes remove; where they stand in for each other, what they do together."""
+    each = listing([f"{plain(c.what)} removes {c.text}" for c in b.causes])
+    if sum(c.share for c in b.causes) > 0.5 * b.together.share:
+        return each
+    names = listing([plain(c.what) for c in b.causes])
+    return (
+        f"{names} together remove {b.together.text}; each can do most of what another does, so that"
+        f" beside the others {each}"
+    )
 
 
 def budget_table(d: Diagnosis, scale: Scale) -> Table:

@@ -100,7 +100,9 @@ def _cause(d: Diagnosis, cause: Cause) -> str:
 def _rivals(d: Diagnosis, cause: Cause) -> str:
     """Return what a cause cannot be told from, else the next most probable effect of the first."""
     known = {c.effect: c.probability for c in d.candidates}
-    first = cause is d.causes[0]  # the candidates are those of the first step
+    # the candidates are those of the first step, whose cause may be without a name
+    steps = [c.what for c in d.budget.causes] if d.budget is not None else []
+    first = cause.effect == (steps or [d.causes[0].effect])[0]
     if cause.cannot_be_told_from:
         rivals = [
             f"{plain(n)} ({probability_text(known[n])})" if first and known.get(n) else plain(n)
