@@ -94,6 +94,24 @@ def test_an_effect_without_a_name_is_said_to_be_in_the_extended_model(tmp_path: 
     assert diagnosis("cause_named").kept == ()
 
 
+def test_causes_that_stand_in_for_each_other_are_told_together() -> None:
+    """The first of them has no name; the probabilities of rivals are those of its step."""
+    whole = Share("together", 0.97, (0.92, 1.0))
+    each = (Share("hysteresis_memory", 0.04, (0.01, 0.07)), Share("slow_creep", 0.05, (0.0, 0.1)))
+    d = diagnosis("ambiguous")
+    lines = told(replace(d, budget=Budget(4e-8, 5e-9, whole, each, None, 7e-9, 0.04)))
+    assert (
+        "hysteresis memory and slow creep together remove 97 % (92 to 100 %); each can do most of"
+        " what another does, so that beside the others hysteresis memory removes 4 % (1 to 7 %) and"
+        " slow creep removes 5 % (0 to 10 %)"
+    ) in lines["budget"]
+    assert lines["rivals"].endswith("cannot distinguish it from offset drift")
+    alone = replace(each[1], share=0.6)
+    lines = told(replace(d, budget=Budget(4e-8, 5e-9, whole, (alone,), None, 7e-9, 0.04)))
+    assert "together" not in lines["budget"]
+    assert lines["rivals"].endswith("cannot distinguish it from offset drift (8 %)")
+
+
 def _names(figure: dict[str, object]) -> list[str]:
     rows = figure.get("data", [])
     assert isinstance(rows, list)
