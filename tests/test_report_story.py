@@ -112,6 +112,14 @@ def test_causes_that_stand_in_for_each_other_are_told_together() -> None:
     assert lines["rivals"].endswith("cannot distinguish it from offset drift (8 %)")
 
 
+def test_of_many_rivals_five_are_named() -> None:
+    d = diagnosis("ambiguous")
+    many = tuple(f"effect_{k}" for k in range(9))
+    lines = told(replace(d, causes=(replace(d.causes[0], cannot_be_told_from=many),)))
+    assert lines["rivals"].endswith("effect 3, effect 4 or 4 more")
+    assert "slow creep, effect 0, effect 1, effect 2, effect 3 or 5 more" in lines["verdict"]
+
+
 def _names(figure: dict[str, object]) -> list[str]:
     rows = figure.get("data", [])
     assert isinstance(rows, list)

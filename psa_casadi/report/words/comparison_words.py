@@ -6,7 +6,15 @@ from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import BudgetShare, Finding
 from psa_casadi.population.parameters import Estimates, display_unit
-from psa_casadi.report.words.phrases import Scale, handy_scale, listing, number, percent, plain
+from psa_casadi.report.words.phrases import (
+    MOST_NAMES,
+    Scale,
+    handy_scale,
+    listing,
+    number,
+    percent,
+    plain,
+)
 from psa_casadi.report.words.population_words import p_text
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import VERDICTS
@@ -67,10 +75,9 @@ def _verdict_row(f: Finding, scale: Scale) -> tuple[str, ...]:
 
 def causes_text(f: Finding) -> str:
     """Return the named causes with their confidence, rivals joined by "or"."""
-    told = [
-        f"{plain(' or '.join((c.effect, *c.or_else)))} ({percent(c.confidence)})" for c in f.causes
-    ]
-    return listing(told)
+    each = [listing([c.effect, *c.or_else], "or", most=MOST_NAMES) for c in f.causes]
+    told = zip(each, f.causes, strict=True)
+    return listing([f"{plain(names)} ({percent(c.confidence)})" for names, c in told])
 
 
 def budget_table(findings: Sequence[Finding]) -> Table:

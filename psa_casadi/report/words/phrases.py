@@ -161,8 +161,14 @@ def plain(name: str) -> str:
     return name.replace("_", " ")
 
 
-def listing(words: Sequence[str], joint: str = "and") -> str:
-    """Return "a, b and c"."""
+#: Effects that a sentence names of those that it is about.
+MOST_NAMES = 5
+
+
+def listing(words: Sequence[str], joint: str = "and", *, most: int | None = None) -> str:
+    """Return "a, b and c", or "a, b and 7 more" of more words than `most`."""
+    if most is not None and len(words) > most:
+        return f"{', '.join(words[:most])} {joint} {len(words) - most} more"
     if len(words) < 2:
         return "".join(words)
     return f"{', '.join(words[:-1])} {joint} {words[-1]}"

@@ -16,6 +16,7 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
+    MOST_NAMES,
     Scale,
     length_scale,
     listing,
@@ -40,8 +41,6 @@ if TYPE_CHECKING:  # which take long to load
     from psa_casadi.export.check.check import CheckReport
 
 _LABEL = 10
-#: Blind spots that a terminal names.
-_NAMES = 5
 #: Where the first sentence of a note ends; how a sentence on a view ends.
 _FIRST = re.compile(r"(?<=\.) ")
 _EXPLAINS = re.compile(r"; this(?: view)? explains (\d+ %) of the excess(?=\.)")
@@ -108,7 +107,7 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
             f"{plain(n)} ({probability_text(known[n])})" if first and known.get(n) else plain(n)
             for n in cause.cannot_be_told_from
         ]
-        return f"these data cannot distinguish it from {listing(rivals, 'or')}"
+        return f"these data cannot distinguish it from {listing(rivals, 'or', most=MOST_NAMES)}"
     named = {c.effect for c in d.causes}
     others = [(p, n) for n, p in known.items() if n not in named]
     if not others or not first:
@@ -122,8 +121,7 @@ def _blind(d: Diagnosis) -> str:
     names = [plain(b.effect) for b in blindest(d)]
     if not names:
         return "no effect of ordinary size in the table"
-    more = f" and {len(names) - _NAMES} more" if len(names) > _NAMES else ""
-    return f"{', '.join(names[:_NAMES])}{more}" if more else listing(names)
+    return listing(names, most=MOST_NAMES)
 
 
 def identification_text(
