@@ -106,6 +106,10 @@ def test_causes_that_stand_in_for_each_other_are_told_together() -> None:
         " slow creep removes 5 % (0 to 10 %)"
     ) in lines["budget"]
     assert lines["rivals"].endswith("cannot distinguish it from offset drift")
+    adds = Share("slow_creep", -0.1, (-0.2, 0.0))  # on held-out samples
+    for none in ((adds,), (adds, adds)):
+        lines = told(replace(d, budget=Budget(4e-8, 5e-9, adds, none, None, 4e-8, 0.2)))
+        assert "together" not in lines["budget"]
     alone = replace(each[1], share=0.6)
     lines = told(replace(d, budget=Budget(4e-8, 5e-9, whole, (alone,), None, 7e-9, 0.04)))
     assert "together" not in lines["budget"]

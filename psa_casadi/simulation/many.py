@@ -71,8 +71,8 @@ def simulate_many(
     meant = _meant(record) if reduce == "misfit" else np.zeros(record.n)
     t, u = record.time - record.time[0], record_inputs(model, record, record.n)
     p = _columns(model, sets) if isinstance(sets, Mapping) else _rows(model, sets)
-    _check_bounds(model, p)
     work = _Work(model, p, Task(model.structure, output, t, u, meant, rtol))
+    _check_bounds(work)
     if device == "cuda":
         return _on_device(work, kept)
     return _on_cores(work, kept.beside(meant) if isinstance(kept, Reduction) else kept)
@@ -136,12 +136,12 @@ def _columns(model: Model, sets: Mapping[str, npt.ArrayLike]) -> FloatArray:
     ])  # fmt: skip
 
 
-def _check_bounds(model: Model, p: FloatArray) -> None:
+def _check_bounds(work: _Work) -> None:
     """Raise InputError for the first set that has a value out of bounds."""
-    low, high = np.array([q.bounds for q in model.structure.parameters]).reshape(-1, 2).T
-    outside = ~np.all((low[:, None] <= p) & (p <= high[:, None]), axis=0)
+    bounds = np.array([q.bounds for q in work.task.structure.parameters]).reshape(-1, 2, 1)
+    outside = ~np.all((bounds[:, 0] <= work.p) & (work.p <= bounds[:, 1]), axis=0)
     for k in np.flatnonzero(outside)[:1]:
-        model.with_values(dict(zip(model.parameter_names, p[:, k].tolist(), strict=True)))  # raises
+        work.alone(int(k))  # raises
 
 
 def _sizes(model: Model, p: FloatArray) -> FloatArray:

@@ -201,8 +201,8 @@ def without(
     causes = [c for c in whole.causes if c is not cause]
     gains = [c.gain for c in causes if c.gain]
     for share in _SHARES:
-        start = model.with_values({n: share * model.values[n] for n in gains})
         try:
+            start = model.with_values({n: share * model.values[n] for n in gains})
             found = refit(replace(whole.fit, model=start), experiments, names, least=least)
         except PsaError:
             continue

@@ -10,7 +10,7 @@ from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.finding_plots import evidence_plot
 from psa_casadi.report.plots.signature_figure import size_sentence
 from psa_casadi.report.plots.view_plots import signature_plot, view_named
-from psa_casadi.report.words.phrases import MOST_NAMES, listing, percent, plain
+from psa_casadi.report.words.phrases import either, percent, plain
 from psa_casadi.report.words.verdict_words import alternative_sentence, cause_size
 
 #: Causes whose signatures are drawn.
@@ -51,9 +51,9 @@ def add_evidence_of_all(
 def add_rivals(page: Document, cause: Cause | PortCause) -> None:
     """Say what a named cause cannot be told from, if there is anything."""
     if cause.cannot_be_told_from:
-        names = [plain(n) for n in cause.cannot_be_told_from]
-        rivals = listing(names, "or", most=MOST_NAMES)
-        page.paragraph(f"These data cannot distinguish it from {rivals}.")
+        page.paragraph(
+            f"These data cannot distinguish it from {either(cause.cannot_be_told_from)}."
+        )
 
 
 def add_causes(page: Document, d: Diagnosis) -> None:

@@ -47,7 +47,8 @@ def budget_sentence(d: Diagnosis, scale: Scale) -> str:
 def _removed(b: Budget) -> str:
     """Say what the causes remove; where they stand in for each other, what they do together."""
     each = listing([f"{plain(c.what)} removes {c.text}" for c in b.causes])
-    if sum(c.share for c in b.causes) > 0.5 * b.together.share:
+    alone = sum(c.share for c in b.causes)
+    if len(b.causes) < 2 or b.together.share <= 0.0 or alone > 0.5 * b.together.share:
         return each
     names = listing([plain(c.what) for c in b.causes])
     return (

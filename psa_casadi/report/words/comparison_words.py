@@ -7,8 +7,8 @@ from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import BudgetShare, Finding
 from psa_casadi.population.parameters import Estimates, display_unit
 from psa_casadi.report.words.phrases import (
-    MOST_NAMES,
     Scale,
+    either,
     handy_scale,
     listing,
     number,
@@ -75,9 +75,8 @@ def _verdict_row(f: Finding, scale: Scale) -> tuple[str, ...]:
 
 def causes_text(f: Finding) -> str:
     """Return the named causes with their confidence, rivals joined by "or"."""
-    each = [listing([c.effect, *c.or_else], "or", most=MOST_NAMES) for c in f.causes]
-    told = zip(each, f.causes, strict=True)
-    return listing([f"{plain(names)} ({percent(c.confidence)})" for names, c in told])
+    told = [f"{either((c.effect, *c.or_else))} ({percent(c.confidence)})" for c in f.causes]
+    return listing(told)
 
 
 def budget_table(findings: Sequence[Finding]) -> Table:

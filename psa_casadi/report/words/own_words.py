@@ -9,7 +9,7 @@ from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
-    MOST_NAMES,
+    either,
     listing,
     number,
     percent,
@@ -106,8 +106,7 @@ def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
     for c in d.causes:
         lines.append(("cause", f"{_cause(c)}: {cause_size(d, c)}"))
         if c.cannot_be_told_from:
-            names = [plain(n) for n in c.cannot_be_told_from]
-            rivals = listing(names, "or", most=MOST_NAMES)
+            rivals = either(c.cannot_be_told_from)
             lines.append(("rivals", f"these data cannot distinguish it from {rivals}"))
     return [*lines, ("remains", rest_sentence(d)), *(("note", n) for n in d.notes)]
 

@@ -174,6 +174,11 @@ def listing(words: Sequence[str], joint: str = "and", *, most: int | None = None
     return f"{', '.join(words[:-1])} {joint} {words[-1]}"
 
 
+def either(effects: Sequence[str]) -> str:
+    """Return effects of which the data leave open which it is, as words."""
+    return listing([plain(name) for name in effects], "or", most=MOST_NAMES)
+
+
 def with_unit(text: str, unit: str) -> str:
     """Return a number's text with its unit; "1" is no unit to a reader."""
     return text if unit == "1" else f"{text} {unit}"

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
 from psa_casadi.report.words.phrases import (
-    MOST_NAMES,
+    either,
     interval_text,
     length_scale,
     listing,
@@ -90,8 +90,7 @@ def naming_sentence(
     """
     if d.verdict == "ambiguous":
         first = d.causes[0]
-        names = [plain(n) for n in (first.effect, *first.cannot_be_told_from)]
-        rivals = listing(names, "or", most=MOST_NAMES)
+        rivals = either((first.effect, *first.cannot_be_told_from))
         together = listing([plain(c.effect) for c in d.causes])
         return (
             f"Something is missing, and these data do not decide whether it is {rivals}; with"
