@@ -15,7 +15,7 @@ from psa_casadi.identification.fitting.minimum import objective
 from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
-from psa_casadi.identification.search.multistart import free_parameters
+from psa_casadi.identification.search.multistart import fit_base, free_parameters
 from psa_casadi.identification.search.refitting import same_place
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
@@ -208,10 +208,7 @@ def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> No
     wrong[lead] += 40.0 * SIGMA * np.linspace(-1.0, 1.0, int(lead.sum()))
     experiments = divided(records[:2], [replace(held, displacement=wrong)])
     found = fitted(model, experiments)
-    shared = found.predicted(experiments)[2]
-    own = predict(
-        found.model, experiments, found.unknowns, found.theta, way=found.way, everything=True
-    )[2].displacement
+    shared, own = found.predicted(experiments)[2], _from_its_own_beginning(found, experiments[2])
     truth = np.asarray(held.displacement)[~lead]
     errors = [float(np.std(x[~lead] - truth)) for x in (shared, own)]
     assert errors[0] < 1.1 * SIGMA < 2.0 * SIGMA < errors[1]
@@ -219,11 +216,34 @@ def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> No
     other = record_of(model, 5)
     apart = divided(records[:2], [replace(other, voltage=other.voltage + 5.0)])
     elsewhere = fitted(model, apart)
-    plain = predict(
-        elsewhere.model, apart, elsewhere.unknowns, elsewhere.theta, way=elsewhere.way,
-        everything=True,
-    )  # fmt: skip
-    np.testing.assert_array_equal(elsewhere.predicted(apart)[2], plain[2].displacement)
+    plain = _from_its_own_beginning(elsewhere, apart[2])
+    np.testing.assert_allclose(elsewhere.predicted(apart)[2], plain, rtol=0, atol=0.1 * SIGMA)
+
+
+def _from_its_own_beginning(found: Fit, held: Experiment) -> FloatArray:
+    """The prediction of a record whose start and offset are fitted to its first tenth."""
+    lead = Experiment(held.record, held.known, held.held_out)
+    return fit(found.model, [lead], [], sigma=[SIGMA]).predicted([lead])[0]
+
+
+def test_no_fit_sees_a_sample_of_a_record_that_is_held_out() -> None:
+    """Not of its beginning either, which only finds where its prediction begins."""
+    model = model_with()
+    records = [record_of(model, seed) for seed in (1, 2, 3)]
+    nonsense = np.random.default_rng(4).standard_normal(records[2].n)
+    sampled = replace(records[2], time=0.1 * records[2].time)
+    others = [replace(sampled, displacement=1e-4 * nonsense), records[2]]
+    fits = [fitted(model, divided(records[:2], [held])) for held in others]
+    alone = fitted(model, [whole(r) for r in records[:2]])
+    count = alone.unknowns.size
+    for found in fits:
+        np.testing.assert_allclose(found.theta[:count], alone.theta, rtol=1e-6)
+        np.testing.assert_allclose(found.residuals, alone.residuals, rtol=0, atol=1e-6 * SIGMA)
+        assert not np.any(found.theta[count:])
+        assert not np.any(found.jacobian[:, count:])
+    # nor does the search for where a fit begins
+    bases = [fit_base(model, divided(records[:2], [held])) for held in others]
+    assert bases[0].model.values == bases[1].model.values
 
 
 def test_a_trial_whose_numbers_overflow_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:

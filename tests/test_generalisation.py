@@ -91,15 +91,14 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
             for k, e in enumerate(errors)
         ]
         experiments = divided(records[:1], [records[1].slice(0, samples)])
-        lead = experiments[1].used
+        lead = experiments[1].known
         offset = float(np.mean(errors[1][:samples][lead]))
-        used = [errors[0], errors[1][:samples][lead] - offset]
-        sigma = tuple(float(np.std(u)) for u in used)
-        seen = replace(found, residuals=np.concatenate(used), sigma=sigma)
+        sigma = tuple(float(np.std(e)) for e in errors)
+        seen = replace(found, residuals=errors[0], sigma=sigma)
         predicted = (clean, clean[:samples] + offset)
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)
-        colour = colour_of(seen.residuals, [len(u) for u in used])
+        colour = colour_of(seen.residuals, [SAMPLES, 0])
         told.append(held_out_excess(seen, experiments, predicted, colour, noise).factor)
     assert told == [1.0] * 25
 

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.any_model.beginnings import begun
 from psa_casadi.any_model.coordinates import coordinates_of
 from psa_casadi.any_model.predict import STEP_RTOL, output_of, shown_by
 from psa_casadi.any_model.runs import Run, measured_spans
@@ -220,6 +221,7 @@ class _Problem:
         return (residual, jacobian) if finite else None
 
     def fit(self, found: Minimum, zeros: tuple[str, ...], known_start: bool) -> OdeFit:
+        model = self.model.with_values(self.unknowns.values(found.theta))
         spans, outputs, first = measured_spans(self.runs), [], 0
         for j, level in zip(self.places, self.levels, strict=True):
             runs = tuple(k for i, k in self.tasks if i == j)
@@ -239,9 +241,11 @@ class _Problem:
                 )
             )
         return OdeFit(
-            model=self.model.with_values(self.unknowns.values(found.theta)),
+            model=model,
             unknowns=self.unknowns,
-            theta=found.theta,
+            theta=begun(
+                model, self.runs, self.unknowns, found.theta, self.places, self.levels, self.rtol
+            ),
             outputs=tuple(outputs),
             cost=found.cost,
             converged=found.converged,

@@ -197,9 +197,9 @@ def seen_starts(model: Model, runs: Sequence[Run]) -> list[dict[str, float]]:
     ]
     found = []
     for run in runs:
-        own = {}
+        own, known = {}, run.of_beginning() if run.held_out_whole else run
         for j, k in shown:
-            valid = np.flatnonzero(run.fitted(j))
+            valid = np.flatnonzero(known.fitted(j))
             if valid.size:
                 declared = model.structure.states[k].start
                 own[names[k]] = float(run.outputs[valid[0], j]) - declared

@@ -54,7 +54,7 @@ def judged(known: Known) -> OdeDiagnosis:
     more = not left[best.names].white
     verdict = verdict_by(
         missing=not left[root.names].white or bool(best.causes),
-        withdrawn=bool(beaten) or few or not best.causes or (more and not own.enough),
+        withdrawn=bool(beaten) or few or not best.causes or (last.test.alarm and not own.enough),
         ambiguous=any(rivals(told[c.name], c.name) for c in best.causes[:1]),
         more=more,
     )

@@ -4,11 +4,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.any_model.fit import OdeFit, measured_outputs, refitted
+from psa_casadi.any_model.predict import shown_by
 from psa_casadi.any_model.runs import Run, noise_share
 from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, uncertain
 from psa_casadi.records.quality.noise import first_order_noise
+
+FloatArray = npt.NDArray[np.float64]
 
 #: Noise is estimated from so many samples or more, and differs from so many standard errors on.
 _TELLING, _SURE = 32, 3.0
@@ -36,11 +40,14 @@ def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
     """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
 
     Of every output, over the usual one of all experiments (the geometric mean by samples). A share
-    that cannot be told from 1 is 1.
+    that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
     """
     shares = [r.noise.copy() for r in runs]
+    beginnings = _beginnings(fit, runs)
     for o in fit.outputs:
-        found = [(k, p) for k, p in zip(o.runs, o.parts, strict=True) if len(p) >= _TELLING]
+        fitted = zip(o.runs, o.parts, strict=True)
+        begun = ((k, _at(r, e, o.index)) for k, r, e in beginnings)
+        found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
         if len(found) < 2:
             continue
         noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in found]
@@ -49,6 +56,23 @@ def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
             if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
                 shares[k][o.index] *= float(np.exp(own))
     return tuple(replace(r, noise=share) for r, share in zip(runs, shares, strict=True))
+
+
+def _beginnings(fit: OdeFit, runs: Sequence[Run]) -> list[tuple[int, Run, FloatArray]]:
+    """Return the held-out experiments' beginnings, with measured minus predicted over the noise."""
+    found = []
+    for k, run in enumerate(runs):
+        if run.held_out_whole:
+            begun = run.of_beginning()
+            shown = shown_by(fit.model, begun, fit.starts()[k], begun.stop, fit.rtol, fit.zeros)
+            found.append((k, begun, (run.outputs[: begun.stop] - shown) / run.noise))
+    return found
+
+
+def _at(run: Run, errors: FloatArray, output: int) -> FloatArray:
+    """Return the errors of an output where it was measured."""
+    found: FloatArray = errors[run.fitted(output)[: run.stop], output]
+    return found
 
 
 def unlike(runs: Sequence[Run], others: Sequence[Run]) -> bool:

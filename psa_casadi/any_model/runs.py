@@ -1,7 +1,7 @@
 """The experiments that a model is fitted to: inputs, outputs, what is used and what is held out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -42,8 +42,17 @@ class Run:
 
     @cached_property
     def stop(self) -> int:
-        """One past the last used sample: a fit need not simulate further."""
-        return int(np.flatnonzero(self.used)[-1]) + 1
+        """One past the last used sample: a fit need not simulate further; 0 without any."""
+        return int(np.max(np.flatnonzero(self.used), initial=-1)) + 1
+
+    @property
+    def held_out_whole(self) -> bool:
+        """Whether no sample is fitted; the first tenth, which is not judged, finds the start."""
+        return bool(self.held_out.any() and not self.used.any())
+
+    def of_beginning(self) -> "Run":
+        """Return the experiment with the samples before the judged ones as those to fit."""
+        return replace(self, used=np.arange(len(self.used)) < np.argmax(self.held_out))
 
     def fitted(self, output: int) -> BoolArray:
         """True where an output is measured and fitted, shape (n,)."""

@@ -38,6 +38,7 @@ CHARGE_LEAKAGE = Component(
     ),
     states=(State("leak_voltage", "V", "part that leaks away", voltage_scale, memory=True),),
     equations=_equations,
+    finite_step=(1.0, 100.0),  # plain leakage takes the whole charge: far from a derivative at 0
     probe={"leak_time": (0.3, 3.0, 30.0)},
     looks_like="droop back after every step, exponential in time; less stroke at low frequencies",
 )

@@ -8,7 +8,6 @@ import numpy.typing as npt
 from psa_casadi.identification.certainty.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import OUTPUT, measured, record_start
-from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import (
     Covariance,
@@ -73,7 +72,7 @@ def _runs(
     predicted: Sequence[FloatArray],
     factors: Sequence[int],
 ) -> tuple[RecordRun, ...]:
-    theta, _ = shared_starts(fit.model, fit.unknowns, fit.theta, experiments)
+    theta = fit.placed(experiments)
     runs = []
     for k, (e, y, factor) in enumerate(zip(experiments, predicted, factors, strict=True)):
         x0 = record_start(fit.model, e.record, fit.unknowns.start(theta, k))
@@ -86,7 +85,7 @@ def _runs(
                 offset_m=float(y[0]) - _shown(fit.model, e.record, x0),
                 samples=e.record.n,
                 averaged=factor,
-                fitted_m=_rms(errors[e.used]),
+                fitted_m=_rms(errors[e.known]),
                 held_out_m=_rms(errors[e.held_out]) if held else None,
                 held_out=tuple(zip(*(k.tolist() for k in runs_of(e.held_out)), strict=True)),
             )

@@ -34,8 +34,9 @@ class Level:
 class Experiment:
     """A record with the samples that count for a fit (`used`) and those held out for judging it.
 
-    `further` are the columns beside the displacement that are fitted as well; the same in all
-    experiments of a fit, whether a record has them or not.
+    A record that is held out whole has no used ones: see `judging`. `further` are the columns
+    beside the displacement that are fitted as well; the same in all experiments of a fit, whether a
+    record has them or not.
     """
 
     record: Record
@@ -45,18 +46,38 @@ class Experiment:
 
     @property
     def held_out_whole(self) -> bool:
-        """Whether the record is held out, but for a beginning that finds its offset."""
-        return bool(np.count_nonzero(self.held_out) > np.count_nonzero(self.used))
+        """Whether no sample of the record is fitted; what comes before finds where it begins."""
+        return bool(self.held_out.any() and not self.used.any())
+
+    @property
+    def known(self) -> BoolArray:
+        """The samples that are not held out: the used ones, or those that find the beginning."""
+        found: BoolArray = self.record.mask & ~self.held_out
+        return found
 
     @property
     def stop(self) -> int:
-        """One past the last used sample: a fit need not simulate further."""
-        return int(np.flatnonzero(self.used)[-1]) + 1
+        """One past the last used sample: a fit need not simulate further; 0 without any."""
+        return int(np.max(np.flatnonzero(self.used), initial=-1)) + 1
 
 
 def whole(record: Record) -> Experiment:
     """Return the experiment that uses every valid sample of a record and holds out none."""
     return Experiment(record, record.mask, np.zeros(record.n, dtype=bool))
+
+
+def judging(record: Record) -> Experiment:
+    """Return the experiment that is held out whole: no fit sees a sample of it.
+
+    Its first tenth is not judged: it finds the record's offset, and its memory.
+    """
+    lead = np.arange(record.n) < max(8, record.n // 10)
+    return Experiment(record, np.zeros(record.n, dtype=bool), record.mask & ~lead)
+
+
+def fitted(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Return the experiments that have samples to fit."""
+    return [e for e in experiments if not e.held_out_whole]
 
 
 def split(record: Record) -> Experiment:
@@ -138,12 +159,8 @@ def in_one_order(records: Iterable[Record]) -> list[Record]:
 def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Experiment, ...]:
     """Return the experiments of records and held-out ones; without these every record is `split`.
 
-    The first tenth of a held-out record only serves to find its offset and memory.
+    The held-out ones (`judging`) come last.
     """
     if not holdout:
         return tuple(split(r) for r in records)
-    held = []
-    for record in holdout:
-        lead = np.arange(record.n) < max(8, record.n // 10)
-        held.append(Experiment(record, record.mask & lead, record.mask & ~lead))
-    return (*(whole(r) for r in records), *held)
+    return (*(whole(r) for r in records), *(judging(r) for r in holdout))

@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out.errors import Gain, gain_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.read.reading import read_record
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, judging
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate_record
 from tests.benchmarks.hidden_cases import ORDINARY
@@ -112,13 +112,12 @@ def _play(truth: Truth, seed: int, path: Path, models: tuple[Model, Model]) -> _
     """Play the device again and predict it with both models, the offset from the first tenth."""
     play_again(truth, seed, path)
     record = read_record(path)
-    lead = np.arange(record.n) < record.n // 10
-    experiment = Experiment(record, record.mask & lead, record.mask & ~lead)
+    experiment = judging(record)
     y = np.asarray(record.displacement)
     predicted = []
     for model in models:
         moved = simulate_record(model, record).displacement
-        predicted.append(moved + float(np.mean((y - moved)[experiment.used])))
+        predicted.append(moved + float(np.mean((y - moved)[experiment.known])))
     return experiment, predicted[0], predicted[1]
 
 

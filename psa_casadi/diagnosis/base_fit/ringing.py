@@ -23,7 +23,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.search.force_start import force_of
 from psa_casadi.records.quality.filtering import filtered
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -72,8 +72,10 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     The residual is whitened by its own autoregression, so that a tone has to follow the force to
     count: one that is there all the time is taken for colour.
     """
-    interval = min(e.record.sample_time for e in experiments)
-    forces = [_force(fit, k, e, interval) for k, e in enumerate(experiments)]
+    interval = min(e.record.sample_time for e in fitted(experiments))
+    forces = [
+        None if e.held_out_whole else _force(fit, k, e, interval) for k, e in enumerate(experiments)
+    ]
     if all(f is None for f in forces):
         return None
     colour = residual_colour(fit.residuals, [int(e.used.sum()) for e in experiments])

@@ -17,7 +17,7 @@ from psa_casadi.identification.search.refitting import Progress, quick_from, ref
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.identification.start.starting_points import resolved
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage
 
@@ -49,7 +49,7 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     """
     if "k_P" not in base.model.values:
         return None
-    records = [e.record for e in experiments]
+    records = [e.record for e in fitted(experiments)]
     progress("resonances and lags that the records show")
     linear = linear_start(records, base.model.values)
     fastest = min(r.sample_time for r in records)
@@ -98,7 +98,7 @@ def instead_of_mode(
     progress("base fit, with the mode as a resonance of the stack's own")
     values = found.model.values
     tone, damping = values[mode.tone or ""], values["mode_damping"]
-    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
     near = images(tone, rate, _IMAGES)
     starts = [m for f in near for m in _masses(before.model.values, [f], damping * tone / f)]
     return _with_masses(before, starts, experiments, _as_good(found, _AS_GOOD))
@@ -161,7 +161,7 @@ def _with_ringing(
     explains clearly more, down to the rms `least` [m]. A mass that is free already is tried
     elsewhere, too.
     """
-    rate = 1.0 / min(e.record.sample_time for e in experiments)
+    rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
     if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
         return None
     tone = ringing(fit, experiments)

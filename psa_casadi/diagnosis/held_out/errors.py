@@ -11,7 +11,6 @@ from psa_casadi.diagnosis.noise.colour import rms
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import predicted_further
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -61,7 +60,7 @@ def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     In their SI units; those of the fitted samples where none is held out. Raises PsaError.
     """
     found = []
-    theta = shared_starts(fit.model, fit.unknowns, fit.theta, experiments)[0]
+    theta = fit.placed(experiments)
     for f in fit.further:
         shown = predicted_further(fit.model, experiments, fit.unknowns, theta, f, way=fit.way)
         parts = [

@@ -49,7 +49,7 @@ def held_out_excess(
     make an error there too, so that only a clear excess counts. One below what can be told of a
     stack does not.
     """
-    own = [2 * int(e.used.sum()) > int(e.held_out.sum()) for e in experiments]
+    own = [not e.held_out_whole for e in experiments]
     parts = held_out_residuals(experiments, predicted)
     beyond = [
         rms(part) / floor.level

@@ -119,7 +119,8 @@ def colour_of(
     seen = top / bottom if bottom > 0 else 0.0
     if removed is not None and bottom > 0:
         ends = np.cumsum(lengths)[:-1]
-        parts = [q for q, own in zip(np.split(removed, ends), given, strict=True) if own is None]
+        pairs = zip(np.split(removed, ends), given, strict=True)
+        parts = [q for q, own in pairs if own is None and len(q)]
         seen = _before(seen, parts)
     correlation = float(np.clip(seen, 0.0, _LARGEST))
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
@@ -226,7 +227,8 @@ def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
     """
     ends = np.cumsum(lengths)
     parts = np.split(residual, ends[:-1])
-    return _with_level(tuple(autoregression_of(part) for part in parts), residual, lengths)
+    each = (autoregression_of(part) if part.size else part for part in parts)
+    return _with_level(tuple(each), residual, lengths)
 
 
 def _with_level(

@@ -116,8 +116,9 @@ def _sizes(
     Breusch and Pagan, Econometrica 47 (1979) 1287, with Koenker's correction; squares are over
     their mean in each record, and those above `_MOST` count as that.
     """
-    ends = np.cumsum(colour.lengths)[:-1]
-    powers = np.array([np.mean(part**2) for part in np.split(white, ends)])
+    lengths = [n for n in colour.lengths if n]
+    parts = np.split(white, np.cumsum(lengths)[:-1])
+    powers = np.array([np.mean(part**2) for part in parts])
     if not np.all(powers > 0):
         return 1.0, 0.0
     u, rate, turn, t = _drive(voltage, time)
@@ -125,7 +126,7 @@ def _sizes(
     way, age = _since_reversal(u, turn)
     columns = [u, u**2, speed, np.sqrt(speed), way, np.exp(-20.0 * way), np.exp(-0.1 * age), t]
     x = np.column_stack([*columns, t**2])
-    squares = np.minimum(white**2 / np.repeat(powers, colour.lengths), _MOST)
+    squares = np.minimum(white**2 / np.repeat(powers, lengths), _MOST)
     return _f_test(x - np.mean(x, axis=0), squares - np.mean(squares))
 
 

@@ -91,6 +91,8 @@ def _binned(
     """
     parts = []
     for k, (e, residual) in enumerate(zip(experiments, fit.residuals_of(experiments), strict=True)):
+        if e.held_out_whole:
+            continue
         shown = measured(e.record)[: e.stop][e.used[: e.stop]]
         parts.append((shown - residual - fit.offset(k), residual))
     x, residual = max(parts, key=lambda part: float(np.ptp(part[0])))

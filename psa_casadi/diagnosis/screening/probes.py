@@ -143,7 +143,7 @@ def _histories(
     if settling:
         cycled = []
         for memory, e in zip(known, experiments, strict=True):
-            y = measured(e.record)[e.used]
+            y = measured(e.record)[e.known]
             cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
         variants.append(tuple(cycled))
     if effect.trial_starts:
@@ -192,6 +192,8 @@ class _Trial:
     def _moved(self, k: int, output: str) -> FloatArray:
         """Return an output after the step, or its change along the derivative."""
         e, step = self.experiments[k], self.step
+        if e.held_out_whole:
+            return np.zeros(0)
         model = self.model.with_values({self.gain: step}) if step else self.model
         start = dict.fromkeys(memory_names(model.structure), 0.0) | self.memory[k]
         rtol = self.fit.way.rtol if step else _RTOL

@@ -22,7 +22,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.search.refitting import quick_rtol, refit
 from psa_casadi.identification.start.ordinary import ordinary_values
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Evaluations of quick fits beside other causes, and of those afresh that go on; of these the best
@@ -79,7 +79,7 @@ def with_causes_afresh(
         size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), gain)
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
-    ordinary = ordinary_values(before.fit.model, [e.record for e in experiments])
+    ordinary = ordinary_values(before.fit.model, [e.record for e in fitted(experiments)])
     return _with_all(before, experiments, added, tuple(before.fit.starts()), ordinary, goal)
 
 
@@ -244,7 +244,7 @@ def _from_ordinary(
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
     values = _ordinary_form(effect, known)
-    ordinary = ordinary_values(before.model, [e.record for e in experiments])
+    ordinary = ordinary_values(before.model, [e.record for e in fitted(experiments)])
     starts = [(values, s * size, tuple(before.starts())) for s in sizes]
     found = side_by_side(
         lambda s: fit_from(before, experiments, effect, s, ordinary, QUICK), starts

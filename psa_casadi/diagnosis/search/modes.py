@@ -38,7 +38,7 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
     """
     if "wafer_force" not in before.fit.model.structure.balances:
         return None
-    even = [k for k, e in enumerate(experiments) if _even(e.record.time)]
+    even = [k for k, e in enumerate(experiments) if not e.held_out_whole and _even(e.record.time)]
     most = _ENOUGH // max(1, len(even))
     shaken, free = [], []
     for k in even:

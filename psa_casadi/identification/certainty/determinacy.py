@@ -153,6 +153,8 @@ def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | N
     curvature = np.diag(1.0 / fit.unknowns.prior**2)
     pull = np.zeros(fit.unknowns.size)
     for r, (level, e) in enumerate(zip(fit.sigma, experiments, strict=True)):
+        if not e.stop:
+            continue
         scaled = fit.jacobian[fit.of_record(experiments, r)] / level
         start = fit.start(r)
         _, by_parameter, by_start = predict_record(

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.beginnings import beginnings
 from psa_casadi.identification.fitting.further import Further, further_of, scaled
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS
 from psa_casadi.identification.fitting.minimum import Effort, accurate_minimum
@@ -18,10 +19,9 @@ from psa_casadi.identification.fitting.prediction import (
     motions_of,
     predict,
 )
-from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
 from psa_casadi.model.compose import Model
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way
 
@@ -108,21 +108,15 @@ class Fit:
     def predictions(
         self, experiments: Sequence[Experiment], *, differentiated: bool = True
     ) -> list[Prediction]:
-        """Predict whole records with their derivatives by theta, if `differentiated`.
-
-        A record that is held out as a whole begins as the fitted ones do (`shared_starts`); what
-        finds its offset are the samples that it may use.
-        """
-        theta, shared = shared_starts(self.model, self.unknowns, self.theta, experiments)
-        full = predict(
-            self.model, experiments, self.unknowns, theta,
+        """Predict whole records with their derivatives by theta, if `differentiated`."""
+        return predict(
+            self.model, experiments, self.unknowns, self.placed(experiments),
             way=self.way, everything=True, differentiated=differentiated,
         )  # fmt: skip
-        for k in shared:
-            own, x = experiments[k], full[k].displacement
-            offset = float(np.mean((measured(own.record) - x)[own.used]))
-            full[k] = replace(full[k], displacement=x + offset)
-        return full
+
+    def placed(self, experiments: Sequence[Experiment]) -> FloatArray:
+        """Return theta with where held-out records begin (`beginnings`), which no fit has seen."""
+        return beginnings(self.model, self.unknowns, self.theta, experiments, self.sigma, self.way)
 
 
 @contextmanager
@@ -161,11 +155,12 @@ def fit(
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
-    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
+    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
     placed = model.with_values(start or {})
     motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
     first = [float(e.record.voltage[0]) for e in experiments]
     unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
+    unknowns = unknowns.without([k for k, e in enumerate(experiments) if not e.used.any()])
     theta = _starting_point(model, experiments, unknowns, start or {}, start_states)
     weights = np.concatenate(
         [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
@@ -206,6 +201,8 @@ def _starting_point(
     theta = np.zeros(unknowns.size)
     theta[: len(unknowns.names)] = unknowns.coordinates(values)
     for r, experiment in enumerate(experiments):
+        if not experiment.used.any():
+            continue
         given = start_states[r] if start_states else {}
         y, v = measured(experiment.record)[experiment.used], experiment.record.voltage
         slope = values["G"] * values["k_L"] * static_compliance(values)

@@ -206,19 +206,22 @@ def predicted_further(
 ) -> dict[int, FloatArray]:
     """Return a further column of whole records (n,) as predicted, by the index of the record.
 
-    Factors are those of the fit, offsets those of the used samples. Raises PsaError.
+    Factors are those of the fit, offsets those of the known samples. Raises PsaError.
     """
     current = model.with_values(unknowns.values(theta))
     found = {}
-    for k in with_column(experiments, fitted.column):
-        e, start = experiments[k], unknowns.start(theta, k)
+    for k, e in enumerate(experiments):
+        given: FloatArray | None = getattr(e.record, fitted.column)
+        if given is None or not e.known.any():
+            continue
+        start = unknowns.start(theta, k)
         total = np.zeros(e.record.n)
         for factor, output in zip(fitted.factors, COLUMNS[fitted.column].outputs, strict=True):
             total += factor * trace_record(
                 current, e.record, start, (),
                 stop=e.record.n, way=way, by_start=False, output=output,
             ).output  # fmt: skip
-        found[k] = total + np.mean(measured_in(e, fitted.column) - total[e.used])
+        found[k] = total + np.mean((given - total)[e.known])
     return found
 
 

@@ -206,6 +206,8 @@ def predict(
     def one(index: int) -> Prediction:
         experiment = experiments[index]
         stop = experiment.record.n if everything else experiment.stop
+        if not stop:
+            return Prediction(np.zeros(0), np.zeros((0, unknowns.size)), "")
         if not differentiated:
             current, start = model.with_values(unknowns.values(theta)), unknowns.start(theta, index)
             found = trace_record(
@@ -224,7 +226,10 @@ def predict(
 
 @dataclass(frozen=True)
 class Simulated:
-    """How a record was run, and what a finer run differs by (rms of its used samples) [m]."""
+    """How a record was run, and what a finer run differs by (rms of its used samples) [m].
+
+    `way` is "" for a record that is held out whole.
+    """
 
     way: str
     error: float
@@ -244,6 +249,8 @@ def simulated(
     def one(index: int) -> Simulated:
         experiment, start = experiments[index], unknowns.start(theta, index)
         used = experiment.used[: experiment.stop]
+        if not used.size:
+            return Simulated("", 0.0)
         plain, finer = (
             trace_record(
                 current, experiment.record, start, (), stop=experiment.stop, way=w, by_start=False

@@ -1,7 +1,7 @@
 """What a fit searches: parameters, memories, offsets, on scales where 1 is an ordinary change."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -140,6 +140,12 @@ class Unknowns:
         bends = [q * a / (k_l + a) for q in (beta, gamma)]
         moved = [b + _BEND_STEP * self._bend * t for b, t in zip(bends, theta[2:], strict=True)]
         return [s_new - a_new, a_new, *(m * s_new / a_new for m in moved)]
+
+    def without(self, records: Sequence[int]) -> "Unknowns":
+        """Return the unknowns with a prior that keeps the offsets of records without a sample."""
+        prior = self.prior.copy()
+        prior[[self.first(k + 1) - 1 for k in records]] = 1.0
+        return replace(self, prior=prior)
 
     def start(self, theta: FloatArray, record: int) -> dict[str, float]:
         """Return the deviations of one record's initial state, in the states' units."""

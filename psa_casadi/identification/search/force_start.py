@@ -32,7 +32,7 @@ from psa_casadi.identification.start.linear_fit import LinearFit, cost_of, fit_l
 from psa_casadi.identification.start.linear_response import FloatArray
 from psa_casadi.identification.start.vector_fitting import Response, contributions, vector_fit
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
 
 #: Samples that one record and all together may have, and the fewest that count.
@@ -127,7 +127,7 @@ def _begun(
 
 def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
     """Yield the records with the fit's force, in metres of static displacement, for a voltage."""
-    fastest = min(e.record.sample_time for e in experiments)
+    fastest = min(e.record.sample_time for e in fitted(experiments))
     values, levels, total = best.model.values, residual_noise(best, experiments), 0
     for k, e in enumerate(experiments):
         record, y = e.record, measured(e.record)

@@ -26,7 +26,7 @@ from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.starting_points import resolved, starting_points
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.timings import stage
 
 #: Parameters that voltage and displacement determine in every record with loops.
@@ -125,10 +125,10 @@ def _search(
     keep: Callable[[Fit], None],
 ) -> Search:
     """Search as `search` says; `keep` gets every fit that is better than those before it."""
-    core = free_parameters(model, [e.record for e in experiments])
-    fastest = min(e.record.sample_time for e in experiments)
-    told = resolved(model, linear, fastest)
-    starts = starting_points(model, linear, [e.record for e in experiments])
+    records = [e.record for e in fitted(experiments)]
+    core = free_parameters(model, records)
+    told = resolved(model, linear, min(r.sample_time for r in records))
+    starts = starting_points(model, linear, records)
     found = _quick_fits(model, experiments, [*core, *told], starts, progress, keep)
     keep(found[0][1])
     free = found[0][1].unknowns.names

@@ -38,7 +38,7 @@ def noise_levels(experiments: Sequence[Experiment]) -> list[float]:
     """Return the white noise of every record's displacement [m], from its fast differences."""
     levels = []
     for e in experiments:
-        y = measured(e.record)[e.used]
+        y = measured(e.record)[e.known]
         levels.append(max(high_frequency_noise(y), 1e-6 * float(np.ptp(y)), 1e-15))
     return levels
 
@@ -70,9 +70,12 @@ def record_rms(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
 
 
 def residual_noise(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
-    """Return the white noise of every record's residual [m], from its fast differences."""
-    parts = previous.residuals_of(experiments)
-    return [max(high_frequency_noise(p), 1e-15) for p in parts]
+    """Return the white noise of every record's residual [m], from its fast differences.
+
+    That of a record without a fitted sample stays as it was.
+    """
+    parts = zip(previous.residuals_of(experiments), previous.sigma, strict=True)
+    return [max(high_frequency_noise(p), 1e-15) if p.size else sigma for p, sigma in parts]
 
 
 def refit(

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.export.web.module import begun_module
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.shared_starts import shared_starts
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
@@ -137,7 +136,7 @@ def _fitted_records(
 
     `share` is what counts of each record's noise where errors are judged.
     """
-    theta = shared_starts(model, fit.unknowns, fit.theta, experiments)[0]
+    theta = fit.placed(experiments)
     rows = []
     for k, (e, s) in enumerate(zip(experiments, series, strict=True)):
         columns = {n: getattr(e.record, n, None) for n in model.input_names}

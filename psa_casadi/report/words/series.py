@@ -123,7 +123,7 @@ def series_of_fit(found: Identification) -> tuple[Series, ...]:
     rows = []
     predictions = found.fit.predicted(found.experiments)
     for e, predicted in zip(found.experiments, predictions, strict=True):
-        noise = high_frequency_noise((measured(e.record) - predicted)[e.used])
+        noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
         rows.append(_series(e, [Curve("model", EXTENDED_COLOUR, predicted)], noise))
     return tuple(rows)
 

@@ -1,0 +1,126 @@
+"""Where records begin that are held out whole, of which no fit sees a sample.
+
+The stack begins as in the fitted records of the device that begin at the same voltage: what the
+first tenth of a record tells of its memories is mostly the model's own error there. A loop that is
+simulated from it drifts off by a tenth of the range, where one that begins as the device's other
+records do stays within a hundredth. States of drive, sensor and environment belong to the record,
+as does the whole start where no fitted record begins alike: the first tenth finds them.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, minimise
+from psa_casadi.identification.fitting.prediction import measured, trace_record
+from psa_casadi.identification.fitting.unknowns import Unknowns
+from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.ways import Way
+
+FloatArray = npt.NDArray[np.float64]
+
+#: First voltages that differ by less than this share of the records' range are the same.
+_SAME = 0.01
+#: How far the start is sought in the first tenth.
+_EVALUATIONS, _TOLERANCE = 30, 1e-5
+
+
+def beginnings(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiments: Sequence[Experiment],
+    sigma: Sequence[float],
+    way: Way,
+) -> FloatArray:
+    """Return theta with start and offset of the records that are held out whole; others stay.
+
+    `model` has the values of theta; `sigma` [m] are the records' noise levels. Raises PsaError
+    where a record cannot be simulated.
+    """
+    found = theta.copy()
+    for k, experiment in enumerate(experiments):
+        if not experiment.held_out_whole or not experiment.known.any():
+            continue
+        first, last = unknowns.first(k), unknowns.first(k + 1)
+        found[first:last] = 0.0
+        shared = _shared(model, unknowns, theta, experiments, k)
+        found[list(shared)] = list(shared.values())
+        searched = [c for c in range(first, last) if c not in shared]
+        found[searched] = _sought(model, unknowns, found, experiment, k, sigma[k], searched, way)
+    return found
+
+
+def _shared(
+    model: Model, unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
+) -> dict[int, float]:
+    """Return the coordinates of the stack's own start that the other records tell of record k."""
+    own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
+    size = max(float(np.ptp(e.record.voltage)) for e in experiments)
+    first = [float(e.record.voltage[0]) for e in experiments]
+    alike = [
+        j
+        for j, other in enumerate(experiments)
+        if not other.held_out_whole and abs(first[j] - first[k]) <= _SAME * size
+    ]
+    found = {}
+    for name in unknowns.started[k]:
+        told = [theta[_place(unknowns, j, name)] for j in alike if name in unknowns.started[j]]
+        if told and name not in own:
+            found[_place(unknowns, k, name)] = float(np.mean(told))
+    return found
+
+
+def _place(unknowns: Unknowns, record: int, name: str) -> int:
+    return unknowns.first(record) + unknowns.started[record].index(name)
+
+
+def _sought(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiment: Experiment,
+    k: int,
+    sigma: float,
+    searched: Sequence[int],
+    way: Way,
+) -> FloatArray:
+    """Return the coordinates `searched` of record k with which its first samples fit best."""
+    known, columns = np.flatnonzero(experiment.known), list(searched)
+    stop = int(known[-1]) + 1
+    y, prior = measured(experiment.record)[known], 1.0 / unknowns.prior[columns]
+
+    def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        there = theta.copy()
+        there[columns] = own
+        try:
+            run = trace_record(
+                model, experiment.record, unknowns.start(there, k), (), stop=stop, way=way
+            )
+        except PsaError:
+            return None
+        by_start, by_offset = unknowns.place_slopes(there, k)
+        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / sigma
+        missed = (run.output[known] + unknowns.offset(there, k) - y) / sigma
+        return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
+
+    return _minimum(evaluate, len(columns))
+
+
+def _minimum(evaluate: Evaluate, size: int) -> FloatArray:
+    """Return where the search ends; the last coordinate is the offset, exactly linear."""
+    free = np.full(size, np.inf)
+    found = minimise(
+        evaluate,
+        np.zeros(size),
+        (-free, free),
+        tolerance=_TOLERANCE,
+        evaluations=_EVALUATIONS,
+        linear=(size - 1,),
+    )
+    if found is None:
+        raise PsaError("A held-out record cannot be simulated from where the others begin.")
+    return found.theta
