@@ -90,9 +90,20 @@ def usual_source(name: str, array: str, unit: str | None = None) -> Source:
     usual = SI_UNITS.get(name, "um")
     if unit is None:
         return Source(array, usual)
-    wrong = Problems()
-    check_unit(COLUMNS[name], unit, "", wrong)
-    return Source(array, usual, 1.0) if wrong else Source(array, None)
+    return Source(array, unit) if measures(name, unit) else Source(array, usual, 1.0)
+
+
+def measures(name: str, unit: str) -> bool:
+    """Whether a unit measures what a column holds, so that its numbers can be converted."""
+    try:
+        parsed = parse_unit(unit)
+    except InputError:
+        return False
+    own = COLUMNS[name].quantities
+    return parsed.quantity in own or (
+        not parsed.quantity
+        and any(parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in own)
+    )
 
 
 _SPECIAL = re.compile(r"[^\w.,=:+/%@-]")
@@ -108,14 +119,11 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
         )
         return
     try:
-        parsed = parse_unit(unit, column.quantities[0])
+        parse_unit(unit, column.quantities[0])
     except InputError as error:
         problems.add(f"{where}: {error}")
         return
-    compound = not parsed.quantity and any(
-        parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in column.quantities
-    )
-    if parsed.quantity not in column.quantities and not compound:
+    if not measures(column.name, unit):
         problems.add(
             f"{where}: the unit '{unit}' does not measure {column.quantities[0]}; correct it to "
             f"one of {accepted}, or say what 1 in the file is: --columns {column.name}=NAME:10"

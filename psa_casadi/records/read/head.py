@@ -7,14 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.errors import Problems
-from psa_casadi.records.read.columns import COLUMNS, SI_UNITS, Field
+from psa_casadi.records.read.columns import COLUMNS, Field
 from psa_casadi.records.read.csv_table import CsvText, load_text
 from psa_casadi.records.read.file_bytes import read_bytes
-from psa_casadi.records.read.header import named_columns, parse_header
-from psa_casadi.records.read.header_names import understood
+from psa_casadi.records.read.header import guessed_header, named_columns
+from psa_casadi.records.read.header_names import stated_unit
 from psa_casadi.records.read.layout import cells_of
-from psa_casadi.records.read.read_arrays import LOADERS, array_of, unit_of
+from psa_casadi.records.read.read_arrays import (
+    LOADERS,
+    array_of,
+    last_part,
+    suggested_sources,
+    unit_of,
+)
 from psa_casadi.records.read.read_parquet import parquet_head
 from psa_casadi.records.read.read_xlsx import workbook_text
 
@@ -67,7 +72,7 @@ def _of_text(text: CsvText, count: int) -> Head:
 
 
 def _of_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Head:
-    guess = parse_header(header, NEEDED, "", Problems())
+    guess = guessed_header(header, NEEDED)
     named = [(name, unit or "") for name, unit in named_columns(header)]
     names = tuple("" if set(name) & _MARKS else name for name, _ in named)
     units = tuple(unit for _, unit in named)
@@ -77,22 +82,18 @@ def _of_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Head:
 def _of_arrays(path: str, ending: str, count: int) -> Head:
     arrays = LOADERS[ending](path, read_bytes(path))
     names = tuple(arrays)
-    guess = {}
+    guess, asked = {}, suggested_sources(arrays, NEEDED)
     for column in COLUMNS:
-        source = array_of(column, arrays)
+        source = array_of(column, arrays, by_unit=column in NEEDED) or asked.get(column)
         if source is not None:
             unit = unit_of(column, source, arrays[source.array].unit) or ""
             guess[column] = Field(names.index(source.array), unit)
-            continue
-        meant = [
-            n for n in names if (own := understood(n.rpartition(".")[2])) and own.column == column
-        ]
-        if meant and column in NEEDED:
-            guess[column] = Field(names.index(meant[0]), SI_UNITS.get(column, "um"))
     firsts = [[f"{v:.9g}" for v in np.asarray(a.values[:count])] for a in arrays.values()]
     longest = max(map(len, firsts), default=0)
     rows = [[own[k] if k < len(own) else "" for own in firsts] for k in range(longest)]
-    units = tuple(a.unit or "" for a in arrays.values())
+    units = tuple(
+        array.unit or stated_unit(last_part(name)) or "" for name, array in arrays.items()
+    )
     return Head(names, units, _even(rows, len(names)), guess)
 
 

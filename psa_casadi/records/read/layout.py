@@ -5,11 +5,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from psa_casadi.records.read.header_names import columns_known, units_row
+from psa_casadi.records.read.header_names import columns_known, stated_unit, units_row
 
 #: Lines in which a header is looked for.
 _MOST_LINES = 500
 _SPACES, _BEFORE_UNIT = re.compile(r"[ \t]+"), re.compile(r"\s+(?=[\[(])")
+#: A first line that tells Excel what separates the cells.
+_TOLD_MARK = re.compile(r"\s*\"?sep=([^\w\s]|\t)\"?[\s,;]*", re.I)
 _NUMBER = re.compile(
     r"\s*\"?\s*([+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|nan|-?inf)\s*\"?\s*", re.I
 )
@@ -34,24 +36,34 @@ def layout(lines: Sequence[str]) -> Layout | None:
     The header is the first line that names two columns of a record, in a comment too if numbers
     follow; where none does, it is the line above the first numbers, else the first line that is no
     comment, and where that one holds numbers there is no header. A row of units below is joined to
-    the names.
+    the names. A first line `sep=;` says what separates the cells.
     """
+    told = _TOLD_MARK.fullmatch(lines[0]) if lines else None
+    if told is not None:
+        return _laid_out(["", *lines[1:]], told[1])
+    return _laid_out(lines, "")
+
+
+def _laid_out(lines: Sequence[str], mark: str) -> Layout | None:
+    """Return the layout of lines whose cells `mark` separates; "" where that is not told."""
     start = next((k for k, line in enumerate(lines) if _told(line)), None)
     if start is None:
         return None
-    plain = _named(lines, [start])
-    place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)))
+    plain = _named(lines, [start], mark)
+    place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)), mark)
     if place is None:
-        if _all_numbers(lines[start]):
-            return Layout((), delimiter_of(lines[start]), start, start)
-        place = _above_numbers(lines, start)
-    delimiter = delimiter_of(lines[place].lstrip("#"))
+        numbers = _numbers(lines[start], mark)
+        if numbers:
+            return Layout((), numbers, start, start)
+        place = _above_numbers(lines, start, mark)
+    delimiter = mark or delimiter_of(lines[place].lstrip("#"))
     header = cells_of(lines[place].lstrip("# "), delimiter, spaced=True)
     below = place + 1
     if below < len(lines):
         units = units_row(cells_of(lines[below].lstrip("# "), delimiter))
         if units is not None and len(units) == len(header):
-            header = [f"{n.strip()} [{u}]" if u else n for n, u in zip(header, units, strict=True)]
+            pairs = zip(header, units, strict=True)
+            header = [f"{n.strip()} [{u}]" if u and not stated_unit(n) else n for n, u in pairs]
             below += 1
     return Layout(tuple(header), delimiter, place, below)
 
@@ -81,17 +93,26 @@ def _told(line: str) -> bool:
     return bool(line.strip()) and not line.startswith("#")
 
 
-def _all_numbers(line: str) -> bool:
-    cells = cells_of(line, delimiter_of(line))
-    return len(cells) > 1 and all(_NUMBER.fullmatch(c) for c in cells)
+def _numbers(line: str, mark: str) -> str:
+    """Return what separates the numbers of a line, "" where it does not hold numbers alone.
+
+    Where numbers have decimal commas, that is no comma.
+    """
+    for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), ";", "\t", " ")):
+        cells = cells_of(line, delimiter)
+        if len(cells) > 1 and all(_NUMBER.fullmatch(c) for c in cells):
+            return delimiter
+    return ""
 
 
-def _above_numbers(lines: Sequence[str], start: int) -> int:
+def _above_numbers(lines: Sequence[str], start: int, mark: str) -> int:
     """Return the line of names, and of units below it, above the first numbers, else the first."""
-    numbers = (k for k in range(start, min(len(lines), _MOST_LINES)) if _all_numbers(lines[k]))
-    first = next(numbers, start)
+    places = range(start, min(len(lines), _MOST_LINES))
+    first = next((k for k in places if _numbers(lines[k], mark)), start)
+    told = mark or _numbers(lines[first], mark).strip(" ")
     cells = [
-        cells_of(line, delimiter_of(line)) for line in lines[max(start, first - 2) : first + 1]
+        cells_of(line, told if told and told in line else delimiter_of(line))
+        for line in lines[max(start, first - 2) : first + 1]
     ]
     if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
         return first - 2
@@ -99,22 +120,23 @@ def _above_numbers(lines: Sequence[str], start: int) -> int:
     return first - 1 if alike and not _NUMBER.fullmatch(cells[-2][0]) else start
 
 
-def _named(lines: Sequence[str], places: Sequence[int]) -> int | None:
+def _named(lines: Sequence[str], places: Sequence[int], mark: str) -> int | None:
     """Return the first of the places that names two columns, and has more lines below."""
     for k in places:
         line = lines[k].lstrip("# ")
-        for delimiter in dict.fromkeys((delimiter_of(line), " ")):
-            if columns_known(cells_of(line, delimiter)) >= 2 and _numbers_follow(lines, k):
+        for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), " ")):
+            known = columns_known(cells_of(line, delimiter))
+            if known >= 2 and _numbers_follow(lines, k, mark):
                 return k
     return None
 
 
-def _numbers_follow(lines: Sequence[str], k: int) -> bool:
+def _numbers_follow(lines: Sequence[str], k: int, mark: str) -> bool:
     """Whether a line of numbers comes within three lines of line k, where that is a comment."""
     if not lines[k].startswith("#"):
         return True
     return any(
-        _NUMBER.fullmatch(cells_of(line, delimiter_of(line))[0]) is not None
+        _NUMBER.fullmatch(cells_of(line, mark or delimiter_of(line))[0]) is not None
         for line in lines[k + 1 : k + 4]
         if line.strip()
     )

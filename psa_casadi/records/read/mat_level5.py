@@ -17,14 +17,17 @@ from numpy.typing import NDArray
 
 from psa_casadi.records.read.file_bytes import check_size
 
-#: An array of numbers, a structure of named ones, or None for what is neither.
-Tree = NDArray[np.generic] | Mapping[str, "Tree"] | None
+#: An array of numbers, a structure of named ones, several structures, a text, or None for others.
+Tree = NDArray[np.generic] | Mapping[str, "Tree"] | tuple["Tree", ...] | str | None
 
 _MATRIX, _COMPRESSED = 14, 15
 _INT8, _INT32, _UINT32, _NAMES = 1, 5, 6, (1, 2, 16)
-_CELL, _STRUCT = 1, 2
-#: Objects, texts, sparse matrices, functions and opaque ones: no arrays of numbers.
-_LEFT_OUT = (3, 4, 5, 16, 17)
+_CELL, _STRUCT, _CHARS = 1, 2, 4
+#: How texts are stored, as Python calls it. No name or unit is longer than this, in bytes.
+_CODES = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_LONGEST = 10_000
+#: Objects, sparse matrices, functions and opaque ones: no arrays of numbers.
+_LEFT_OUT = (3, 5, 16, 17)
 #: Classes of arrays of numbers, and storage types of numbers, as NumPy calls them.
 _CLASSES = {
     6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
@@ -141,7 +144,7 @@ def _array(content: memoryview, order: str, depth: int = 0) -> tuple[str, Tree]:
     kind = flags[0] & 0xFF if len(flags) == 2 else 0
     if kind in _LEFT_OUT:
         return "", None
-    if kind not in (_CELL, _STRUCT, *_CLASSES):
+    if kind not in (_CELL, _STRUCT, _CHARS, *_CLASSES):
         raise ValueError(f"an array has the class {kind}")
     shape = parts.integers(_INT32, _UINT32)
     if len(shape) < 2 or min(shape) < 0:
@@ -150,9 +153,13 @@ def _array(content: memoryview, order: str, depth: int = 0) -> tuple[str, Tree]:
     if kind in _CLASSES:
         numbers = _numbers(parts, kind, shape)
         return name, None if flags[0] & _COMPLEX else numbers
-    if math.prod(shape) != 1:
-        return name, None
-    return name, parts.array() if kind == _CELL else _structure(parts)
+    if kind == _CHARS:
+        return name, _characters(parts)
+    count = math.prod(shape)
+    if kind == _STRUCT and count:
+        several = _structures(parts, count)
+        return name, several if count > 1 else several[0]
+    return name, parts.array() if kind == _CELL and count == 1 else None
 
 
 def _numbers(parts: _Parts, kind: int, shape: list[int]) -> NDArray[np.generic]:
@@ -167,16 +174,31 @@ def _numbers(parts: _Parts, kind: int, shape: list[int]) -> NDArray[np.generic]:
     return np.frombuffer(content, given).reshape(shape, order="F")
 
 
-def _structure(parts: _Parts) -> dict[str, Tree]:
+def _structures(parts: _Parts, count: int) -> tuple[dict[str, Tree], ...]:
+    """Return structures of the same fields; what lies in them stands one after the other."""
     lengths = parts.integers(_INT32)
     names = bytes(parts.next(_INT8)[1])
     length = lengths[0] if len(lengths) == 1 else 0
     if length < 1 or len(names) % length:
         raise ValueError(f"the names of a structure have {len(names)} bytes of {length} each")
-    found: dict[str, Tree] = {}
-    for at in range(0, len(names), length):
-        _keep(found, _text(names[at : at + length].split(b"\0")[0]), parts.array())
-    return found
+    if count > _MOST_NAMES:
+        raise ValueError(f"{count} structures stand in one place")
+    found: list[dict[str, Tree]] = [{} for _ in range(count if names else 1)]
+    for own in found:
+        for at in range(0, len(names), length):
+            _keep(own, _text(names[at : at + length].split(b"\0")[0]), parts.array())
+    return tuple(found)
+
+
+def _characters(parts: _Parts) -> str | None:
+    """Return a short text, None for another."""
+    stored, content = parts.next(*_CODES, *_STORED)
+    code = _CODES.get(stored, "")
+    if not code or len(content) > _LONGEST:
+        return None
+    ends = {"<": "-le", ">": "-be"}[parts.order] if code in ("utf-16", "utf-32") else ""
+    text = bytes(content).decode(code + ends, errors="replace")
+    return text if text.isprintable() else None
 
 
 def _text(name: bytes | memoryview) -> str:

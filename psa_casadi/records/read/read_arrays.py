@@ -1,7 +1,8 @@
 """Columns from files of named arrays: MATLAB, HDF5, TDMS and NumPy files.
 
 An array named `time`, `voltage_mV` or `displacement_um` is recognised, and what laboratories call
-them where the file or the name gives a unit; all others are named by `--columns`. Without a unit
+them where the file or the name gives a unit, or the only one in a unit of time, voltage or length;
+all others are named by `--columns`. Without a unit
 the SI unit is meant for an array that has the column's own name, but never for a displacement.
 """
 
@@ -10,7 +11,8 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 
 from psa_casadi.errors import Problems
-from psa_casadi.records.read.arrays import Array, Arrays, Numbers
+from psa_casadi.records.read.arrays import Arrays, Numbers
+from psa_casadi.records.read.candidates import Cell, cell_of, decided, source_of, suggested
 from psa_casadi.records.read.columns import (
     COLUMNS,
     SI_UNITS,
@@ -22,7 +24,7 @@ from psa_casadi.records.read.columns import (
 )
 from psa_casadi.records.read.file_bytes import read_bytes
 from psa_casadi.records.read.hdf5_process import series_apart
-from psa_casadi.records.read.header_names import understood, unit_named
+from psa_casadi.records.read.header_names import unit_for, unit_named
 from psa_casadi.records.read.mat_file import load_arrays
 from psa_casadi.records.read.read_npy import npy_arrays
 from psa_casadi.records.read.read_tdms import tdms_arrays
@@ -31,7 +33,7 @@ from psa_casadi.records.read.samples import Samples, whole_samples
 _OR_STEP = " Or give --sample-time, where there is none."
 #: What reads the arrays in the content of a file, by the ending of its name.
 LOADERS: dict[str, Callable[[str, bytes], Arrays]] = {
-    ".mat": lambda path, data: {n: Array(v) for n, v in load_arrays(path, data).items()},
+    ".mat": load_arrays,
     ".h5": series_apart,
     ".hdf5": series_apart,
     ".hdf": series_apart,
@@ -56,7 +58,7 @@ def read_arrays(
     arrays = LOADERS[os.path.splitext(path)[1].lower()](path, data)
     columns: dict[str, tuple[str, Numbers]] = {}
     for name in COLUMNS:
-        source = wanted.get(name) or array_of(name, arrays)
+        source = wanted.get(name) or array_of(name, arrays, by_unit=name in required)
         if source is not None and source.array in arrays:
             unit = _unit(path, name, source, arrays[source.array].unit, problems)
             columns[name] = (unit, arrays[source.array].values)
@@ -89,14 +91,16 @@ def _unit(path: str, name: str, source: Source, stated: str | None, problems: Pr
 
 
 def unit_of(name: str, source: Source, stated: str | None) -> str | None:
-    """Return the unit that a source, the file or, of an SI column, its name gives."""
-    return source.unit or stated or SI_UNITS.get(name)
+    """Return the unit that a source, the file, the array's name or an SI column's name gives."""
+    own = source.unit or stated or unit_for(name, last_part(source.array))
+    return own or SI_UNITS.get(name)
 
 
-def array_of(name: str, arrays: Arrays) -> Source | None:
+def array_of(name: str, arrays: Arrays, *, by_unit: bool) -> Source | None:
     """Return the array called `name` or `name_unit`, else the only one that means it.
 
-    That one has a unit, or the column's own name in a group.
+    That one has a unit, or the column's own name in a group; `by_unit` allows the only one whose
+    unit measures what the column holds.
     """
     for array in arrays:
         plain = array.lower()
@@ -105,29 +109,38 @@ def array_of(name: str, arrays: Arrays) -> Source | None:
         unit = array[len(name) + 1 :] if plain.startswith(f"{name}_") else ""
         if unit_named(unit):
             return Source(array, unit_named(unit))
-    meant = []
-    for array in arrays:
-        last = array.rpartition(".")[2]
-        found = understood(last)
-        if found is not None and found.column == name:
-            stated = found.unit or arrays[array].unit
-            if stated or last.lower() == name:
-                meant.append(Source(array, stated))
-    return meant[0] if len(meant) == 1 else None
+    cells = _cells(arrays)
+    one, several = decided(name, cells, by_unit=by_unit)
+    if one is not None:
+        return Source(cells[one].label, cells[one].unit)
+    own = [cells[k].label for k in several if cells[k].text.lower() == name]
+    return Source(own[0], None) if len(several) == len(own) == 1 else None
+
+
+def suggested_sources(arrays: Arrays, required: Sequence[str]) -> dict[str, Source]:
+    """Return the arrays that are the columns, or seem to be."""
+    found = {n: s for n in required if (s := array_of(n, arrays, by_unit=True)) is not None}
+    known = {
+        n: usual_source(n, s.array, unit_of(n, s, arrays[s.array].unit)) for n, s in found.items()
+    }
+    free = [c for c in _cells(arrays) if c.label not in {s.array for s in found.values()}]
+    chosen = suggested([n for n in required if n not in known], free)
+    return known | {n: source_of(n, free[k]) for n, k in chosen.items()}
+
+
+def _cells(arrays: Arrays) -> list[Cell]:
+    return [cell_of(last_part(name), name, array.unit) for name, array in arrays.items()]
+
+
+def last_part(array: str) -> str:
+    """Return the name of an array without that of its group."""
+    return array.rpartition(".")[2]
 
 
 def _line(arrays: Arrays, required: Sequence[str]) -> str:
-    """Return the option to type: the arrays that seem to be meant, else the others in order."""
-    texts: dict[str, str] = {}
-    for array in arrays:
-        found = understood(array.rpartition(".")[2])
-        if found is not None:
-            texts.setdefault(found.column, array)
-    left = (array for array in arrays if array not in texts.values())
-    for name in required:
-        if name not in texts:
-            texts[name] = next(left, "ARRAY")
-    return ready_line({name: usual_source(name, texts[name]) for name in required})
+    """Return the option to type: the arrays that seem to be meant, ARRAY where none does."""
+    sources = suggested_sources(arrays, required)
+    return ready_line({n: sources.get(n) or usual_source(n, "ARRAY") for n in required})
 
 
 def _listed(arrays: Arrays) -> str:

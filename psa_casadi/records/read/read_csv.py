@@ -2,10 +2,12 @@
 
 A header names each column with its unit, in any order:
 `time [s],voltage [V],displacement [um],load_force [N],temperature [degC]`. Laboratories' names for
-them are understood (`Time (s)`, `voltage_V`, `pos [um]`), and units in a row below. What stands
-before the header is left alone. Cells are separated by commas, semicolons, tabs or spaces, as in
-the header. A file of numbers alone needs `wanted` with the columns counted from 1. Missing samples
-are allowed in `displacement` (an empty cell or nan).
+them are understood (`Time (s)`, `voltage_V`, `pos [um]`), and units in a row below. Where only one
+column is in s, V or um, it is the time, the voltage or the displacement under any name but one that
+says otherwise. What stands before the header is left alone. Cells are separated by commas,
+semicolons, tabs or spaces, as in the header, or as a first line `sep=;` says. A file of numbers
+alone needs `wanted` with the columns counted from 1. Missing samples are allowed in `displacement`
+(an empty cell or nan).
 """
 
 from collections.abc import Sequence
