@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.base_fit.between_samples import smooth_between
 from psa_casadi.diagnosis.columns import decisions
 from psa_casadi.diagnosis.driven import driven
 from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
@@ -174,13 +175,31 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         stuck += more
         steps, task = _searched(start, replace(task, experiments=fewer))
         experiments = task.experiments
+    steps, task, between = _with_smooth_voltage(start, steps, task)
+    experiments = task.experiments
     progress("judging")
     found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
     turned = [f.turned for f in steps[0].fit.further if f.turned]
-    notes = (*seen.notes, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
+    notes = (*seen.notes, *between, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
     return replace(found, notes=(*found.notes, *notes))
+
+
+def _with_smooth_voltage(
+    start: Model, steps: list[Step], task: Task
+) -> tuple[list[Step], Task, tuple[str, ...]]:
+    """Search again where the voltage is smooth between its samples; return what holds, and notes.
+
+    As it is where the base's error shows none of it, or is no less with it.
+    """
+    if "between samples" not in task.method.without:
+        between = smooth_between(steps[0].fit, task.experiments)
+        if between is not None:
+            again, other = _searched(start, replace(task, experiments=between[0]))
+            if again[0].fit.rms < steps[0].fit.rms:
+                return again, other, (between[1],)
+    return steps, task, ()
 
 
 def _base(start: Model, task: Task) -> tuple[Fit, Task]:

@@ -29,6 +29,7 @@ STEPS = {
     "all afresh": "effects far behind in the screening are never fitted",
     "rejected": "no neighbours of what held-out data reject are fitted",
     "held out": "held-out data are not asked",
+    "between samples": "the voltage between two samples is a straight line, whatever the data say",
     "form": "a further cause may be smaller than the first one's form is known",
 }
 

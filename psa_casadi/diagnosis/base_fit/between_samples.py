@@ -1,0 +1,108 @@
+"""What the voltage does between two samples: straight lines, or a smooth curve through them.
+
+A simulation joins the samples of the voltage by straight lines. Where an amplifier smooths them,
+chords cut the bends of a fast signal off: by u'' h^2/12 in the mean of a sampling interval h, 0.2 %
+of the amplitude of a sine with 40 samples a period. A plant that answers within some intervals
+shows this mean, and the error looks like a further resonance or a lag.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import trace_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
+
+if TYPE_CHECKING:
+    from scipy.interpolate import Akima1DInterpolator
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Standard errors by which the share of the difference that the residual holds must exceed none,
+#: and how far it may be from the whole of it. A smooth plant has 0.93 +- 0.03, others 0.0 +- 0.1,
+#: and residuals that hold something else -6000 to 11.
+_SURE, _NEAR = 6.0, 0.25
+NOTE = (
+    "Between its samples the voltage follows a smooth curve, not straight lines, of whose"
+    " difference the base model's error held {:.2f} ({:.2f} to {:.2f}): the model is driven by the"
+    " curve, and a simulation of such a record needs more samples for each period."
+)
+
+
+def smooth_between(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> tuple[tuple[Experiment, ...], str] | None:
+    """Return the experiments with the voltage moved to a smooth curve's mean, and a note; or None.
+
+    The difference of the two displacements is fitted to what the `fit` leaves, beside all fitted
+    parameters: the share of it that the residual holds is 1 for a smooth voltage, 0 for straight
+    lines. None where it is not near 1, or a record cannot be simulated.
+    """
+    try:
+        pairs = enumerate(experiments)
+        added = np.concatenate([_difference(fit, k, e)[e.used] for k, e in pairs])
+    except PsaError:
+        return None
+    basis, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
+    own, left = (x - basis @ (basis.T @ x) for x in (added, fit.residuals))
+    power = float(own @ own)
+    if power <= 0.0:
+        return None
+    share, error = float(own @ left) / power, float(np.sqrt(np.mean(left**2) / power))
+    if not (share > _SURE * error and abs(share - 1.0) < _NEAR):
+        return None
+    moved = tuple(replace(e, record=_moved(e.record)) for e in experiments)
+    return moved, NOTE.format(share, share - 1.96 * error, share + 1.96 * error)
+
+
+def _difference(fit: Fit, number: int, experiment: Experiment) -> FloatArray:
+    """Return what a smooth voltage changes in a record's displacement (n,) [m].
+
+    Straight lines between twice as many samples of the curve lack a quarter of it.
+    """
+    record, start = experiment.record, fit.start(number)
+    if experiment.held_out_whole:
+        return np.zeros(record.n)
+    time = np.empty(2 * record.n - 1)
+    time[::2], time[1::2] = record.time, 0.5 * (record.time[1:] + record.time[:-1])
+    finer = Record(
+        name=record.name,
+        time=time,
+        voltage=_curve(record)(time),
+        load_force=_between(record, time, record.load_force),
+        temperature=_between(record, time, record.temperature),
+    )
+    straight, smooth = (
+        trace_record(fit.model, r, start, (), stop=r.n, way=fit.way, by_start=False).output
+        for r in (record, finer)
+    )
+    return np.asarray((smooth[::2] - straight) * 4.0 / 3.0)
+
+
+def _between(record: Record, time: FloatArray, column: FloatArray | None) -> FloatArray | None:
+    return None if column is None else np.interp(time, record.time, column)
+
+
+def _curve(record: Record) -> "Akima1DInterpolator":
+    """Return a smooth curve through a record's voltage, straight where the samples are."""
+    from scipy.interpolate import Akima1DInterpolator  # noqa: PLC0415 (slow to load, seldom needed)
+
+    return Akima1DInterpolator(record.time, record.voltage)
+
+
+def _moved(record: Record) -> Record:
+    """Return a record whose straight lines have the mean of a smooth curve in each interval.
+
+    With the curve's slopes s_k at the samples that mean is higher by h (s_k - s_(k+1))/12; a sample
+    is moved by the mean of the intervals on its sides.
+    """
+    slopes = _curve(record).derivative()(record.time)
+    higher = np.diff(record.time) * (slopes[:-1] - slopes[1:]) / 12.0
+    beside = np.concatenate([higher[:1], 0.5 * (higher[1:] + higher[:-1]), higher[-1:]])
+    return replace(record, voltage=record.voltage + beside)
