@@ -234,9 +234,12 @@ def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None
     except PsaError as error:
         why = f"{d.next_experiment.why} No record could be designed: {error}"
         return replace(d, next_experiment=replace(d.next_experiment, why=why))
+    each = sentences(design, d.model.values.get("C_p"))
+    if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
+        why = " ".join((d.next_experiment.why, *each[:-1], same)).rstrip()
+        return replace(d, next_experiment=replace(d.next_experiment, why=why))
     write_voltage(path, design.record)
-    said = " ".join(sentences(design, d.model.values.get("C_p")))
-    why = f"Apply {path} and diagnose all records together. {said} {same}".rstrip()
+    why = " ".join((f"Apply {path} and diagnose all records together.", *each, same)).rstrip()
     following = NextExperiment(str(path), design.names, why, dict(design.chance))
     return replace(d, next_experiment=following)
 

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.held_out.errors import held_out_columns, held_out_parts
+from psa_casadi.diagnosis.held_out.errors import errors_of, held_out_columns, held_out_parts
 from psa_casadi.diagnosis.held_out.shares import Removed, Share
 from psa_casadi.records.split import Experiment
 
@@ -29,7 +29,8 @@ class Budget:
     `excess_rms_m` is that error, `noise_rms_m` the noise; `together` what all causes remove,
     `causes` what each does beside the others, `unnamed` what the best correction would remove of
     the base's error (nothing named) or beyond the causes; `remains_rms_m` and
-    `remains_percent` of the range are what the named causes leave above the noise.
+    `remains_percent` of the range, each record's over its own as of all errors, are what the named
+    causes leave above the noise.
     """
 
     excess_rms_m: float
@@ -65,7 +66,7 @@ def budget(
     sums, counts = held_out_parts(experiments, base, extended)
     powers = np.sum(sums, axis=0) / max(int(np.sum(counts)), 1)
     excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
-    largest = max(e.record.range_m for e in experiments)
+    whole = errors_of(experiments, extended)
     return Budget(
         excess_rms_m=excess,
         noise_rms_m=noise,
@@ -75,5 +76,5 @@ def budget(
         if correction is None
         else removed.share(correction[0], extended, correction[1]),
         remains_rms_m=remains,
-        remains_percent=100.0 * remains / largest if largest > 0 else 0.0,
+        remains_percent=whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300),
     )

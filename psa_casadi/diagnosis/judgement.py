@@ -177,5 +177,9 @@ def vague_note(vague: Mapping[str, Correction]) -> tuple[str, ...]:
 
 
 def _each(vague: Mapping[str, Correction]) -> str:
-    better = "; ".join(f"{c.kind.sentence}, instead of {name}" for name, c in vague.items())
+    free = 1.0 - thresholds().form
+    better = "; ".join(
+        f"{c.kind.sentence}, {'freer in form than' if c.copies >= free else 'instead of'} {name}"
+        for name, c in vague.items()
+    )
     return f"beside the model without it, an unnamed correction explains more ({better})"

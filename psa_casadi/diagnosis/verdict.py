@@ -29,6 +29,7 @@ from psa_casadi.diagnosis.judgement import (
     verdict_of,
     withdrawn_names,
 )
+from psa_casadi.diagnosis.next_record import next_experiment
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
@@ -36,11 +37,10 @@ from psa_casadi.diagnosis.result import (
     Cause,
     Diagnosis,
     Estimate,
-    NextExperiment,
     Remaining,
     Verdict,
 )
-from psa_casadi.diagnosis.search.contenders import contenders, same_curve_note
+from psa_casadi.diagnosis.search.contenders import contenders
 from psa_casadi.diagnosis.search.hypothesis import Scale
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import same_curves
@@ -150,10 +150,11 @@ def conclude(
         gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
         blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
         remaining=_remaining(final, unseen if kept else beyond),
-        next_experiment=_next_experiment(
+        next_experiment=next_experiment(
             causes,
             verdict,
             same_curves(experiments, table, first.fit),
+            [e.record for e in experiments],
             doubted=bool(doubt),
         ),
         doubt=doubt if verdict in ("adequate", "unexplained") else "",
@@ -272,30 +273,3 @@ def _remaining(r: Step, beyond: Excess) -> Remaining:
         where = _HELD_OUT.format(beyond.factor)
     p_value = min(r.test.p_value, beyond.p_value)
     return Remaining(not (r.test.alarm or beyond), p_value, where)
-
-
-_ADVICE = (
-    "Record a hold of several seconds, the same loop at three rates and at three amplitudes, and a"
-    " repeated step: rates separate delay, lag and creep; amplitudes separate asymmetry and memory;"
-    " holds separate creep and drift; the repeat shows the noise."
-)
-_AGAIN = "Correct the record, or record again, so that what the verdict says of it no longer holds."
-_COLUMNS = "Correct the record as the notes say, and diagnose it again."
-
-
-def _next_experiment(
-    causes: Sequence[Cause], verdict: Verdict, alike: Sequence[Sequence[str]], *, doubted: bool
-) -> NextExperiment:
-    if verdict == "not_driven":
-        return NextExperiment(None, (), _COLUMNS)
-    if doubted:
-        return NextExperiment(None, (), _AGAIN)
-    rivals = tuple(dict.fromkeys(n for c in causes for n in (c.effect, *c.cannot_be_told_from)))
-    if verdict == "ambiguous":
-        own = (causes[0].effect, *causes[0].cannot_be_told_from)
-        if len(own) > 1 and any(set(own) <= set(group) for group in alike):
-            return NextExperiment(None, rivals, same_curve_note(own))
-        return NextExperiment(None, rivals, _ADVICE)
-    if verdict in ("unexplained", "partly_explained"):
-        return NextExperiment(None, (), _ADVICE)
-    return NextExperiment(None, (), "None is needed for this verdict.")

@@ -35,6 +35,8 @@ ORDINARY = 2.5
 #: Samples of the grid on which the result is judged, at most.
 _FINE = 2000
 _SURE = 1.959964
+#: Rivals that a record is designed for, at most: as many as a verdict tells.
+_RIVALS = 5
 
 
 def usual_records(limits: Limits, steepest: float) -> dict[str, Record]:
@@ -158,7 +160,8 @@ def resolving_experiment(
     """Return the record that would tell which of an ambiguous diagnosis' effects is the cause.
 
     It has the voltages and the length of the records diagnosed unless `limits` say otherwise; the
-    search is brief by default. Of effects that bend the same curve one stands for all.
+    search is brief by default. Of effects that bend the same curve one stands for all, of many
+    rivals the most likely ones count: each adds a simulation to every trial.
     Raises InputError where the diagnosis is not ambiguous, or between such effects only.
     """
     if d.verdict != "ambiguous" or len(d.contenders) < 2:
@@ -169,6 +172,7 @@ def resolving_experiment(
     told, _ = one_of_each(d.contenders, d.experiments)
     if len(told) < 2 or (limits is not None and not _slow(limits)):
         told = d.contenders  # a new record that shows resonances may tell
+    told = tuple(sorted(told, key=lambda c: -c.evidence)[:_RIVALS])
     best = min(d.contenders, key=lambda c: c.fit.rms).fit
     noise, colour = noise_of_fit(best, d.experiments)
     rivals = [rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in told]

@@ -49,7 +49,9 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
             "Something is missing, and no effect in the table explains it: no cause is named;"
             f" {words}{_base_errors(d)}."
         )
-    return naming_sentence(d, [_cause(c) for c in d.causes], own_gain(d), d.explained_share)
+    return naming_sentence(
+        d, [_cause(c) for c in d.causes], own_gain(d), percent(within(d.explained_share))
+    )
 
 
 def own_gain(d: OdeDiagnosis) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
 from psa_casadi.report.words.phrases import (
     either,
@@ -48,7 +49,10 @@ def gain_sentence(d: Diagnosis) -> str:
     low, high = d.gain.interval
     if gain <= 0:
         return "the held-out error does not fall"
-    return f"the held-out error falls by {gain:.0f} % (95 % interval {low:.0f} to {high:.0f} %)"
+    told = (f"{gain:.0f}", f"{low:.0f}", f"{high:.0f}")
+    if told[1] == "100":
+        told = Share("error", 0.01 * gain, (0.01 * low, 0.01 * high)).percents
+    return f"the held-out error falls by {told[0]} % (95 % interval {told[1]} to {told[2]} %)"
 
 
 _PLAIN = {
@@ -77,12 +81,12 @@ def verdict_sentence(d: Diagnosis) -> str:
             "Something is missing, and no effect in the table explains it: no cause is named; "
             f"{_kept(d)}{_unnamed(d)}{error}."
         )
-    share = None if d.budget is None else d.budget.together.share
+    share = None if d.budget is None else f"{d.budget.together.percents[0]} %"
     return naming_sentence(d, [_cause(c) for c in d.causes], gain_sentence(d), share)
 
 
 def naming_sentence(
-    d: "Diagnosis | OdeDiagnosis", causes: Sequence[str], gain: str, share: float | None
+    d: "Diagnosis | OdeDiagnosis", causes: Sequence[str], gain: str, share: str | None
 ) -> str:
     """Say the verdict of a diagnosis that names: its `causes` in words, and what they remove.
 
@@ -98,7 +102,7 @@ def naming_sentence(
         )
     are = f"{'cause is' if len(causes) == 1 else 'causes are'} {listing(causes)}"
     if d.verdict == "partly_explained":
-        of = "" if share is None else f" ({percent(within(share))} of its power above the noise)"
+        of = "" if share is None else f" ({share} of its power above the noise)"
         return f"The closest known {are}: {gain}{of}; more than noise remains."
     return f"The {are}: {gain}."
 
