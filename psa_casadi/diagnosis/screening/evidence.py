@@ -105,8 +105,8 @@ def temperature(largest: float) -> float:
     """Return what evidence is divided by before it becomes a probability.
 
     The effects are not the true equations, so that their evidence differs by more than noise, and
-    the more the larger the `largest` one is: that of a whole model over the base with all
-    resonances of its own, as the form of each effect is approximate.
+    the more the larger the `largest` one is: that of a whole model over the plain base, as the form
+    of each of its parts is approximate.
     """
     return max(thresholds().temperature, thresholds().temperature_share * largest)
 
@@ -114,8 +114,8 @@ def temperature(largest: float) -> float:
 def probabilities(evidences: Mapping[str, float], whole: float = 0.0) -> dict[str, float]:
     """Return the probability of each effect, given that one of them is the cause.
 
-    `whole` is the evidence of the model with the cause over the base, where the effects' evidence
-    is that over other causes.
+    `whole` is the evidence of the model with the cause over the plain base, where the effects'
+    evidence is that over other causes and a better base.
     """
     if not evidences:
         return {}

@@ -94,7 +94,7 @@ class Known:
         best = self.best()
         if not self.removes_little(best):
             return best
-        own = self.scale.evidence(best) - self.scale.evidence(self.root)
+        own = self.scale.evidence(best)
         least = self.scale.score(best) - thresholds().clearly * temperature(own)
         near = [h for h in self.ranked() if h.causes and self.scale.score(h) > least]
         self.finish([h for h in near if not h.final])

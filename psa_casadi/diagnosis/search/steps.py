@@ -12,7 +12,7 @@ from psa_casadi.diagnosis.screening.evidence import levelled, probabilities, tem
 from psa_casadi.diagnosis.screening.screen import Screening
 from psa_casadi.diagnosis.search.fits import with_cause, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, root_of
-from psa_casadi.diagnosis.search.known import NONE, Searched
+from psa_casadi.diagnosis.search.known import Searched
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import in_character
 from psa_casadi.diagnosis.task import Task
@@ -124,13 +124,11 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
     alone = {**view.estimated(), **{n: found.scale.evidence(c) - own for n, c in fitted.items()}}
     if chosen is None:
         refused = {n for n, c in fitted.items() if c.names not in found.worth}
-        whole = _over_base(found, view.of)
-        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, whole, task)
+        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, own, task)
     cause = chosen.causes[-1]
     less = _without(found, task, cause)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
-        whole = _over_base(found, view.of)
-        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), whole, task)
+        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), own, task)
     there = _view(found, less, task)
     beside = {**_fitted(found, less), cause.name: found.best}
     own = found.scale.evidence(less)
@@ -138,18 +136,13 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
         **there.estimated(),
         **{n: found.scale.evidence(c) - own for n, c in beside.items()},
     }
-    whole = _over_base(found, found.best)
+    whole = found.scale.evidence(found.best)
     for name in _promising(evidence, beside, cause.name, whole):
         more = with_cause(less, task.experiments, there.starts_of(name))
         evidence[name] = -np.inf if more is None else found.scale.evidence(more) - own
     refused = {n for n, c in beside.items() if c.names not in found.worth} - {cause.name}
     step = Step(view, fitted, chosen, less, there, beside, alone)
     return _judged(step, evidence, beside, refused, whole, task)
-
-
-def _over_base(found: Searched, h: Hypothesis) -> float:
-    """Return the evidence over the base with all resonances of its own, whose form is no guess."""
-    return found.scale.evidence(h) - found.scale.evidence(found.known[NONE])
 
 
 def _fitted(found: Searched, h: Hypothesis) -> dict[str, Hypothesis]:
@@ -168,7 +161,7 @@ def _judged(
 ) -> Step:
     """Return a step with evidence and probability; `refused` effects may not be the answer.
 
-    `whole` is the evidence over the base of the model with the cause.
+    `whole` is the evidence over the plain base of the model with the cause.
 
     Effects that bend the same curve are refused together, and share what the best of them has.
     """
