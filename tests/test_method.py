@@ -132,6 +132,22 @@ def test_a_parameter_at_its_bound_is_out_of_character(creeping: Creeping) -> Non
     assert not in_character(replace(creep.fit, model=model), cause, experiments)
 
 
+def test_a_hum_where_the_stack_rings_is_out_of_character(creeping: Creeping) -> None:
+    """Within the width of a sharp resonance, 2 % of its frequency on each side at a ratio of 0.01;
+    a damped one hides no line of the mains.
+    """
+    _, creep, _, experiments = creeping
+    hum, omega = EFFECTS["mains_hum"], 2.0 * np.pi * 1600.0
+    stiffness = creep.fit.model.values["k_P"]
+    for ratio, frequency, fits in (
+        (0.01, 1601.0, False), (0.01, 1625.0, False), (0.01, 1640.0, True), (0.2, 1601.0, True),
+    ):  # fmt: skip
+        ringing = {"m_P": stiffness / omega**2, "c_P": 2.0 * ratio * stiffness / omega}
+        model = creep.fit.model.with_values(ringing)
+        model = model.with_effect(hum, {"hum_gain": 1e-9, "hum_frequency": frequency})
+        assert in_character(replace(creep.fit, model=model), hum, experiments) is fits
+
+
 def test_a_ripple_that_hardly_repeats_is_out_of_character(creeping: Creeping) -> None:
     """With less than two periods over the displacement it is a bent curve."""
     _, creep, _, experiments = creeping

@@ -9,14 +9,18 @@ from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.linear_part import linear_part
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Terms of a static curve.
 _CURVE = 8
+#: Damping ratio of a sharp resonance, and halves of its width within which a tone is its ringing.
+_SHARP, _WIDTHS = 0.05, 2.0
 
 
 def held_out_confirms(
@@ -78,8 +82,8 @@ def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) 
     """Whether the data ask for this effect and not for something else.
 
     Not with a parameter pushed to the end of its range, a tone among the harmonics of a periodic
-    drive (a hum at the mains' frequency may lie between them), or a period over the displacement
-    that fits into it less than twice.
+    drive (a hum at the mains' frequency may lie between them), a hum where the stack itself rings,
+    or a period over the displacement that fits into it less than twice.
     """
     values = fit.model.values
     widest = max(e.record.range_m for e in experiments)
@@ -92,7 +96,20 @@ def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) 
         tells_tone(values[tone], e.record, hum=hum) for e in experiments
     ):
         return False
+    if tone is not None and hum and _rings_at(fit, values[tone]):
+        return False
     return inside_ranges(values, cause)
+
+
+def _rings_at(fit: Fit, frequency: float) -> bool:
+    """Whether a frequency [Hz] lies within a sharp resonance of the fitted model."""
+    try:
+        poles = np.linalg.eigvals(linear_part(fit.model).a) / (2.0 * np.pi)
+    except (PsaError, np.linalg.LinAlgError):
+        return False
+    sharp = np.abs(poles.real) < _SHARP * np.abs(poles)
+    near = np.abs(np.abs(poles) - frequency) < _WIDTHS * np.abs(poles.real)
+    return bool(np.any(sharp & near))
 
 
 def inside_ranges(
