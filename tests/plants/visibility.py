@@ -18,8 +18,8 @@ from tests.plants.stack import FloatArray, Stack
 
 COARSE_SUB_INTERVALS = 6
 RELATIVE_STEP = 0.02
-#: Largest change of a parameter in a fit, in its logarithm.
-_WIDEST = 12.0
+#: Largest change of a parameter in a fit, in its logarithm; residual of a loop that diverges.
+_WIDEST, _DIVERGED = 12.0, 1e6
 FREE = ("r_s", "a", "beta", "gamma", "n", "delta", "tau")
 
 
@@ -73,7 +73,10 @@ def refitted_ratio(run: Run, contribution: FloatArray, sigma: float) -> float:
         factors = dict(zip((*FREE, "k_l", "c_p", "c_b"), np.exp(logs).tolist(), strict=False))
         moved = {name: getattr(run.stack, name) * factor for name, factor in factors.items()}
         stack: Stack = replace(run.stack, **moved)
-        fitted = simulate_base(stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+        try:
+            fitted = simulate_base(stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+        except OverflowError:  # a loop that diverges explains nothing
+            return np.full(run.times.size, _DIVERGED)
         left = (contribution + start - fitted) / sigma
         return np.asarray(left - left.mean(), dtype=np.float64)
 
