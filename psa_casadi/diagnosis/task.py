@@ -7,7 +7,7 @@ from typing import Literal
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.thresholds import Thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 
 #: Sampling interval [s] below which a stack may ring within the record's band.
 FAST = 7e-4
@@ -111,5 +111,5 @@ def same_curves(
 
 
 def shows_ringing(experiments: Sequence[Experiment]) -> bool:
-    """Whether a record is sampled fast enough for a stack to ring within its band."""
-    return min(e.record.sample_time for e in experiments) < FAST
+    """Whether a fitted record is sampled fast enough for a stack to ring within its band."""
+    return min(e.record.sample_time for e in fitted(experiments)) < FAST

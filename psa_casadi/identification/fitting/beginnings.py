@@ -33,13 +33,13 @@ def beginnings(
     unknowns: Unknowns,
     theta: FloatArray,
     experiments: Sequence[Experiment],
-    sigma: Sequence[float],
+    level: float,
     way: Way,
 ) -> FloatArray:
     """Return theta with start and offset of the records that are held out whole; others stay.
 
-    `model` has the values of theta; `sigma` [m] are the records' noise levels. Raises PsaError
-    where a record cannot be simulated.
+    `model` has the values of theta; `level` [m] is that of white noise which tells as little as
+    what the model misses. Raises PsaError where a record cannot be simulated.
     """
     found = theta.copy()
     for k, experiment in enumerate(experiments):
@@ -50,7 +50,7 @@ def beginnings(
         shared = _shared(model, unknowns, theta, experiments, k)
         found[list(shared)] = list(shared.values())
         searched = [c for c in range(first, last) if c not in shared]
-        found[searched] = _sought(model, unknowns, found, experiment, k, sigma[k], searched, way)
+        found[searched] = _sought(model, unknowns, found, experiment, k, level, searched, way)
     return found
 
 
@@ -84,7 +84,7 @@ def _sought(
     theta: FloatArray,
     experiment: Experiment,
     k: int,
-    sigma: float,
+    level: float,
     searched: Sequence[int],
     way: Way,
 ) -> FloatArray:
@@ -103,8 +103,8 @@ def _sought(
         except PsaError:
             return None
         by_start, by_offset = unknowns.place_slopes(there, k)
-        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / sigma
-        missed = (run.output[known] + unknowns.offset(there, k) - y) / sigma
+        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / level
+        missed = (run.output[known] + unknowns.offset(there, k) - y) / level
         return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
 
     return _minimum(evaluate, len(columns))

@@ -27,6 +27,8 @@ from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Correlation of neighbouring residuals that counts at most: a hundred samples are then one.
+_MOST_ALIKE = 0.98
 #: Relative tolerance of a step in fits.
 FIT_RTOL = 1e-6
 
@@ -116,7 +118,21 @@ class Fit:
 
     def placed(self, experiments: Sequence[Experiment]) -> FloatArray:
         """Return theta with where held-out records begin (`beginnings`), which no fit has seen."""
-        return beginnings(self.model, self.unknowns, self.theta, experiments, self.sigma, self.way)
+        return beginnings(
+            self.model, self.unknowns, self.theta, experiments, self._doubt(), self.way
+        )
+
+    def _doubt(self) -> float:
+        """Return the level [m] of white noise that tells as little as what the model misses.
+
+        Of that, samples that are alike count as one. With r the
+        correlation of neighbours, rms sqrt((1 + r)/(1 - r)).
+        """
+        left = self.residuals
+        power = float(left @ left)
+        r = float(left[1:] @ left[:-1]) / power if power > 0.0 else 0.0
+        r = min(max(r, 0.0), _MOST_ALIKE)
+        return max(self.rms * float(np.sqrt((1.0 + r) / (1.0 - r))), 1e-15)
 
 
 @contextmanager
