@@ -27,7 +27,7 @@ from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Evaluations of quick fits beside other causes, and of those afresh that go on; of these the best
 #: so many of one effect, and of any; there the gain begins at so many ordinary sizes.
-_BESIDE, _AFRESH = 12, 17
+_BESIDE, _AFRESH = 12, 45
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Shares of their gains with which the causes begin that are left without another.
 _SHARES = (1.0, 0.3, 0.0)
