@@ -114,7 +114,7 @@ def test_what_is_not_held_out_is_told() -> None:
 
 
 def test_what_is_held_out_but_not_fitted_is_told() -> None:
-    """Slow and wide loops are held out; their first tenth, which gives their start, is not fitted."""
+    """Slow and wide loops are held out; their first tenth, which tells their start, too."""
     small, slow = 0.2 * triangle(1600, 50), triangle(1600, 800)
     found = coverage_notes(divided([record(small)], [record(slow)]))
     assert len(found) == 3

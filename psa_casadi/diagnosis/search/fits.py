@@ -25,9 +25,10 @@ from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 
-#: Evaluations of quick fits beside other causes, and of those afresh that go on; of these the best
-#: so many of one effect, and of any; there the gain begins at so many ordinary sizes.
-_BESIDE, _AFRESH = 12, 45
+#: Evaluations of quick fits beside other causes, of sets afresh, and of one effect afresh that goes
+#: on; of these the best so many of one effect, and of any; there the gain begins at so many
+#: ordinary sizes.
+_BESIDE, _SET_AFRESH, _AFRESH = 12, 17, 45
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Shares of their gains with which the causes begin that are left without another.
 _SHARES = (1.0, 0.3, 0.0)
@@ -92,7 +93,7 @@ def _with_all(
     goal: float,
 ) -> Hypothesis | None:
     """Fit quickly with several more causes, each from its values and gain."""
-    quick = fit_with_all(before.fit, experiments, added, memory, reset, _AFRESH, goal)
+    quick = fit_with_all(before.fit, experiments, added, memory, reset, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
 
 
