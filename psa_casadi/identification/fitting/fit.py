@@ -125,8 +125,8 @@ class Fit:
     def _doubt(self) -> float:
         """Return the level [m] of white noise that tells as little as what the model misses.
 
-        Of that, samples that are alike count as one. With r the
-        correlation of neighbours, rms sqrt((1 + r)/(1 - r)).
+        Samples that are alike count as one: rms sqrt((1 + r)/(1 - r)), r the correlation of
+        neighbours.
         """
         left = self.residuals
         power = float(left @ left)
