@@ -106,6 +106,7 @@ class Component:
     """One piece of physics, declared once and symbolically.
 
     `gain` names the parameter that removes the component exactly at 0 (None for base physics).
+    `linear` names parameters of which it is a factor: a fit holds the gain at 1 and moves them.
     `probe` holds trial values of parameters that have no influence while the gain is 0;
     `finite_step` is the size of the gain, as a share of its scale, at which the effect is looked
     for when its derivative vanishes at 0. `looks_like` is the signature an engineer sees.
@@ -139,6 +140,7 @@ class Component:
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()
     gain: str | None = None
+    linear: tuple[str, ...] = ()
     probe: Mapping[str, tuple[float, ...] | str] = field(default_factory=dict)
     finite_step: tuple[float, ...] = ()
     tone: str | None = None
@@ -167,6 +169,14 @@ class Component:
     def in_plant(self) -> bool:
         """Whether an exported plant holds it: sensor and environment stay outside."""
         return self.belongs_to not in ("sensor", "environment")
+
+    def at_gain(self, gain: float, values: Mapping[str, float]) -> dict[str, float]:
+        """Return the `values` with a gain, as a fit has it: the `linear` ones times it, beside 1."""
+        if not self.linear:
+            return {**values, self.gain or "": gain}
+        declared = {p.name: p.value for p in self.parameters}
+        scaled = {n: gain * values.get(n, declared[n]) for n in self.linear}
+        return {**values, **scaled, self.gain or "": 1.0}
 
     @property
     def fitted(self) -> tuple[str, ...]:

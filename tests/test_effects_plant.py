@@ -145,29 +145,29 @@ def test_contact_kinks_the_curve_at_one_displacement(base: tuple[Component, ...]
         assert meeting == pytest.approx(x_c, rel=0.01)
 
 
-@pytest.mark.parametrize("asymmetry", [0.0, 0.8, -0.6, 0.5 * np.pi])
-@pytest.mark.parametrize(("angle", "bend"), [(0.34, 0.0), (1.7, -0.4)])
-def test_memory_is_a_sum_of_plays_and_their_squares(
-    asymmetry: float, angle: float, bend: float
+@pytest.mark.parametrize(
+    "weights",
+    [{"play": (0.05, 0.02, 0.0)}, {"square": (0.04, 0.0, -0.01)}, {"cube": (0.03, -0.02, 0.0)},
+     {"play": (-0.02, 0.0, 0.01), "square": (0.08, 0.03, 0.0), "cube": (-0.05, 0.0, 0.0)}],
+    ids=["plays", "squares", "cubes", "all"],
+)  # fmt: skip
+def test_memory_is_a_sum_of_plays_their_squares_and_cubes(
+    weights: dict[str, tuple[float, float, float]],
 ) -> None:
     """Of ideal plays with the same weights and thresholds, to the roundness of its stops."""
-    place = np.pi * (np.arange(4) + 0.5) / 4
-    waves = np.array([np.ones(4), np.sqrt(2) * np.cos(place), np.sqrt(2) * np.cos(2 * place)])
-    assert waves @ waves.T == pytest.approx(4.0 * np.eye(3), abs=1e-12)
-    weights = np.array([np.cos(angle), np.sin(angle), bend]) @ waves
-    model = linear(
-        HYSTERESIS_MEMORY, 0.05, memory_threshold=0.02, memory_angle=angle, memory_bend=bend,
-        memory_asymmetry=asymmetry,
-    )  # fmt: skip
+    values = {f"memory_{name}_{k}": 0.0 for name in ("play", "square", "cube") for k in range(3)}
+    values |= {f"memory_{name}_{k}": w for name, row in weights.items() for k, w in enumerate(row)}
+    model = linear(HYSTERESIS_MEMORY, 1.0, memory_threshold=0.02, **values)
     t = np.linspace(0.0, 60.0, 6001)
     voltage = 60.0 * (1.0 - np.cos(2 * np.pi * t / 20.0)) * (1.0 - t / 90.0)
     plain = linear(HYSTERESIS_MEMORY, 0.0)
     shown = driven(model, t, voltage).y[:, -1] - driven(plain, t, voltage).y[:, -1]
     rated, expected = model.values["u_rated"], np.zeros_like(t)
-    for weight, ratio in zip(weights, (1.0, 2.5, 6.0, 15.0), strict=True):
+    for i, ratio in enumerate((1.0, 2.5, 6.0, 15.0)):
         p = play(voltage, 0.02 * ratio * rated)
-        plays, squares = voltage - p, (voltage**2 - p**2) / rated
-        expected += 0.05 * weight * (np.cos(asymmetry) * plays + np.sin(asymmetry) * squares)
+        for power, name in enumerate(("play", "square", "cube"), 1):
+            terms = np.cos(np.pi * np.arange(3) * (i + 0.5) / 4) * weights.get(name, (0.0,) * 3)
+            expected += np.sum(terms) * (voltage**power - p**power) / rated ** (power - 1)
     expected *= model.values["k_L"] * static_compliance(model.values)
     assert np.sqrt(np.mean((shown - expected) ** 2)) < 0.05 * np.ptp(expected)
 

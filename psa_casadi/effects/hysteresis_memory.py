@@ -1,10 +1,7 @@
 """Hysteresis memory: the error depends on past reversal points; minor loops nest differently."""
 
-import math
-
-import casadi as ca
-
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.components.memory_spectrum import spectrum_force, spectrum_parameters
 from psa_casadi.scales import stop_scale
 from psa_casadi.smooth import stop_rate
 from psa_casadi.variables import Parameter, State
@@ -14,28 +11,18 @@ from psa_casadi.variables import Parameter, State
 _NARROWEST = 0.0125
 #: Thresholds of the elements over the first one: more than a decade.
 _RATIOS = (1.0, 2.5, 6.0, 15.0)
+#: Cosines over the elements that the weights of plays, of their squares and cubes are made of.
+_COUNTS = (3, 3, 3)
+#: Mean weight at which it is looked for.
+_ORDINARY = 0.02
 
-
-def _weights(s: Symbols) -> list[Expression]:
-    """Weights: a smooth curve over the elements, of a form that a fit can turn without a stop.
-
-    The first three cosines over the elements, each of the same sum of squares. The base has an
-    element of its own, so that the mean weight may be anything: as an angle it may pass through 0.
-    """
-    places = [math.pi * (i + 0.5) / len(_RATIOS) for i in range(len(_RATIOS))]
-    even, slope = ca.cos(s.memory_angle), math.sqrt(2.0) * ca.sin(s.memory_angle)
-    bend = math.sqrt(2.0) * s.memory_bend
-    return [even + slope * math.cos(x) + bend * math.cos(2.0 * x) for x in places]
+_WEIGHTS = tuple(spectrum_parameters("memory_", _COUNTS, _ORDINARY))
 
 
 def _equations(s: Symbols) -> Equations:
     elements = [getattr(s, f"z_m{i + 1}") for i in range(len(_RATIOS))]
     first = s.memory_threshold * s.u_rated
-    plain, squares = ca.cos(s.memory_asymmetry), ca.sin(s.memory_asymmetry) / s.u_rated
-    total = sum(
-        weight * z * (plain + squares * (2.0 * s.u - z))
-        for weight, z in zip(_weights(s), elements, strict=True)
-    )
+    total = spectrum_force(s, "memory_", elements, _COUNTS)
     return Equations(
         der={
             f"z_m{i + 1}": stop_rate(s, z, ratio * first)
@@ -56,30 +43,27 @@ def _state(index: int) -> State:
     )
 
 
-def _angle(name: str, value: float, text: str) -> Parameter:
-    return Parameter(
-        f"memory_{name}", value, "rad", (-2.0 * math.pi, 2.0 * math.pi), text, scale=0.3
-    )
-
-
 HYSTERESIS_MEMORY = Component(
     name="hysteresis_memory",
     description="a spectrum of further hysteresis elements, symmetric or not",
     source=(
-        "generalised Prandtl-Ishlinskii: plays and their squares (Al Janaideh, Rakheja and Su,"
-        " IEEE/ASME Trans. Mechatronics 16 (2011) 734), as stops in smooth Bouc-Wen form"
+        "generalised Prandtl-Ishlinskii: plays, their squares and cubes (Al Janaideh, Rakheja and"
+        " Su, IEEE/ASME Trans. Mechatronics 16 (2011) 734; a Preisach density of second order in"
+        " the mean of its two thresholds), as stops in smooth Bouc-Wen form"
     ),
     gain="memory_gain",
+    linear=tuple(p.name for p in _WEIGHTS),
     equation_text=(
-        "f = k_L memory_gain sum_i w_i z_i (cos(asymmetry)"
-        " + sin(asymmetry) (2 u - z_i)/u_rated),  "
+        "f = k_L memory_gain sum_i z_i (a_i + b_i (2 u - z_i)/u_rated"
+        " + c_i (3 u^2 - 3 u z_i + z_i^2)/u_rated^2),  "
         "z_i' = u' - (|u'| sgn(z_i) + u')/2 (|z_i|/r_i)^4,  "
         "r_i = threshold u_rated (1, 2.5, 6, 15),  "
-        "w_i = cos(angle) + sin(angle) sqrt(2) cos(pi (i - 1/2)/4)"
-        " + bend sqrt(2) cos(2 pi (i - 1/2)/4)"
+        "a_i = sum_k play_k cos(pi k (i - 1/2)/4),  b_i and c_i of square_k and cube_k likewise"
     ),
     parameters=(
-        Parameter("memory_gain", 0.0, "1", (-2.0, 2.0), "elements' force over k_L", scale=0.02),
+        Parameter(
+            "memory_gain", 0.0, "1", (-2.0, 2.0), "1 with the elements", scale=1.0, fitted=False
+        ),
         Parameter(
             "memory_threshold",
             0.03,
@@ -88,22 +72,15 @@ HYSTERESIS_MEMORY = Component(
             "first threshold over rated voltage",
             log=True,
         ),
-        _angle("angle", 0.34, "form of the weights: 0 equal, pi/2 narrow against wide elements"),
-        Parameter(
-            "memory_bend",
-            0.0,
-            "1",
-            (-20.0, 20.0),
-            "weights of the outer elements more than of the inner",
-            scale=1.0,
-        ),
-        _angle("asymmetry", 0.0, "0: plays, as of a symmetric loop; pi/2: their squares alone"),
+        *_WEIGHTS,
     ),
     states=tuple(_state(i + 1) for i in range(len(_RATIOS))),
     equations=_equations,
     probe={
-        "memory_threshold": (0.03, 0.06),
-        "memory_asymmetry": (-0.25 * math.pi, 0.0, 0.25 * math.pi),
+        "memory_threshold": (0.015, 0.12),
+        "memory_play_0": (_ORDINARY, 0.0),
+        "memory_square_0": (0.0, _ORDINARY),
+        "memory_cube_0": (-0.7 * _ORDINARY, 0.0),
     },
     looks_like=(
         "the residual changes with the distance from past reversal points; minor loops do not nest"

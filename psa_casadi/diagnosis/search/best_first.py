@@ -18,7 +18,7 @@ from psa_casadi.diagnosis.base_fit.variants import (
     instead_of_mode,
     rings,
 )
-from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
+from psa_casadi.diagnosis.noise.colour import noise_rms
 from psa_casadi.diagnosis.search.exchange import exchange
 from psa_casadi.diagnosis.search.fits import (
     afresh,
@@ -41,9 +41,9 @@ from psa_casadi.simulation.timings import stage
 
 #: Hypotheses whose neighbours are fitted, at most, and visits to them.
 _EXPANSIONS, _VISITS = 5, 24
-#: Neighbours whose residual is within this factor of the noise, or that remove this share of the
-#: excess power, need no fits afresh; of a first and a further cause so many get some.
-_SETTLED, _NEARLY, _AFRESH, _AFRESH_FURTHER = 1.02, 0.95, 4, 2
+#: Where a neighbour's residual is within this factor of the noise, none needs fits afresh; else of
+#: a first and a further cause so many get some.
+_SETTLED, _AFRESH, _AFRESH_FURTHER = 1.02, 4, 2
 #: So many neighbours are fitted first.
 _PACE = 2
 
@@ -237,12 +237,11 @@ class _Search:
     @stage("fits afresh")
     def fit_afresh(self, h: Hypothesis, view: View) -> None:
         floor = noise_rms(h.fit.residuals, view.screening.colour)
-        excess = excess_power(h.fit.residuals, view.screening.colour, floor)
         count = _AFRESH_FURTHER if h.causes else _AFRESH
         children = [c for c in self.known.children(h) if not has_series(c)]
-        for k, child in enumerate(children[:count]):
+        for child in children[:count]:
             best = max(self.known.children(h), key=lambda c: c.removes(h))
-            if best.fit.rms < _SETTLED * floor or (k > 0 and best.removes(h) > _NEARLY * excess):
+            if best.fit.rms < _SETTLED * floor:
                 break
             self.tell(h, f"{child.causes[-1].name} afresh")
             self.known.note(afresh(h, self.task.experiments, child))

@@ -84,9 +84,11 @@ def fit_with_all(
         try:
             for effect, values, gain in added:
                 low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
-                own = share * gain if effect.gain in effect.fitted else gain
-                value = float(np.clip(own, 0.9 * low, 0.9 * high))
-                model = model.with_effect(effect, {**values, **reset, effect.gain or "": value})
+                moved = effect.linear or effect.gain in effect.fitted
+                own = share * gain if moved else gain
+                if not effect.linear:
+                    own = float(np.clip(own, 0.9 * low, 0.9 * high))
+                model = model.with_effect(effect, {**effect.at_gain(own, values), **reset})
             found = fit(
                 model,
                 experiments,

@@ -53,6 +53,7 @@ def accurate_minimum(
 ) -> tuple[Minimum, Way, list[Simulated]]:
     """Return the minimum, found by a simulation that is accurate there, and how that was done."""
     allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
+    goal = min(effort.goal, _missing_all(experiments, sigma))
     ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
     ways.append(Way(rtol, 0.1 * rtol, stepped=True))
     spent, before = 0, None
@@ -65,7 +66,7 @@ def accurate_minimum(
                 unknowns.bounds(),
                 tolerance=effort.tolerance,
                 evaluations=max(effort.evaluations - spent, 2),
-                goal=effort.goal,
+                goal=goal,
                 linear=effort.linear,
                 radius=effort.radius if before is None else max(before[0].radius, LEAST_RADIUS),
             )
@@ -86,12 +87,23 @@ def accurate_minimum(
         if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
             current_work().stop()
             return replace(minimum, evaluations=spent), way, []
-        if minimum.cost > effort.goal:  # of no use, however accurate
+        if minimum.cost > goal:  # of no use, however accurate
             return replace(minimum, evaluations=spent), way, []
         told = simulated(model, experiments, unknowns, theta, way=way)
         if not any(t.error > a for t, a in zip(told, allowed, strict=True)):
             break
     return replace(minimum, evaluations=spent), way, told
+
+
+def _missing_all(experiments: Sequence[Experiment], sigma: Sequence[float]) -> float:
+    """Return the cost of missing every sample by the whole range: a loop that diverges misses more.
+
+    Infinite where a further column counts as well.
+    """
+    if any(e.further for e in experiments):
+        return np.inf
+    parts = [(measured(e.record)[e.used], s) for e, s in zip(experiments, sigma, strict=True)]
+    return sum(y.size * float(np.ptp(y) / s) ** 2 for y, s in parts if y.size)
 
 
 def _allowed(experiment: Experiment, sigma: float) -> float:

@@ -105,7 +105,7 @@ def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
         for linear in _linear_fits(best, parts)[:_BEGUN]
     ]
     found = sorted((f for f in begun if f is not None), key=lambda f: f.data_cost)[:_ENDED]
-    ended = [refit(f, experiments, names, sigma=best.sigma) for f in found]
+    ended = [refit(f, experiments, names, sigma=best.sigma, least=best.rms) for f in found]
     if any(f.interrupted for f in (*found, *ended)):
         raise KeyboardInterrupt
     return min(ended, key=lambda f: f.data_cost, default=None)

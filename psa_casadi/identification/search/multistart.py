@@ -108,6 +108,8 @@ def search(
     no start can be simulated.
     """
     so_far: list[Fit] = []
+    off = (c for c in model.effects if c.linear and model.values[c.gain or ""] == 0.0)
+    model = model.with_values({n: v for c in off for n, v in c.at_gain(0.0, {}).items()})
     try:
         return _search(model, experiments, linear, thorough, progress, so_far.append)
     except KeyboardInterrupt:
@@ -217,6 +219,9 @@ def _quick_fits(
         if quick.interrupted:
             break
     found.sort(key=lambda pair: pair[1].data_cost)
+    widest = max(e.record.range_m for e in fitted(experiments))
+    # a loop that diverges is left there, unless all do
+    found = [pair for pair in found if pair[1].rms < widest] or found
     for k, (name, quick) in enumerate(found[: _FINALISTS if len(rounds) > 1 else 0]):
         if any(f.interrupted for _, f in found):
             break
