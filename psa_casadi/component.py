@@ -171,7 +171,7 @@ class Component:
         return self.belongs_to not in ("sensor", "environment")
 
     def at_gain(self, gain: float, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the `values` with a gain, as a fit has it: the `linear` ones times it, beside 1."""
+        """Return `values` with a gain, as a fit has them: the `linear` ones times it, beside 1."""
         if not self.linear:
             return {**values, self.gain or "": gain}
         declared = {p.name: p.value for p in self.parameters}

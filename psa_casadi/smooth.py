@@ -71,18 +71,3 @@ def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
         rate_magnitude(s) * signed_power(ratio, _SHARPNESS)
         + s.voltage_rate * magnitude_power(ratio, _SHARPNESS)
     )
-
-
-def play_polynomial(
-    s: Symbols, z: Expression, plain: Expression, square: Expression, cube: Expression
-) -> Expression:
-    """Return plain (u - p) + square (u^2 - p^2)/u_r + cube (u^3 - p^3)/u_r^2 [V] of a stop z.
-
-    p = u - z is its play, u_r the rated voltage: u^2 - p^2 = z (2 u - z), u^3 - p^3 =
-    z (3 u (u - z) + z^2). Squares make a loop asymmetric, cubes steeper or flatter in its middle;
-    over all thresholds this is a Preisach density of second order in the mean of its thresholds.
-    """
-    u, rated = s.u, s.u_rated
-    return z * (
-        plain + square * (2.0 * u - z) / rated + cube * (3.0 * u * (u - z) + z**2) / rated**2
-    )

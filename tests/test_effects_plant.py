@@ -157,10 +157,10 @@ def test_memory_is_a_sum_of_plays_their_squares_and_cubes(
     """Of ideal plays with the same weights and thresholds, to the roundness of its stops."""
     values = {f"memory_{name}_{k}": 0.0 for name in ("play", "square", "cube") for k in range(3)}
     values |= {f"memory_{name}_{k}": w for name, row in weights.items() for k, w in enumerate(row)}
-    model = linear(HYSTERESIS_MEMORY, 1.0, memory_threshold=0.02, **values)
+    plain = linear(HYSTERESIS_MEMORY, 0.0)
+    model = plain.with_values({"memory_gain": 1.0, "memory_threshold": 0.02, **values})
     t = np.linspace(0.0, 60.0, 6001)
     voltage = 60.0 * (1.0 - np.cos(2 * np.pi * t / 20.0)) * (1.0 - t / 90.0)
-    plain = linear(HYSTERESIS_MEMORY, 0.0)
     shown = driven(model, t, voltage).y[:, -1] - driven(plain, t, voltage).y[:, -1]
     rated, expected = model.values["u_rated"], np.zeros_like(t)
     for i, ratio in enumerate((1.0, 2.5, 6.0, 15.0)):

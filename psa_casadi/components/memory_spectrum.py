@@ -1,58 +1,17 @@
 """The hysteresis as a spectrum of elements: what stands in the place of Bouc-Wen's."""
 
-import math
-from collections.abc import Sequence
-
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.components.wafers import HOLD_RATE
+from psa_casadi.plays import spectrum_force, spectrum_parameters
 from psa_casadi.scales import stop_scale
-from psa_casadi.smooth import play_polynomial, stop_rate
-from psa_casadi.variables import Parameter, State
+from psa_casadi.smooth import stop_rate
+from psa_casadi.variables import State
 
 #: Thresholds over the rated voltage: from a hundredth of it to beyond the widest loop, evenly in
 #: their logarithms, a factor of two apart.
 _THRESHOLDS = tuple(0.0125 * 2.0**i for i in range(8))
 #: Cosines over the elements that the weights of plays, of their squares and cubes are made of.
 _COUNTS = (5, 3, 3)
-#: What the elements add: the powers of their plays.
-POWERS = {"play": "the plays", "square": "the plays' squares", "cube": "the plays' cubes"}
-
-
-def spectrum_force(
-    s: Symbols, prefix: str, elements: Sequence[Expression], counts: Sequence[int]
-) -> Expression:
-    """Return what stop elements add to the voltage [V]: the polynomials of their plays, summed.
-
-    Plays, squares and cubes have weights of their own, each a sum of `counts` cosines over the
-    elements.
-    """
-    places = [math.pi * (i + 0.5) / len(elements) for i in range(len(elements))]
-
-    def weights(name: str, count: int) -> list[Expression]:
-        terms = [getattr(s, f"{prefix}{name}_{k}") for k in range(count)]
-        return [sum(c * math.cos(k * x) for k, c in enumerate(terms)) for x in places]
-
-    each = [weights(name, count) for name, count in zip(POWERS, counts, strict=True)]
-    return sum(play_polynomial(s, z, *own) for z, *own in zip(elements, *each, strict=True))
-
-
-def spectrum_parameters(prefix: str, counts: Sequence[int], mean: float) -> list[Parameter]:
-    """Return the weights of `spectrum_force`; `mean` is that of the plays.
-
-    The k-th cosine has a scale of 1/(k + 1), so that the prior prefers smooth spectra.
-    """
-    return [
-        Parameter(
-            f"{prefix}{name}_{k}",
-            mean if name == "play" and not k else 0.0,
-            "1",
-            (-2.0, 2.0),
-            f"cosine {k} of the weights of {text}" if k else f"mean weight of {text}",
-            scale=0.02 / (k + 1),
-        )
-        for (name, text), count in zip(POWERS.items(), counts, strict=True)
-        for k in range(count)
-    ]
 
 
 def _equations(s: Symbols) -> Equations:

@@ -1,7 +1,7 @@
 """Hysteresis memory: the error depends on past reversal points; minor loops nest differently."""
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.components.memory_spectrum import spectrum_force, spectrum_parameters
+from psa_casadi.plays import spectrum_force, spectrum_parameters
 from psa_casadi.scales import stop_scale
 from psa_casadi.smooth import stop_rate
 from psa_casadi.variables import Parameter, State
@@ -62,7 +62,7 @@ HYSTERESIS_MEMORY = Component(
     ),
     parameters=(
         Parameter(
-            "memory_gain", 0.0, "1", (-2.0, 2.0), "1 with the elements", scale=1.0, fitted=False
+            "memory_gain", 0.0, "1", (-100.0, 100.0), "1 with the elements", scale=1.0, fitted=False
         ),
         Parameter(
             "memory_threshold",

@@ -74,9 +74,12 @@ def _direction(s: Symbols) -> Equations:
 def _memory(s: Symbols) -> Equations:
     span, q = s.patch_high - s.patch_low, _place(s, s.u)
     stops = [getattr(s, f"z_p{k + 1}") for k in range(ELEMENTS)]
-    weights = _weights(s, 2 * ELEMENTS)
-    total = sum(w * z / span for w, z in zip(weights[:ELEMENTS], stops, strict=True))
-    total += sum(w * (q - z / span) ** 2 for w, z in zip(weights[ELEMENTS:], stops, strict=True))
+    weights = _weights(s, 3 * ELEMENTS)
+    each = zip(*(weights[k * ELEMENTS : (k + 1) * ELEMENTS] for k in range(3)), strict=True)
+    total = 0.0
+    for (plain, square, cube), z in zip(each, stops, strict=True):
+        p = q - z / span
+        total += plain * z / span + square * p**2 + cube * p**3
     return Equations(
         der={f"z_p{k + 1}": stop_rate(s, z, radius(k) * span) for k, z in enumerate(stops)},
         add={"free_force": static_stiffness(s) * s.patch_gain * total},
@@ -180,7 +183,7 @@ PATCHES: Mapping[tuple[str, str], Component] = {
         "memory",
         "force",
         _memory,
-        _parameters(2 * ELEMENTS, "V"),
+        _parameters(3 * ELEMENTS, "V"),
         _states(ELEMENTS, "V", voltage_scale, settles=False),
     ),
     ("relaxation", "force"): _patch(

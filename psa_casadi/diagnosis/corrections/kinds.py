@@ -5,14 +5,14 @@ data, p_k the shape of the prior, smooth where 1/k or steeper. Quantities are ov
 
     curve         cos(k pi q)                       p_k = 1/k            of voltage or displacement
     direction     d cos(k pi q), k from 0           p_k = 1/(1 + k)      d a narrow stop, -1 to 1
-    memory        stops E_r and plays' squares      p_k = 1              of the voltage
+    memory        stops E_r, plays^2, plays^3       p_k = 1              of the voltage
     relaxation    z_tau - x, tau z' + z = x         p_k = 1              tau over decades
     modes         resonators driven by the force    p_k = 1              frequencies over decades
     time          cos(k pi t/T)                     p_k = 1/k            of every record
     gain in time  x cos(k pi t/T)                   p_k = 1/k
 
-Stops and plays: Visintin 1994; their squares make asymmetric loops (generalised Prandtl-Ishlinskii,
-Al Janaideh, Rakheja and Su 2009).
+Stops and plays: Visintin 1994; their squares and cubes make loops that are asymmetric or S-shaped
+(generalised Prandtl-Ishlinskii, Al Janaideh, Rakheja and Su 2009).
 """
 
 from collections.abc import Callable, Sequence
@@ -106,7 +106,7 @@ def _memory(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
     radii = np.array([radius(k) for k in range(ELEMENTS)])
     plays = _plays(q, radii)
-    return s.respond(k, np.hstack([q[:, None] - plays, plays**2]))
+    return s.respond(k, np.hstack([q[:, None] - plays, plays**2, plays**3]))
 
 
 def _relaxation(s: Signals, k: int) -> FloatArray:
