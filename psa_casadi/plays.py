@@ -1,4 +1,4 @@
-"""A spectrum of hysteresis elements: what play operators, their squares and cubes add to a force."""
+"""A spectrum of hysteresis elements: what plays, their squares and cubes add to a force."""
 
 import math
 from collections.abc import Sequence
