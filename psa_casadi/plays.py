@@ -28,15 +28,17 @@ def spectrum_force(
     return sum(_polynomial(s, z, *own) for z, *own in zip(elements, *each, strict=True))
 
 
-def spectrum_parameters(prefix: str, counts: Sequence[int], mean: float) -> list[Parameter]:
-    """Return the weights of `spectrum_force`; `mean` is that of the plays.
+def spectrum_parameters(
+    prefix: str, counts: Sequence[int], plays: Sequence[float]
+) -> list[Parameter]:
+    """Return the weights of `spectrum_force`; the first ones of the `plays` begin as given.
 
     The k-th cosine has a scale of 1/(k + 1), so that the prior prefers smooth spectra.
     """
     return [
         Parameter(
             f"{prefix}{name}_{k}",
-            mean if name == "play" and not k else 0.0,
+            plays[k] if name == "play" and k < len(plays) else 0.0,
             "1",
             (-2.0, 2.0),
             f"cosine {k} of the weights of {text}" if k else f"mean weight of {text}",

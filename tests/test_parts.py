@@ -95,7 +95,7 @@ def test_the_compensator_makes_the_reference_linear() -> None:
 @pytest.mark.parametrize(
     ("effect", "gain"),
     [
-        pytest.param("hysteresis_memory", 0.05, marks=slow),
+        pytest.param("hysteresis_memory", 2.5, marks=slow),
         ("field_dependent_gain", 0.1),
         pytest.param("saturation_of_strain", 0.3, marks=slow),
     ],

@@ -51,7 +51,7 @@ MEMORY_SPECTRUM = Component(
         "a_i = sum_k play_k cos(pi k (i - 1/2)/8),  b_i and c_i of square_k and cube_k likewise"
     ),
     parameters=(
-        *spectrum_parameters("", _COUNTS, -0.03),
+        *spectrum_parameters("", _COUNTS, (-0.03,)),
         HOLD_RATE,
     ),
     states=tuple(_state(i + 1) for i in range(len(_THRESHOLDS))),

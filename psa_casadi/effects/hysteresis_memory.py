@@ -13,10 +13,10 @@ _NARROWEST = 0.0125
 _RATIOS = (1.0, 2.5, 6.0, 15.0)
 #: Cosines over the elements that the weights of plays, of their squares and cubes are made of.
 _COUNTS = (3, 3, 3)
-#: Mean weight at which it is looked for.
+#: Mean weight at which it is looked for; an ordinary one is larger in narrow elements.
 _ORDINARY = 0.02
 
-_WEIGHTS = tuple(spectrum_parameters("memory_", _COUNTS, _ORDINARY))
+_WEIGHTS = tuple(spectrum_parameters("memory_", _COUNTS, (_ORDINARY, 0.5 * _ORDINARY)))
 
 
 def _equations(s: Symbols) -> Equations:
@@ -79,6 +79,7 @@ HYSTERESIS_MEMORY = Component(
     probe={
         "memory_threshold": (0.015, 0.12),
         "memory_play_0": (_ORDINARY, 0.0),
+        "memory_play_1": (0.0,),
         "memory_square_0": (0.0, _ORDINARY),
         "memory_cube_0": (-0.7 * _ORDINARY, 0.0),
     },
