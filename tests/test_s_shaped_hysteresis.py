@@ -10,6 +10,7 @@ from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import compose
 from psa_casadi.records.split import whole
+from tests.exam.hysteresis import relay_means
 from tests.tiers import slow
 
 _MEMORY = EFFECTS["hysteresis_memory"]
@@ -30,12 +31,8 @@ def _record() -> psa.Record:
     drawn = rng.uniform(-0.1, 1.1, 40_000)
     likely = 1.0 + 0.8 * np.exp(-(((drawn - 0.5) / 0.3) ** 2))
     middle = _RATED * drawn[rng.uniform(0.0, 1.8, drawn.size) < likely][:4000]
-    up, down, state = middle + width / 2.0, middle - width / 2.0, np.full(4000, -1.0)
-    means = np.empty(t.size)
-    for k, x in enumerate(v):
-        state[x >= up] = 1.0
-        state[x <= down] = -1.0
-        means[k] = state.mean()
+    up, down = middle + width / 2.0, middle - width / 2.0
+    means = relay_means(v, up, down, np.full(4000, -1.0))
     x = 0.7 * v / _RATED + 0.15 * (means + 1.0)
     noise = rng.normal(0.0, _NOISE, t.size)
     return psa.record_from(

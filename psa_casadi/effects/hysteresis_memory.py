@@ -79,7 +79,7 @@ HYSTERESIS_MEMORY = Component(
     probe={
         "memory_threshold": (0.015, 0.12),
         "memory_play_0": (_ORDINARY, 0.0),
-        "memory_play_1": (0.0,),
+        "memory_play_1": (0.0,),  # the same weight in all elements
         "memory_square_0": (0.0, _ORDINARY),
         "memory_cube_0": (-0.7 * _ORDINARY, 0.0),
     },

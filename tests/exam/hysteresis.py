@@ -59,12 +59,18 @@ def relays(
     up, down = middle + width / 2, middle - width / 2
     state = np.where(rng.random(count) < 0.5, 1.0, -1.0)
     before = approach(history, 50)
+    means = relay_means(np.concatenate((before, u)), up, down, state)
+    return (1 - share) * u + share * means[before.size :] * span / 2
+
+
+def relay_means(path: Floats, up: Floats, down: Floats, state: Floats) -> Floats:
+    """Return the mean of relays of thresholds up and down along a path; `state` is moved."""
     means = []
-    for x in np.concatenate((before, u)).tolist():
+    for x in path.tolist():
         state[x >= up] = 1.0
         state[x <= down] = -1.0
         means.append(state.mean())
-    return (1 - share) * u + share * np.array(means[before.size :]) * span / 2
+    return np.array(means)
 
 
 def prandtl_ishlinskii(

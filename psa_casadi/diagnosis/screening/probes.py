@@ -104,7 +104,10 @@ def _probe_values(
         else:
             grids.append(grid)
     for point in product(*grids):
-        yield dict(zip(effect.probe, point, strict=True))
+        values = dict(zip(effect.probe, point, strict=True))
+        weights = effect.at_gain(1.0, values)
+        if not effect.linear or any(weights[n] for n in effect.linear):  # else it adds nothing
+            yield values
 
 
 def _directions_at(
