@@ -3,11 +3,14 @@
 The stack begins as in the fitted records of the device that begin at the same voltage: what the
 first tenth of a record tells of its memories is mostly the model's own error there. A loop that is
 simulated from it drifts off by a tenth of the range, where one that begins as the device's other
-records do stays within a hundredth. States of drive, sensor and environment belong to the record,
-as does the whole start where no fitted record begins alike: the first tenth finds them.
+records do stays within a hundredth. Where no fitted record begins alike, the first tenth finds the
+whole start. States of drive, sensor and environment belong to the record, and the first tenth finds
+them, too; but it hardly tells a charge that leaks slowly from the sensor's offset, and what it
+leaves open grows along the record. So such a state is looked for within the size that it has where
+the fitted records begin which begin alike (their root mean square is its prior).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +27,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: First voltages that differ by less than this share of the records' range are the same.
 _SAME = 0.01
+#: Coordinates of a start are of order 1: smaller than this none is known.
+_LEAST = 1e-6
 #: How far the start is sought in the first tenth.
 _EVALUATIONS, _TOLERANCE = 30, 1e-5
 
@@ -42,36 +47,45 @@ def beginnings(
     what the model misses. Raises PsaError where a record cannot be simulated.
     """
     found = theta.copy()
+    own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
     for k, experiment in enumerate(experiments):
         if not experiment.held_out_whole or not experiment.known.any():
             continue
         first, last = unknowns.first(k), unknowns.first(k + 1)
         found[first:last] = 0.0
-        shared = _shared(model, unknowns, theta, experiments, k)
-        found[list(shared)] = list(shared.values())
-        searched = [c for c in range(first, last) if c not in shared]
-        found[searched] = _sought(model, unknowns, found, experiment, k, level, searched, way)
+        told = _told(unknowns, theta, experiments, k)
+        shared = {c: told[c] for c in told if unknowns.started[k][c - first] not in own}
+        found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
+        sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
+        for c in sizes.keys() & told.keys():
+            size = float(np.sqrt(np.mean(np.square(told[c]))))
+            sizes[c] = min(sizes[c], max(size, _LEAST))
+        found[list(sizes)] = _sought(model, unknowns, found, experiment, k, level, sizes, way)
     return found
 
 
-def _shared(
-    model: Model, unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
-) -> dict[int, float]:
-    """Return the coordinates of the stack's own start that the other records tell of record k."""
-    own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
+def _told(
+    unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
+) -> dict[int, list[float]]:
+    """Return what the fitted records that begin as record k does tell of its start's coordinates.
+
+    One value for each of these records, by the coordinate's place.
+    """
+    first = unknowns.first(k)
     size = max(float(np.ptp(e.record.voltage)) for e in experiments)
-    first = [float(e.record.voltage[0]) for e in experiments]
+    begins = [float(e.record.voltage[0]) for e in experiments]
     alike = [
         j
         for j, other in enumerate(experiments)
-        if not other.held_out_whole and abs(first[j] - first[k]) <= _SAME * size
+        if not other.held_out_whole and abs(begins[j] - begins[k]) <= _SAME * size
     ]
-    found = {}
-    for name in unknowns.started[k]:
-        told = [theta[_place(unknowns, j, name)] for j in alike if name in unknowns.started[j]]
-        if told and name not in own:
-            found[_place(unknowns, k, name)] = float(np.mean(told))
-    return found
+    found = {
+        first + place: [
+            float(theta[_place(unknowns, j, name)]) for j in alike if name in unknowns.started[j]
+        ]
+        for place, name in enumerate(unknowns.started[k])
+    }
+    return {c: values for c, values in found.items() if values}
 
 
 def _place(unknowns: Unknowns, record: int, name: str) -> int:
@@ -85,13 +99,13 @@ def _sought(
     experiment: Experiment,
     k: int,
     level: float,
-    searched: Sequence[int],
+    sizes: Mapping[int, float],
     way: Way,
 ) -> FloatArray:
-    """Return the coordinates `searched` of record k with which its first samples fit best."""
-    known, columns = np.flatnonzero(experiment.known), list(searched)
+    """Return the coordinates of record k with which its first tenth fits best, of such sizes."""
+    known, columns = np.flatnonzero(experiment.known), list(sizes)
     stop = int(known[-1]) + 1
-    y, prior = measured(experiment.record)[known], 1.0 / unknowns.prior[columns]
+    y, prior = measured(experiment.record)[known], 1.0 / np.array(list(sizes.values()))
 
     def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         there = theta.copy()
