@@ -74,7 +74,10 @@ def test_the_finding_is_told_and_repeats(run: Run) -> None:
     assert again is not None
     assert again.period == pytest.approx(found.period, rel=0.01)
     assert again.height == pytest.approx(found.height, rel=0.01)
-    assert any("sampled by two clocks" in s for s in prepared(given)[1])
+    ready, said = prepared(given)
+    assert any("sampled by two clocks" in s for s in said)
+    assert two_clocks(ready) is None
+    assert (ready.name, ready.sha256) == (given.name, given.sha256)
     gaps[100:110] = np.nan
     with_gaps = two_clocks(replace(given, displacement=gaps))
     assert with_gaps is not None

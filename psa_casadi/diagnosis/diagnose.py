@@ -25,7 +25,7 @@ from psa_casadi.identification.start.form import Hysteresis, forms_of
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.identification.start.other_quantities import refuse_wrapped
 from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
-from psa_casadi.identification.start.two_clocks import clocks_said
+from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
@@ -86,7 +86,8 @@ def diagnose(
             clean, said, hidden = _cleaned(ordered)
             said += [*cut, *cut_too]
             judged = [cleaned(r) for r in apart]
-            said += [s for r in (*clean, *judged) for s in clocks_said(r)]
+            if "one clock" not in method.without:
+                clean, judged = _on_one_clock(clean, said), _on_one_clock(judged, said)
             experiments = divided(clean, judged)
             start, scale_given = chosen_start(clean, model, stiffness)
             columns = columns_of(start, [e.record for e in experiments])
@@ -146,6 +147,13 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]
             said.append(COARSE_NOTE.format(r.name, r.range_m / own.quantum))
     saturated = sum(own.counts["saturated"] for own in found)
     return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
+
+
+def _on_one_clock(records: Sequence[Record], said: list[str]) -> list[Record]:
+    """Return the records with their readings on one clock; what is done to them goes to `said`."""
+    done = [on_one_clock(r) for r in records]
+    said += [s for _, own in done for s in own]
+    return [r for r, _ in done]
 
 
 def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:

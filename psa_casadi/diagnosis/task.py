@@ -18,9 +18,11 @@ _TELL_BENDS = ("displacement_2", "strain")
 #: The steps of the method that a diagnosis can go without, to show what each is good for, and what
 #: is done in their place.
 STEPS = {
+    "one clock": "readings stay on a clock of their own, whatever the data say",
     "remainder": "the noise's colour is that of the residual, not of what nothing explains",
     "finite steps": "effects whose derivative vanishes at their null are not looked for by a step",
     "fits afresh": "no fits from an ordinary base beside those from the fitted one",
+    "other parents": "a set is fitted from one of its parents only",
     "base again": "the base is not fitted again from where a cause has led",
     "resonances": "no resonances that the base has missed are tried",
     "several modes": "no series of modes is fitted where one leaves structure",

@@ -76,13 +76,7 @@ HYSTERESIS_MEMORY = Component(
     ),
     states=tuple(_state(i + 1) for i in range(len(_RATIOS))),
     equations=_equations,
-    probe={
-        "memory_threshold": (0.015, 0.12),
-        "memory_play_0": (_ORDINARY, 0.0),
-        "memory_play_1": (0.0,),  # the same weight in all elements
-        "memory_square_0": (0.0, _ORDINARY),
-        "memory_cube_0": (-0.7 * _ORDINARY, 0.0),
-    },
+    probe={"memory_threshold": (0.015, 0.12)},
     looks_like=(
         "the residual changes with the distance from past reversal points; minor loops do not nest"
     ),

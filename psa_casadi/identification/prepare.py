@@ -1,14 +1,19 @@
-"""What is done to a record before it is fitted: suspect samples masked, oversampling averaged."""
+"""What is done to a record before it is fitted: readings masked, put on one clock, averaged."""
 
 import numpy as np
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
-from psa_casadi.identification.start.two_clocks import clocks_said
+from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.quality.fast_noise import fast_noise
-from psa_casadi.records.quality.suspects import masked, suspects
+from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.record import Record
+
+
+def as_read(record: Record) -> Record:
+    """Return the record with suspect samples masked and its readings on one clock."""
+    return on_one_clock(cleaned(record))[0]
 
 
 def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
@@ -18,8 +23,8 @@ def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
     averages lose nothing, they take the samples' place.
     """
     found = suspects(record)
-    clean = masked(record, found)
-    said = [*found.sentences(record.name), *clocks_said(clean)]
+    clean, clocks = on_one_clock(masked(record, found))
+    said = [*found.sentences(record.name), *clocks]
     y = measured(clean)
     noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([clean])
     if noise <= 0 or slope == 0:

@@ -142,6 +142,8 @@ def _freedom(fit: Fitted) -> int:
 
 
 def _linear(score: Score, gained: float) -> float:
+    if score.penalty is not None:
+        return gained - score.penalty
     if not np.isfinite(score.detectable_gain) or score.detectable_gain == 0.0:
         return 0.0
     width = LINEAR_PRIOR * score.direction.unit_gain / abs(score.detectable_gain)

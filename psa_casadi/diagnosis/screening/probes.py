@@ -43,7 +43,8 @@ class Direction:
     `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
     times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
     history. `one_sided` says that only positive multiples make sense. `further` are the same
-    changes of the further columns, in their units, without what their offsets can follow.
+    changes of the further columns, in their units, without what their offsets can follow. `weight`
+    names the parameter that moves, of several that an effect is linear in (see `spans`).
     """
 
     effect: Component
@@ -54,6 +55,7 @@ class Direction:
     one_sided: bool
     finite: bool
     further: tuple[FloatArray, ...] = ()
+    weight: str = ""
 
 
 def directions(
@@ -104,10 +106,7 @@ def _probe_values(
         else:
             grids.append(grid)
     for point in product(*grids):
-        values = dict(zip(effect.probe, point, strict=True))
-        weights = effect.at_gain(1.0, values)
-        if not effect.linear or any(weights[n] for n in effect.linear):  # else it adds nothing
-            yield values
+        yield dict(zip(effect.probe, point, strict=True))
 
 
 def _directions_at(
@@ -122,18 +121,28 @@ def _directions_at(
     parameter = model.parameter(gain)
     scale = parameter.typical({**model.values, gain: 0.0})
     one_sided = parameter.bounds[0] >= 0
+    moved, steps = {gain: scale}, [s * scale for s in effect.finite_step if finite_steps] or [0.0]
+    if effect.linear:
+        model = model.with_values(effect.at_gain(0.0, {}))
+        moved, steps = {n: model.parameter(n).typical(model.values) for n in effect.linear}, [0.0]
     for memory in _histories(fit, experiments, effect, model):
-        for step in [s * scale for s in effect.finite_step if finite_steps] or [0.0]:
-            trial = _Trial(fit, experiments, model, gain, memory, step, scale)
+        for step in steps:
+            trial = _Trial(fit, experiments, model, moved, memory, step)
             try:
-                column, further = trial.column(), trial.further()
+                columns, further = trial.columns(), trial.further()
             except PsaError:
                 continue
-            every = np.concatenate([column, *further])
-            if np.all(np.isfinite(every)) and np.any(every):
+            for k, (name, size) in enumerate(moved.items()):
+                column, others = columns[:, k], tuple(f[:, k] for f in further)
+                every = np.concatenate([column, *others])
+                if not np.all(np.isfinite(every)) or not np.any(every):
+                    continue
+                weight = name if effect.linear else ""
                 yield Direction(
-                    effect, values, memory, step or scale, column, one_sided, bool(step), further
-                )
+                    effect, {**values, weight: size} if weight else values, memory,
+                    1.0 if weight else step or size, column,
+                    one_sided and not weight, bool(step), others, weight,
+                )  # fmt: skip
 
 
 def _histories(
@@ -156,53 +165,54 @@ def _histories(
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """One gain of a model, moved by a finite `step`, or by its `scale` along the derivative."""
+    """Parameters `moved` along their derivatives, by their sizes; or the one by a finite `step`."""
 
     fit: Fit
     experiments: Sequence[Experiment]
     model: Model
-    gain: str
+    moved: Mapping[str, float]
     memory: tuple[dict[str, float], ...]
     step: float
-    scale: float
 
-    def column(self) -> FloatArray:
-        """Return what the gain changes in the displacement's used samples [m]."""
+    def columns(self) -> FloatArray:
+        """Return what each changes in the displacement's used samples (samples, m) [m]."""
         parts = [self._moved(k, OUTPUT) for k in range(len(self.experiments))]
         if self.step:
             left = self.fit.residuals_of(self.experiments)
             for k, (e, residual) in enumerate(zip(self.experiments, left, strict=True)):
                 shown = measured(e.record)[: e.stop][e.used[: e.stop]]
-                parts[k] = parts[k] + self.fit.offset(k) - (shown - residual)
+                parts[k] = parts[k] + (self.fit.offset(k) - (shown - residual))[:, None]
         return np.concatenate(parts)
 
     def further(self) -> tuple[FloatArray, ...]:
-        """Return what it changes in every further column, beyond offsets and factors."""
+        """Return what each changes in every further column, beyond offsets and factors."""
         found = []
         for f in self.fit.further:
             records = with_column(self.experiments, f.column)
             left = f.left_of(np.concatenate([self._in_column(f, k) for k in records]))
-            found.append(left + f.residuals if self.step else left)
+            found.append(left + f.residuals[:, None] if self.step else left)
         return tuple(found)
 
     def _in_column(self, f: Further, k: int) -> FloatArray:
         e = self.experiments[k]
         total = -measured_in(e, f.column) if self.step else np.zeros(int(e.used.sum()))
+        total = total[:, None]
         for factor, output in zip(f.factors, COLUMNS[f.column].outputs, strict=True):
             total = total + factor * self._moved(k, output)
         return total
 
     def _moved(self, k: int, output: str) -> FloatArray:
-        """Return an output after the step, or its change along the derivative."""
+        """Return an output after the step, or its changes along the derivatives (samples, m)."""
         e, step = self.experiments[k], self.step
         if e.held_out_whole:
-            return np.zeros(0)
-        model = self.model.with_values({self.gain: step}) if step else self.model
+            return np.zeros((0, len(self.moved)))
+        model = self.model.with_values(dict.fromkeys(self.moved, step)) if step else self.model
         start = dict.fromkeys(memory_names(model.structure), 0.0) | self.memory[k]
         rtol = self.fit.way.rtol if step else _RTOL
         found = trace_record(
-            model, e.record, start, () if step else (self.gain,),
+            model, e.record, start, () if step else tuple(self.moved),
             stop=e.stop, way=Way(rtol, rtol), by_start=False, output=output,
         )  # fmt: skip
-        moved = found.output if step else found.sensitivity[:, 0] * self.scale
+        sizes = np.array(list(self.moved.values()))
+        moved = found.output[:, None] if step else found.sensitivity * sizes
         return moved[e.used[: e.stop]]

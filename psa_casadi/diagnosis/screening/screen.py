@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.colour import Colour, colour_of
 from psa_casadi.diagnosis.screening.probes import Direction
+from psa_casadi.diagnosis.screening.spans import Span, combined, declared, spans
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fitted import Fitted
 
@@ -27,12 +28,17 @@ _WORTH, _LEADING, _MOST, _AS_NEAR = 0.1, 4, 7, 0.4
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """One direction's decrease of the whitened sum of squares, and the gain it suggests."""
+    """One direction's decrease of the whitened sum of squares, and the gain it suggests.
+
+    Of a span (see `spans`) the direction is the best one in it; `penalty` is what the evidence
+    loses by its weights.
+    """
 
     direction: Direction
     decrease: float
     gain: float
     detectable_gain: float
+    penalty: float | None = None
 
     @property
     def start(self) -> float:
@@ -104,8 +110,16 @@ def screen(
     norm = np.where(usable, norm, 1.0)
     unit = np.where(usable, white / norm, 0.0)
     t = unit.T @ residual / colour.level
-    scores = []
-    for k, direction in enumerate(trials):
+    scores, seen = [], []
+    gram = unit.T @ unit
+    for places in spans(trials):
+        own = [trials[k] for k in places]
+        if own[0].weight:
+            span = Span(gram[np.ix_(places, places)], norm[places] * usable[places] / colour.level)
+            seen.append((places, span))
+            scores.append(_of_span(own, span, t[places]))
+            continue
+        k, direction = places[0], own[0]
         allowed = usable[k] and (t[k] > 0 or not direction.finite)
         scores.append(
             Score(
@@ -116,7 +130,18 @@ def screen(
             )
         )
     scores.sort(key=lambda s: -s.decrease)
-    return Screening(tuple(scores), _threshold(unit), colour)
+    return Screening(tuple(scores), _threshold(gram, seen), colour)
+
+
+def _of_span(own: Sequence[Direction], span: Span, t: FloatArray) -> Score:
+    """Return the score of a span's best direction; `t` (m,) are the residual's projections."""
+    return Score(
+        combined(own, span.gains(t)),
+        float(span.decrease(t)),
+        1.0,
+        span.detectable(declared(own)),
+        float(np.sum(span.penalties)) - 0.5 * span.surplus,
+    )
 
 
 def whitened_residuals(fit: Fitted, colour: Colour) -> FloatArray:
@@ -181,11 +206,31 @@ def copies(
         if power <= 0 or not large.size:
             continue
         share = float(np.sum((independent(free[:, large]).T @ target) ** 2)) / power
-        along = free[:, large].T @ target / norms[large]
-        best = int(np.argmax(np.abs(along)))
-        direction, norm = own[int(large[best])], float(norms[large[best]])
-        found[name] = Copy(share, direction, float(along[best]) / norm * direction.unit_gain)
+        usable = np.isin(np.arange(len(own)), large)
+        unit, sizes = np.where(usable, free / np.where(usable, norms, 1.0), 0.0), usable * norms
+        along = unit.T @ target / colour.level
+        ways = [_copy(own, p, unit, sizes / colour.level, along) for p in spans(own)]
+        _, direction, gain = max(ways, key=lambda w: w[0])
+        found[name] = Copy(share, direction, gain)
     return power / colour.level**2, found
+
+
+def _copy(
+    trials: Sequence[Direction],
+    places: Sequence[int],
+    unit: FloatArray,
+    norms: FloatArray,
+    along: FloatArray,
+) -> tuple[float, Direction, float]:
+    """Return how much of a target a span or a direction explains, and how it does so best."""
+    first = trials[places[0]]
+    if not first.weight:
+        t, norm = float(along[places[0]]), float(norms[places[0]])
+        return t**2, first, t / max(norm, 1e-300) * first.unit_gain
+    span = Span(unit[:, places].T @ unit[:, places], norms[places])
+    own = [trials[k] for k in places]
+    t_own = along[list(places)]
+    return float(span.decrease(t_own)), combined(own, span.gains(t_own)), 1.0
 
 
 def independent(columns: FloatArray) -> FloatArray:
@@ -208,13 +253,19 @@ def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
     return projected
 
 
-def _threshold(unit: FloatArray) -> float:
-    """Quantile of the largest squared projection of white noise on the unit directions."""
-    if not unit.shape[1]:
+def _threshold(gram: FloatArray, seen: Sequence[tuple[list[int], Span]]) -> float:
+    """Quantile of the largest decrease that white noise makes along directions and spans.
+
+    `gram` is that of the unit directions, `seen` has the places of those that are in spans.
+    """
+    if not len(gram):
         return np.inf
-    gram = unit.T @ unit
     values, vectors = np.linalg.eigh(gram)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     noise = np.random.default_rng(_SEED).standard_normal((_DRAWS, len(gram)))
-    largest = np.max((noise @ root.T) ** 2, axis=1)
+    drawn = noise @ root.T
+    single = np.ones(len(gram), dtype=bool)
+    single[[k for places, _ in seen for k in places]] = False
+    every = [*(drawn[:, single] ** 2).T, *(span.decrease(drawn[:, p]) for p, span in seen)]
+    largest = np.max(every, axis=0)
     return float(np.quantile(largest, 1.0 - thresholds().false_alarm))

@@ -21,7 +21,9 @@ from psa_casadi.diagnosis.screening.screen import (
     whitened_residuals,
     without,
 )
+from psa_casadi.diagnosis.screening.spans import Span, combined, spans
 from psa_casadi.identification.fitting.fitted import Fitted
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,7 +35,8 @@ _NEW = 1e-4
 class Together:
     """Directions of different effects, the gains that fit best together, and what they promise.
 
-    `promise` is n/2 ln(S / (S - D)): S the whitened sum of squares, D its decrease.
+    `promise` is n/2 ln(S / (S - D)): S the whitened sum of squares, D its decrease. What the
+    evidence loses by more weights than one of a span (see `spans`) is taken off.
     """
 
     directions: tuple[Direction, ...]
@@ -44,6 +47,48 @@ class Together:
     def names(self) -> frozenset[str]:
         """Names of the effects."""
         return frozenset(d.effect.name for d in self.directions)
+
+
+def _ways(
+    trials: Sequence[Direction], gram: FloatArray, sizes: FloatArray
+) -> tuple[dict[str, npt.NDArray[np.int64]], FloatArray, FloatArray]:
+    """Return the directions (ways, m) of each effect, what priors add to the gram, and costs.
+
+    `gram` is that of unit directions, `sizes` are theirs over the noise level, 0 where the fitted
+    parameters can follow one. `costs` stand at the first place of a span: what the evidence loses
+    by its weights but for the best told combination. A span that lacks a weight is left out.
+    """
+    found: dict[str, list[list[int]]] = {}
+    weak, cost = np.full(len(trials), _NEW**2), np.zeros(len(trials))
+    for places in spans(trials):
+        first, own = trials[places[0]], sizes[places]
+        if first.weight:
+            span = Span(gram[np.ix_(places, places)], own)
+            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * own, _NEW) ** 2
+            cost[places[0]] = float(np.sum(span.penalties[:-1]))
+        if first.weight or own[0]:
+            found.setdefault(first.effect.name, []).append(places)
+    most = {name: max(map(len, own)) for name, own in found.items()}
+    whole = {n: [p for p in own if len(p) == most[n]] for n, own in found.items()}
+    return {n: np.array(own, dtype=np.int64) for n, own in whole.items()}, weak, cost
+
+
+def _together(
+    trials: Sequence[Direction],
+    own: Sequence[npt.NDArray[np.int64]],
+    places: npt.NDArray[np.int64],
+    multiples: FloatArray,
+    promise: float,
+) -> Together:
+    """Return the directions at these places with their multiples, those of a span as one."""
+    ends = np.cumsum([p.shape[1] for p in own])[:-1]
+    directions, gains = [], []
+    for of_one, sizes in zip(np.split(places, ends), np.split(multiples, ends), strict=True):
+        these = [trials[int(k)] for k in of_one]
+        whole = combined(these, sizes) if these[0].weight else these[0]
+        directions.append(whole)
+        gains.append(whole.unit_gain if these[0].weight else float(sizes[0]) * whole.unit_gain)
+    return Together(tuple(directions), tuple(gains), promise)
 
 
 def best_sets(
@@ -64,38 +109,31 @@ def best_sets(
     columns = colour.whiten_all(main, further_columns(fit, trials))
     free = without(columns, basis)
     norm = np.linalg.norm(free, axis=0)
-    usable = np.flatnonzero(norm > _NEW * np.linalg.norm(columns, axis=0))
-    unit = free[:, usable] / norm[usable]
-    gram, along = unit.T @ unit + _NEW**2 * np.eye(len(usable)), unit.T @ residual
-    own = [trials[int(k)] for k in usable]
-    positive = np.array([d.one_sided or d.finite for d in own], dtype=bool)
-    of_effect: dict[str, list[int]] = {}
-    for k, direction in enumerate(own):
-        of_effect.setdefault(direction.effect.name, []).append(k)
+    usable = norm > _NEW * np.linalg.norm(columns, axis=0)
+    unit = np.where(usable, free / np.where(usable, norm, 1.0), 0.0)
+    gram, along = unit.T @ unit, unit.T @ residual
+    positive = np.array([d.one_sided or d.finite for d in trials], dtype=bool)
+    ways, weak, cost = _ways(trials, gram, norm * usable / colour.level)
+    gram += np.diag(weak)
     total, n = float(residual @ residual), len(residual)
     found = []
-    for names in combinations(of_effect, size):
+    for names in combinations(ways, size):
         if any(len(set(names) & set(group)) > 1 for group in alike):
             continue
-        grids = np.meshgrid(*(of_effect[name] for name in names), indexing="ij")
-        index = np.stack([g.ravel() for g in grids], axis=1)
+        own = [ways[name] for name in names]
+        grids = np.meshgrid(*(np.arange(len(p)) for p in own), indexing="ij")
+        index = np.hstack([p[g.ravel()] for p, g in zip(own, grids, strict=True)])
         systems = gram[index[:, :, None], index[:, None, :]]
         gains = np.linalg.solve(systems, along[index][:, :, None])[:, :, 0]
         decrease = np.sum(gains * along[index], axis=1)
         decrease[np.any(positive[index] & (gains <= 0.0), axis=1)] = 0.0
         best = int(np.argmax(decrease))
         share = min(float(decrease[best]) / max(total, 1e-300), 1.0 - 1e-9)
-        chosen = [own[k] for k in index[best]]
-        sizes = gains[best] / norm[usable[index[best]]]
-        found.append(
-            Together(
-                tuple(chosen),
-                tuple(float(g) * d.unit_gain for g, d in zip(sizes, chosen, strict=True)),
-                -0.5 * n * float(np.log1p(-share)),
-            )
-        )
-    first = {n: group[0] for group in alike for n in group}
+        promise = -0.5 * n * float(np.log1p(-share)) - float(np.sum(cost[index[best]]))
+        multiples = gains[best] / np.maximum(norm[index[best]], 1e-300)
+        found.append(_together(trials, own, index[best], multiples, promise))
+    heads = {n: group[0] for group in alike for n in group}
     best_of: dict[frozenset[str], Together] = {}
     for each in sorted(found, key=lambda t: -t.promise):
-        best_of.setdefault(frozenset(first.get(n, n) for n in each.names), each)
+        best_of.setdefault(frozenset(heads.get(n, n) for n in each.names), each)
     return list(best_of.values())

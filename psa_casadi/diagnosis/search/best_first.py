@@ -23,6 +23,7 @@ from psa_casadi.diagnosis.search.exchange import exchange
 from psa_casadi.diagnosis.search.fits import (
     afresh,
     any_afresh,
+    in_place,
     together,
     with_cause,
     without,
@@ -128,7 +129,7 @@ class _Search:
         if self.seen_in_records():
             return True
         if not self.known.best().causes and self.once("sets", NONE):
-            self.several_at_once()
+            self.several_at_once(self.known.best())
             return True
         if "all afresh" in self.task.method.without or not self.once("all afresh", NONE):
             return False
@@ -170,7 +171,7 @@ class _Search:
             return
         if view.shows and len(h.causes) < thresholds().most_causes:
             if h.causes and not series:
-                self.several_at_once()
+                self.several_at_once(h)
             self.add_causes(h, view)
 
     def once(self, what: str, names: Names) -> bool:
@@ -197,6 +198,7 @@ class _Search:
             self.known.note(found)
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
+            self.merge(h)
         self.known.finish([c for c in self.known.leaders(h) if not c.final][:FINALISTS])
 
     @stage("fits of candidates")
@@ -227,12 +229,12 @@ class _Search:
         self.known.remember(less, found.causes[-1].name, name)
         return self.known.best().names == found.names
 
-    def several_at_once(self) -> None:
+    def several_at_once(self, h: Hypothesis) -> None:
         """Fit sets of causes at once, again where the base without causes has become another."""
         if "several at once" in self.task.method.without or self.sets_of is self.known.root:
             return
         self.sets_of = self.known.root
-        fit_sets(self.known, self.task)
+        fit_sets(self.known, self.task, h)
 
     @stage("fits afresh")
     def fit_afresh(self, h: Hypothesis, view: View) -> None:
@@ -245,6 +247,26 @@ class _Search:
                 break
             self.tell(h, f"{child.causes[-1].name} afresh")
             self.known.note(afresh(h, self.task.experiments, child))
+
+    @stage("fits afresh")
+    def merge(self, h: Hypothesis) -> None:
+        """Fit children of a hypothesis from their other parents, where those promise more.
+
+        Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes
+        add up, a child gains what both of its parents have gained over what these share.
+        """
+        known, experiments = self.known, self.task.experiments
+        evidence = known.scale.evidence
+        for cause in h.causes if "other parents" not in self.task.method.without else ():
+            shared = known.get(h.names - {cause.name})
+            if shared is None or not shared.causes:
+                continue
+            gained = evidence(h) - evidence(shared) - known.scale.price
+            for child in known.children(h):
+                other = known.get(child.names - {cause.name})
+                if other is not None and evidence(other) + gained > evidence(child):
+                    self.tell(h, f"{child.causes[-1].name} as beside fewer causes")
+                    known.note(in_place(child, other, other.fit, h.fit, cause, experiments))
 
     @stage("fits afresh")
     def all_afresh(self) -> None:

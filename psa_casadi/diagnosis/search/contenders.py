@@ -13,11 +13,11 @@ from psa_casadi.diagnosis.task import Task, same_curves
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.prepare import as_read
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.suspects import cleaned
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 
@@ -79,7 +79,7 @@ def fit_contenders(
 
     Raises InputError where an effect cannot be fitted to them.
     """
-    experiments = tuple(whole(cleaned(r)) for r in records)
+    experiments = tuple(whole(as_read(r)) for r in records)
     start = chosen_start(records, model, None)[0].without(e.name for e in effects)
     base = fit_base(start, experiments, progress=progress)
     plain = hypothesis((), base, experiments, final=True)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.screening.screen import Copy, Score
 from psa_casadi.diagnosis.screening.sets import Together
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis
@@ -77,11 +78,18 @@ def with_causes_afresh(
     """
     added = []
     for d, gain in zip(start.directions, start.gains, strict=True):
-        size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), gain)
+        size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), _towards(d) * gain)
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
     ordinary = ordinary_values(before.fit.model, [e.record for e in fitted(experiments)])
     return _with_all(before, experiments, added, tuple(before.fit.starts()), ordinary, goal)
+
+
+def _towards(direction: Direction) -> float:
+    """Return the side to which the effect's declared weights move with it, 1 where it has none."""
+    effect, values = direction.effect, direction.values
+    own = {p.name: p.value for p in effect.parameters}
+    return sum(own[n] * values[n] for n in effect.linear) if effect.linear else 1.0
 
 
 def _with_all(

@@ -1,5 +1,7 @@
 """Several causes at once: from the base to the sets of effects that promise most together."""
 
+from collections.abc import Sequence
+
 from psa_casadi.diagnosis.screening.sets import best_sets
 from psa_casadi.diagnosis.search.fits import to_end, with_causes, with_causes_afresh
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
@@ -12,13 +14,17 @@ from psa_casadi.simulation.timings import stage
 
 #: So many sets are fitted.
 _SETS = 4
+#: ... of which so many are pairs with the best cause alone.
+_PAIRS = 2
 
 
 @stage("fits of several at once")
-def fit_sets(known: Known, task: Task) -> None:
+def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
-    The cause that explains most alone may stand for several, and hold the search there.
+    The cause that explains most alone may stand for several, and hold the search there. First come
+    its pairs with what leads beside it: a fit that adds one cause to the other may end in another
+    minimum than one that begins with both. They go to their end, as they need more steps for it.
     """
     root, price = known.root, known.scale.price
     view, alike = known.view(root), task.alike(root.fit)
@@ -30,6 +36,8 @@ def fit_sets(known: Known, task: Task) -> None:
         for found in best_sets(root.fit, view.trials, view.screening.colour, size, alike)
     ]
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
+    beside = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
+    ranked.sort(key=lambda s: s.names not in beside)
     starts = [s for s in ranked if s.names not in known.found][:_SETS]
     said = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes at once: fitting {said}")
@@ -39,18 +47,22 @@ def fit_sets(known: Known, task: Task) -> None:
         ways.append(with_causes_afresh)
     jobs = [(way, s) for way in ways for s in starts]
     found = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
-    fitted = [h for h in found if h is not None]
-    for h in _best_to_end(fitted, known, task):
-        known.note(h)
+    fitted = [f for f in found if f is not None]
+    better = [f for f in fitted if f.names in beside and known.scale.evidence(f) > 0.0]
+    others = [f for f in fitted if f not in better]
+    for f in _best_to_end(better, others, known, task):
+        known.note(f)
 
 
-def _best_to_end(found: list[Hypothesis], known: Known, task: Task) -> list[Hypothesis]:
-    """Return fits of sets, the best of them to their end.
+def _best_to_end(
+    pairs: Sequence[Hypothesis], found: Sequence[Hypothesis], known: Known, task: Task
+) -> list[Hypothesis]:
+    """Return fits of sets, the pairs and the best others of them to their end.
 
     Of two fits of one set the better one so far need not be the one that ends lower.
     """
     ranked = sorted(found, key=lambda h: -known.scale.score(h))
-    best, others = ranked[:FINALISTS], ranked[FINALISTS:]
+    best, others = [*pairs, *ranked[:FINALISTS]], ranked[FINALISTS:]
     said = ", ".join("+".join(sorted(h.names)) for h in best)
     task.progress(f"{said} to the end")
     return [*side_by_side(lambda h: to_end(h, task.experiments), best), *others]

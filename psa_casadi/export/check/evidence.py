@@ -21,10 +21,9 @@ from psa_casadi.export.fmu.evidence_files import (
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.prepare import as_read, prepared
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence, RecordRun
-from psa_casadi.records.quality.suspects import cleaned
 from psa_casadi.records.record import Record
 
 FloatArray = npt.NDArray[np.float64]
@@ -113,7 +112,7 @@ def _of_record(
     if missing := [n for n in outside if n not in present]:
         remark = f"not compared: the FMU leaves out {', '.join(missing)}, with which it was found"
         return CheckRow(name, 0.0, ERROR_LIMIT, True, remark)
-    ready = prepared(record)[0] if run.averaged > 1 else cleaned(record)
+    ready = prepared(record)[0] if run.averaged > 1 else as_read(record)
     if ready.n != run.samples:
         return stopped(name, f"the record has {ready.n} samples, {run.samples} are stated")
     shown = "measured_displacement"

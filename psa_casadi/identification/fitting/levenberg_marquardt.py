@@ -65,8 +65,9 @@ def minimise(
 
     r(theta) is exactly linear in the `linear` coordinates, which no bound holds and on which the
     Jacobian does not depend: at every point they take their best values, without an evaluation.
-    A minimum above the `goal` is of no use: the iteration ends where as many steps as are left,
-    each as good as the last one that lowered the cost, would not lead there.
+    A minimum above the `goal` is of no use: the iteration ends where two steps in a row that lower
+    the cost say that as many as are left, each as good as this one, would not lead there. One step
+    does not: after a radius that was too large it may be short, and the next ones long again.
     """
     low, high = bounds
     columns = list(linear)
@@ -76,7 +77,7 @@ def minimise(
         return None
     theta, residual, jacobian = _at_best(theta, start, columns)
     cost = float(residual @ residual)
-    count, quiet, converged, interrupted = 1, 0, False, False
+    count, quiet, short, converged, interrupted = 1, 0, 0, False, False
     while count < evaluations and not converged:
         gradient, normal = jacobian.T @ residual, jacobian.T @ jacobian
         move = _bounded_step(gradient, normal, radius, low - theta, high - theta)
@@ -102,10 +103,10 @@ def minimise(
             radius = max(radius, 2.0 * float(np.linalg.norm(move)))
         if new < cost:
             quiet = quiet + 1 if cost - new < tolerance * cost else 0
-            hopeless = (evaluations - count) * (cost - new) < new - goal
+            short = short + 1 if (evaluations - count) * (cost - new) < new - goal else 0
             theta, (residual, jacobian), cost = trial, at_trial, new
             converged = quiet == 2
-            if hopeless:
+            if short == 2:
                 break
         converged = converged or radius < _SMALLEST_RADIUS
     return Minimum(theta, residual, jacobian, cost, converged, interrupted, count, radius)

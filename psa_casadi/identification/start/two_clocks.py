@@ -62,22 +62,27 @@ class TwoClocks:
         return replace(record, displacement=there, sha256="", source="")
 
     def sentence(self, record: Record) -> str:
-        """Say what was found in the record, and what can be done about it."""
+        """Say what was found in the record."""
         scale, unit = (1e9, "nm") if record.displacement_unit == "m" else (1.0, "counts")
         off = scale * float(np.sqrt(np.nanmean(self.moved**2)))
         return (
             f"{record.name}: voltage and displacement were sampled by two clocks: the delay between"
             f" them {'falls' if self.falling else 'grows'} evenly by {1e3 * self.height:.3g} ms and"
             f" jumps back every {self.period:.3g} s, which moves the readings by {off:.2g} {unit}"
-            " rms. Read both from one device, or put the readings on one clock with"
-            " psa.two_clocks(record).undone(record)."
+            " rms."
         )
 
 
-def clocks_said(record: Record) -> tuple[str, ...]:
-    """Return the sentence on two clocks in a record, none where there is no doubt of one."""
+def on_one_clock(record: Record) -> tuple[Record, tuple[str, ...]]:
+    """Return the record with its readings on one clock, and a sentence where they were on two.
+
+    Name, `source` and `sha256` are kept: the correction repeats from the file.
+    """
     found = two_clocks(record)
-    return () if found is None else (found.sentence(record),)
+    if found is None or record.displacement is None:
+        return record, ()
+    said = f"{found.sentence(record)} That was undone; better read both from one device."
+    return replace(record, displacement=record.displacement - found.moved), (said,)
 
 
 def two_clocks(record: Record) -> TwoClocks | None:
