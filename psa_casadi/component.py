@@ -106,7 +106,8 @@ class Component:
     """One piece of physics, declared once and symbolically.
 
     `gain` names the parameter that removes the component exactly at 0 (None for base physics).
-    `linear` names parameters of which it is a factor: a fit holds the gain at 1 and moves them.
+    `linear` names parameters of which it is a factor: a fit holds the gain at 1 and moves them,
+    and the effect is looked for with all of them at once.
     `probe` holds trial values of parameters that have no influence while the gain is 0;
     `finite_step` is the size of the gain, as a share of its scale, at which the effect is looked
     for when its derivative vanishes at 0. `looks_like` is the signature an engineer sees.

@@ -154,3 +154,19 @@ def test_a_goal_out_of_reach_ends_the_search() -> None:
     assert near.theta.tolist() == free.theta.tolist()
     assert not far.converged
     assert far.evaluations < free.evaluations
+
+
+@pytest.mark.parametrize("steep", [10.0, 30.0, 100.0, 300.0])
+@pytest.mark.parametrize("begun", [(-1.2, 1.0), (-2.0, 2.0), (-3.0, 1.0), (0.0, 3.0)])
+def test_a_short_step_does_not_end_a_search_for_a_goal_within_reach(
+    steep: float, begun: tuple[float, float]
+) -> None:
+    """In Rosenbrock's valley a radius that was too large makes one step short, and not the next."""
+
+    def valley(x: FloatArray) -> Pair:
+        residual = np.array([steep * (x[1] - x[0] ** 2), 1.0 - x[0]])
+        return residual, np.array([[-2.0 * steep * x[0], steep], [-1.0, 0.0]])
+
+    found = minimise(valley, np.array(begun), OPEN, tolerance=1e-10, evaluations=200, goal=1e-2)
+    assert found is not None
+    assert found.cost < 1e-2

@@ -93,7 +93,8 @@ def _probe_values(
 ) -> Iterator[dict[str, float]]:
     longest = max(e.record.duration for e in experiments)
     grids: list[tuple[float, ...]] = []
-    for name, grid in effect.probe.items():
+    probe = {n: grid for n, grid in effect.probe.items() if n not in effect.linear}
+    for name, grid in probe.items():
         if grid == RECORD_DURATION:
             grids.append((longest,))
         elif isinstance(grid, str):
@@ -106,7 +107,7 @@ def _probe_values(
         else:
             grids.append(grid)
     for point in product(*grids):
-        yield dict(zip(effect.probe, point, strict=True))
+        yield dict(zip(probe, point, strict=True))
 
 
 def _directions_at(

@@ -22,9 +22,10 @@ _PAIRS = 2
 def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
-    The cause that explains most alone may stand for several, and hold the search there. First come
-    its pairs with what leads beside it: a fit that adds one cause to the other may end in another
-    minimum than one that begins with both. They go to their end, as they need more steps for it.
+    The cause that explains most alone, that of `h`, may stand for several and hold the search
+    there: sets without it are tried. Or it is one of them: pairs with what leads beside it are
+    tried, as a fit that adds one cause to the other may end in another minimum than one that begins
+    with both. These go to their end, since they need more steps for it.
     """
     root, price = known.root, known.scale.price
     view, alike = known.view(root), task.alike(root.fit)
@@ -37,8 +38,9 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     ]
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
     beside = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
-    ranked.sort(key=lambda s: s.names not in beside)
-    starts = [s for s in ranked if s.names not in known.found][:_SETS]
+    pairs = [s for s in ranked if s.names in beside]
+    others = [s for s in ranked if not s.names & h.names]
+    starts = [s for s in [*pairs, *others] if s.names not in known.found][:_SETS]
     said = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes at once: fitting {said}")
     goal = cost_beside(known.best().fit, root.fit, task.experiments)
