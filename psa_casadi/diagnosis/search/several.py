@@ -39,8 +39,8 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
     beside = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
     pairs = [s for s in ranked if s.names in beside]
-    others = [s for s in ranked if not s.names & h.names]
-    starts = [s for s in [*pairs, *others] if s.names not in known.found][:_SETS]
+    apart = [s for s in ranked if not s.names & h.names]
+    starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
     said = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes at once: fitting {said}")
     goal = cost_beside(known.best().fit, root.fit, task.experiments)
