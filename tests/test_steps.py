@@ -40,10 +40,25 @@ def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
     clock.now = 130.0
     told.tell("base fit from zero")  # parts of the work come again; the step does not go back
     assert told.line() == f"{step}, 2 min (longer than most: 40 s): base fit from zero"
+    assert told.line(drawn=False) == told.line()
     console = Console(width=200)
     with console.capture() as shown:
         console.print(told)
     assert shown.get().strip() == told.line()
+
+
+def test_lines_that_stay_tell_once_what_is_usual(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with working("diagnosing", False, DIAGNOSE) as progress:
+        clock.now = 3.0
+        progress("screening effects")
+        clock.now = 41.0
+        progress("judging")
+    first, early, late = capsys.readouterr().err.splitlines()
+    assert first == "diagnosing (most take up to 40 s) ..."
+    assert early == "  diagnosing, step 3 of 6 (screening the effects), 3 s: screening effects"
+    assert "(longer than most: 40 s)" in late
 
 
 def test_other_work_tells_its_time(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:

@@ -169,11 +169,11 @@ def working(what: str, quiet: bool, course: Course = PLAIN) -> Iterator[Callable
         with Console(stderr=True).status(told):
             yield told.tell
     else:
-        tell(f"{what} ...")
+        tell(told.first())
 
         def next_step(step: str) -> None:
             told.tell(step)
-            tell(f"  {told.line()}")
+            tell(f"  {told.line(drawn=False)}")
 
         yield next_step
 

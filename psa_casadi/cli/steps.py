@@ -59,20 +59,31 @@ class Told:
         self._said = said
         self._step = max(self._step, self._course.step_of(said))
 
-    def line(self) -> str:
-        """Return how far the work is."""
+    def first(self) -> str:
+        """Return that the work begins, and what is usual."""
+        return f"{self._what}{self._usual(0.0)} ..."
+
+    def line(self, *, drawn: bool = True) -> str:
+        """Return how far the work is; what is usual only where a line is `drawn` again and again.
+
+        Else the first line has told it, until the work takes longer.
+        """
         elapsed = clock.monotonic() - self._begin
         parts = [self._what]
         if self._step:
             name, _ = self._course.steps[self._step - 1]
             parts.append(f"step {self._step} of {len(self._course.steps)} ({name})")
         parts.append(_duration(elapsed))
-        line = ", ".join(parts)
-        if self._course.usual_s:
-            usual = _duration(self._course.usual_s)
-            late = elapsed > self._course.usual_s
-            line += f" (longer than most: {usual})" if late else f" (most take up to {usual})"
+        late = elapsed > self._course.usual_s
+        line = ", ".join(parts) + (self._usual(elapsed) if drawn or late else "")
         return f"{line}: {self._said}" if self._said else line
+
+    def _usual(self, elapsed: float) -> str:
+        if not self._course.usual_s:
+            return ""
+        usual = _duration(self._course.usual_s)
+        late = elapsed > self._course.usual_s
+        return f" (longer than most: {usual})" if late else f" (most take up to {usual})"
 
     def __rich__(self) -> Text:
         """Return the line as it is now."""
