@@ -44,7 +44,7 @@ from psa_casadi.simulation.timings import stage
 _EXPANSIONS, _VISITS = 5, 24
 #: Where a neighbour's residual is within this factor of the noise, none needs fits afresh; else of
 #: a first and a further cause so many get some.
-_SETTLED, _AFRESH, _AFRESH_FURTHER = 1.02, 4, 2
+_SETTLED, _AFRESH, _AFRESH_FURTHER = 1.02, 5, 2
 #: So many neighbours are fitted first.
 _PACE = 2
 

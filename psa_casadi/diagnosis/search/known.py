@@ -13,7 +13,12 @@ from psa_casadi.diagnosis.search.fits import to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, tried
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import held_out_confirms, in_character, shows_memory
+from psa_casadi.diagnosis.search.worth import (
+    held_out_confirms,
+    held_out_gain,
+    in_character,
+    shows_memory,
+)
 from psa_casadi.diagnosis.task import State, Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
@@ -132,14 +137,25 @@ class Known:
         return ordered
 
     def note(self, found: Hypothesis | None) -> None:
-        """Keep a hypothesis if it is the best of its causes."""
+        """Keep a hypothesis if it is the best of its causes, and held-out samples do not object.
+
+        Another minimum may explain the fitted samples as well and fail between them.
+        """
         if found is None:
             return
         old = self.found.get(found.names)
-        if old is None or self.scale.evidence(found) > self.scale.evidence(old):
+        if old is None or self.replaces(found, old):
             causes = found.causes if old is None else old.causes
             self.found[found.names] = kept = replace(found, causes=causes)
             self.tell(kept, "finished" if kept.final else "fitted")
+
+    def replaces(self, found: Hypothesis, old: Hypothesis) -> bool:
+        """Whether a fit has more evidence than another one of the same causes."""
+        gained = self.scale.evidence(found) - self.scale.evidence(old)
+        if gained <= 0.0 or "held out" in self.task.method.without:
+            return gained > 0.0
+        held = held_out_gain(found, old, self.task.experiments, self.scale)
+        return gained + held > 0.0
 
     def tell(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""

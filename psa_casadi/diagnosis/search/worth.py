@@ -34,20 +34,31 @@ def held_out_confirms(
     held = np.concatenate([e.held_out for e in experiments])
     if not np.any(held):
         return True
-    colour = scale.colour
+    samples = np.count_nonzero(held) / scale.colour.inflation
     change = np.concatenate(
         [(new - old) for new, old in zip(of.predicted, before.predicted, strict=True)]
     )[held]
-    samples = np.count_nonzero(held) / colour.inflation
     after = max(of.holdout_rms, 1e-300)
-    gained = samples * float(np.log(max(before.holdout_rms, 1e-300) / after))
+    promise = 0.5 * samples * float(np.mean(change**2)) / after**2
+    gained = held_out_gain(of, before, experiments, scale)
+    return confirmed(gained, promise, scale.score(of) - scale.score(before))
+
+
+def held_out_gain(
+    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale
+) -> float:
+    """Return what a hypothesis adds to the log-likelihood of held-out samples over another one."""
+    held, colour = np.concatenate([e.held_out for e in experiments]), scale.colour
+    if not np.any(held):
+        return 0.0
+    ratio = max(before.holdout_rms, 1e-300) / max(of.holdout_rms, 1e-300)
+    gained = np.count_nonzero(held) / colour.inflation * float(np.log(ratio))
     beside = zip(of.fit.further, colour.further, before.held_further, of.held_further, strict=True)
     for f, own, old, new in beside:
         count = np.count_nonzero(held) / own.inflation
         ratio = np.hypot(old, f.straight) / max(float(np.hypot(new, f.straight)), 1e-300)
         gained += count * float(np.log(ratio))
-    promise = 0.5 * samples * float(np.mean(change**2)) / after**2
-    return confirmed(gained, promise, scale.score(of) - scale.score(before))
+    return gained
 
 
 def confirmed(gained: float, promise: float, score: float) -> bool:
