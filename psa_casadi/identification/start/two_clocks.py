@@ -81,7 +81,7 @@ def on_one_clock(record: Record) -> tuple[Record, tuple[str, ...]]:
     found = two_clocks(record)
     if found is None or record.displacement is None:
         return record, ()
-    said = f"{found.sentence(record)} That was undone; better read both from one device."
+    said = f"{found.sentence(record)[:-1]}; that was undone. Better read both from one device."
     return replace(record, displacement=record.displacement - found.moved), (said,)
 
 
