@@ -11,13 +11,11 @@ from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.search.refitting import POLISH
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError
 
 FloatArray = npt.NDArray[np.float64]
-
-#: Evaluations of the fit.
-_EVALUATIONS = 30
 
 
 def with_patch(
@@ -48,7 +46,7 @@ def with_patch(
             [*unknowns.names, *names],
             sigma=before.sigma,
             start_states=[unknowns.start(theta, r) for r in range(unknowns.records)],
-            evaluations=_EVALUATIONS,
+            evaluations=POLISH,
         )
 
     found = []

@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import gammainccinv
 
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -99,10 +99,11 @@ class Span:
 
     @cached_property
     def surplus(self) -> float:
-        """What the largest of a false alarm's share is above that of one direction."""
+        """What a chi-square that is passed as rarely as a false alarm is above that of one."""
         freedom = max(float(np.sum(self.covariance * self.information)), 1.0)
         share = thresholds().false_alarm
-        return float(chi2.isf(share, freedom) - chi2.isf(share, 1.0))
+        largest, of_one = (2.0 * float(gammainccinv(0.5 * f, share)) for f in (freedom, 1.0))
+        return largest - of_one
 
     @cached_property
     def penalties(self) -> FloatArray:
