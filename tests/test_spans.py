@@ -52,7 +52,6 @@ def _case(seed: int) -> tuple[Fit, list[Direction], FloatArray, FloatArray]:
     residual = columns[:, 1] - 2.0 * columns[:, 7] + 3.0 * columns[:, -1] + base @ [4.0, -1.0]
     residual = residual + NOISE * rng.standard_normal(SAMPLES)
     of = cast("Fit", cast("Any", SimpleNamespace(jacobian=base, residuals=residual, further=())))
-    of.unknowns = SimpleNamespace(size=2)  # type: ignore[misc,assignment]
     return of, own, base, residual
 
 

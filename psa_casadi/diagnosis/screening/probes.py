@@ -126,6 +126,7 @@ def _directions_at(
     if effect.linear:
         model = model.with_values(effect.at_gain(0.0, {}))
         moved, steps = {n: model.parameter(n).typical(model.values) for n in effect.linear}, [0.0]
+        one_sided = False
     for memory in _histories(fit, experiments, effect, model):
         for step in steps:
             trial = _Trial(fit, experiments, model, moved, memory, step)
@@ -138,12 +139,13 @@ def _directions_at(
                 every = np.concatenate([column, *others])
                 if not np.all(np.isfinite(every)) or not np.any(every):
                     continue
-                weight = name if effect.linear else ""
+                if effect.linear:
+                    weight, own, unit = name, {**values, name: size}, 1.0
+                else:
+                    weight, own, unit = "", values, step or size
                 yield Direction(
-                    effect, {**values, weight: size} if weight else values, memory,
-                    1.0 if weight else step or size, column,
-                    one_sided and not weight, bool(step), others, weight,
-                )  # fmt: skip
+                    effect, own, memory, unit, column, one_sided, bool(step), others, weight
+                )
 
 
 def _histories(

@@ -202,11 +202,10 @@ def copies(
         columns = np.column_stack([d.column for d in own])
         free = without(colour.whiten(columns), basis)
         norms = np.linalg.norm(free, axis=0)
-        large = np.flatnonzero(norms > 1e-6 * np.linalg.norm(columns, axis=0))
-        if power <= 0 or not large.size:
+        usable = norms > 1e-6 * np.linalg.norm(columns, axis=0)
+        if power <= 0 or not usable.any():
             continue
-        share = float(np.sum((independent(free[:, large]).T @ target) ** 2)) / power
-        usable = np.isin(np.arange(len(own)), large)
+        share = float(np.sum((independent(free[:, usable]).T @ target) ** 2)) / power
         unit, sizes = np.where(usable, free / np.where(usable, norms, 1.0), 0.0), usable * norms
         along = unit.T @ target / colour.level
         ways = [_copy(own, p, unit, sizes / colour.level, along) for p in spans(own)]
@@ -217,7 +216,7 @@ def copies(
 
 def _copy(
     trials: Sequence[Direction],
-    places: Sequence[int],
+    places: list[int],
     unit: FloatArray,
     norms: FloatArray,
     along: FloatArray,
@@ -228,8 +227,7 @@ def _copy(
         t, norm = float(along[places[0]]), float(norms[places[0]])
         return t**2, first, t / max(norm, 1e-300) * first.unit_gain
     span = Span(unit[:, places].T @ unit[:, places], norms[places])
-    own = [trials[k] for k in places]
-    t_own = along[list(places)]
+    own, t_own = [trials[k] for k in places], along[places]
     return float(span.decrease(t_own)), combined(own, span.gains(t_own)), 1.0
 
 

@@ -23,7 +23,6 @@ from psa_casadi.diagnosis.search.exchange import exchange
 from psa_casadi.diagnosis.search.fits import (
     afresh,
     any_afresh,
-    in_place,
     together,
     with_cause,
     without,
@@ -31,7 +30,7 @@ from psa_casadi.diagnosis.search.fits import (
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names, Searched, is_left
 from psa_casadi.diagnosis.search.modes import with_modes
-from psa_casadi.diagnosis.search.several import fit_sets
+from psa_casadi.diagnosis.search.several import fit_from_other_parents, fit_sets
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -198,7 +197,7 @@ class _Search:
             self.known.note(found)
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
-            self.merge(h)
+            fit_from_other_parents(h, self.known, task)
         self.known.finish([c for c in self.known.leaders(h) if not c.final][:FINALISTS])
 
     @stage("fits of candidates")
@@ -247,26 +246,6 @@ class _Search:
                 break
             self.tell(h, f"{child.causes[-1].name} afresh")
             self.known.note(afresh(h, self.task.experiments, child))
-
-    @stage("fits afresh")
-    def merge(self, h: Hypothesis) -> None:
-        """Fit children of a hypothesis from their other parents, where those promise more.
-
-        Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes
-        add up, a child gains what both of its parents have gained over what these share.
-        """
-        known, experiments = self.known, self.task.experiments
-        evidence = known.scale.evidence
-        for cause in h.causes if "other parents" not in self.task.method.without else ():
-            shared = known.get(h.names - {cause.name})
-            if shared is None or not shared.causes:
-                continue
-            gained = evidence(h) - evidence(shared) - known.scale.price
-            for child in known.children(h):
-                other = known.get(child.names - {cause.name})
-                if other is not None and evidence(other) + gained > evidence(child):
-                    self.tell(h, f"{child.causes[-1].name} as beside fewer causes")
-                    known.note(in_place(child, other, other.fit, h.fit, cause, experiments))
 
     @stage("fits afresh")
     def all_afresh(self) -> None:

@@ -1,9 +1,9 @@
-"""Several causes at once: from the base to the sets of effects that promise most together."""
+"""Several causes at once: sets that promise most together, from the base and from smaller sets."""
 
 from collections.abc import Sequence
 
 from psa_casadi.diagnosis.screening.sets import best_sets
-from psa_casadi.diagnosis.search.fits import to_end, with_causes, with_causes_afresh
+from psa_casadi.diagnosis.search.fits import in_place, to_end, with_causes, with_causes_afresh
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, Known
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
@@ -54,6 +54,29 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     others = [f for f in fitted if f not in better]
     for f in _best_to_end(better, others, known, task):
         known.note(f)
+
+
+@stage("fits afresh")
+def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
+    """Fit children of a hypothesis from their other parents, where those promise more.
+
+    Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
+    a child gains what both of its parents have gained over what these share.
+    """
+    if "other parents" in task.method.without:
+        return
+    evidence = known.scale.evidence
+    for cause in h.causes:
+        shared = known.get(h.names - {cause.name})
+        if shared is None or not shared.causes:
+            continue
+        gained = evidence(h) - evidence(shared) - known.scale.price
+        for child in known.children(h):
+            other = known.get(child.names - {cause.name})
+            if other is not None and evidence(other) + gained > evidence(child):
+                added = child.causes[-1].name
+                task.progress(f"cause {len(child.causes)}: {added} as beside fewer causes")
+                known.note(in_place(child, other, other.fit, h.fit, cause, task.experiments))
 
 
 def _best_to_end(

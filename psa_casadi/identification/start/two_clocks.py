@@ -79,10 +79,10 @@ def on_one_clock(record: Record) -> tuple[Record, tuple[str, ...]]:
     Name, `source` and `sha256` are kept: the correction repeats from the file.
     """
     found = two_clocks(record)
-    if found is None or record.displacement is None:
+    if found is None:
         return record, ()
     said = f"{found.sentence(record)[:-1]}; that was undone. Better read both from one device."
-    return replace(record, displacement=record.displacement - found.moved), (said,)
+    return replace(found.undone(record), source=record.source, sha256=record.sha256), (said,)
 
 
 def two_clocks(record: Record) -> TwoClocks | None:
