@@ -50,7 +50,7 @@ def _extended(
     quick = with_cause(plain, experiments, seen.starts_of(name))
     assert quick is not None
     found = to_end(quick, experiments)
-    return found, Scale(base, seen.screening.colour, 0.0).evidence(found)
+    return found, Scale(plain, seen.screening.colour, 0.0).evidence(found)
 
 
 def _quietly(_: str) -> None:

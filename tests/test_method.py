@@ -8,7 +8,7 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, held_out_samples, hypothesis
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import held_out_confirms, in_character
@@ -70,14 +70,14 @@ def creeping(
     fitted: tuple[Fit, tuple[Experiment, ...]],
 ) -> tuple[Hypothesis, Hypothesis, Scale, tuple[Experiment, ...]]:
     """The base, a slow creep beside it, the scale of their scores."""
-    found, experiments = fitted
+    _, experiments = fitted
     seen = _seen(fitted, names=("slow_creep",))
     quick = with_cause(seen.of, experiments, seen.starts_of("slow_creep"))
     assert quick is not None
     return (
         seen.of,
         to_end(quick, experiments),
-        Scale(found, seen.screening.colour, 8.0),
+        Scale(seen.of, seen.screening.colour, 8.0, held_out_samples(experiments)),
         experiments,
     )
 
@@ -92,7 +92,13 @@ def test_the_score_is_the_evidence_less_the_price_of_the_causes(creeping: Creepi
     sums = [np.sum(scale.colour.whiten(h.fit.residuals) ** 2) for h in (plain, creep)]
     gained = 0.5 * n * float(np.log(sums[0] / sums[1]))
     assert 0.0 < scale.evidence(creep) < gained
-    assert scale.score(creep) == pytest.approx(scale.evidence(creep) - 8.0)
+    held = scale.held / scale.colour.inflation * np.log(plain.holdout_rms / creep.holdout_rms)
+    assert held > 0.0
+    assert scale.held_out(creep, plain) == pytest.approx(held)
+    assert scale.score(creep) == pytest.approx(scale.evidence(creep) - 8.0 + held)
+    fitted_alone = replace(scale, held=0)
+    assert fitted_alone.score(creep) == pytest.approx(scale.of_fitted(creep))
+    assert fitted_alone.score(creep) == pytest.approx(scale.evidence(creep) - 8.0)
 
 
 def test_held_out_data_speak_against_what_they_do_not_show(creeping: Creeping) -> None:
@@ -121,6 +127,27 @@ def test_what_held_out_data_reject_is_not_the_answer_but_may_lack_a_cause(
     known.found[creep.names] = worse = replace(creep, holdout_rms=1.02 * plain.holdout_rms)
     assert known.best().names == plain.names
     assert known.rejected() == [worse]
+
+
+def test_held_out_data_choose_where_fitted_ones_cannot(creeping: Creeping) -> None:
+    """They count as the fitted ones do, in what ranks first and between minima of one set."""
+    plain, creep, _, experiments = creeping
+    known = Known(plain.fit, Task(experiments, (EFFECTS["slow_creep"],)))
+    other = replace(creep, causes=(EFFECTS["ageing"],), holdout_rms=1.1 * creep.holdout_rms)
+    known.note(other)
+    known.note(creep)
+    assert known.scale.of_fitted(creep) == known.scale.of_fitted(other)
+    assert [h.names for h in known.ranked()][:2] == [creep.names, other.names]
+    known.note(replace(creep, holdout_rms=0.9 * creep.holdout_rms))
+    kept = known.get(creep.names)
+    assert kept is not None  # the same minimum
+    assert kept.holdout_rms == creep.holdout_rms
+    worse = replace(plain, causes=creep.causes)
+    assert known.replaces(creep, worse)
+    assert not known.replaces(worse, creep)
+    samples = known.scale.held / known.scale.colour.inflation
+    factor = float(np.exp(1.1 * known.scale.evidence(creep) / samples))
+    assert not known.replaces(replace(creep, holdout_rms=factor * plain.holdout_rms), worse)
 
 
 def test_a_parameter_at_its_bound_is_out_of_character(creeping: Creeping) -> None:

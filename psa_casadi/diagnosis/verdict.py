@@ -90,7 +90,7 @@ def conclude(
     if last is not first:
         unseen = held_out_excess(last.fit, experiments, last.predicted, colour, noise)
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
-    balance = Balance(experiments, Scale(first.fit, colour, thresholds().price), floor)
+    balance = Balance(experiments, Scale(first.view.of, colour, thresholds().price), floor)
     weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
     beaten = weighed.beaten_by()
     gain = gain_of(experiments, first.predicted, last.predicted)

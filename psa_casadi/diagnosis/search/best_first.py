@@ -42,8 +42,9 @@ from psa_casadi.simulation.timings import stage
 #: Hypotheses whose neighbours are fitted, at most, and visits to them.
 _EXPANSIONS, _VISITS = 5, 24
 #: Where a neighbour's residual is within this factor of the noise, none needs fits afresh; else of
-#: a first and a further cause so many get some.
-_SETTLED, _AFRESH, _AFRESH_FURTHER = 1.02, 5, 2
+#: a first and a further cause so many get some. The noise is told too low by what was projected out
+#: of it: 1.7 % where 132 directions were taken out of 3,900 samples.
+_SETTLED, _AFRESH, _AFRESH_FURTHER = 1.03, 5, 2
 #: So many neighbours are fitted first.
 _PACE = 2
 

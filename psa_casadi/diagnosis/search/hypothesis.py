@@ -1,14 +1,17 @@
 """A hypothesis: a model with a set of causes, fitted; and the one score that all are compared by.
 
-    score = ln B - price * causes
+    score = ln B + ln L - price * causes
     ln B  = (n - k)/2 ln(S_0 / S) - 1/2 ln det(1 + P H P)
+    ln L  = m ln(E_0 / E)
 
 Laplace's approximation of the Bayes factor over the plain base fit, of k unknowns. S and S_0 are
 sums of squares of n whitened residuals, the noise level being the data's own; H is the information
 on the unknowns that the base has not, those it has projected out, and P their prior standard
 deviations. An unknown that the data do not tell costs nothing, a sharp one costs what its prior
-range is wider than its interval (MacKay, Neural Computation 4 (1992), 415). The price is the prior
-of a cause.
+range is wider than its interval (MacKay, Neural Computation 4 (1992), 415). L is what the fitted
+samples predict of the held-out ones: E are the rms of their errors, m their number over the
+inflation by the noise's colour. The evidence of all samples is the product of the two. The price is
+the prior of a cause.
 """
 
 from collections.abc import Sequence
@@ -113,22 +116,53 @@ def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """What hypotheses are compared by: the plain base fit, the colour of the noise, the price."""
+    """What hypotheses are compared by: the plain base, the colour of the noise, the price.
 
-    base: Fit
+    `held` is the number of held-out samples that count.
+    """
+
+    base: Hypothesis
     colour: Colour
     price: float
+    held: int = 0
     _known: dict[Fit, float] = field(init=False, default_factory=dict)
 
     def evidence(self, of: Hypothesis) -> float:
-        """Ln of the Bayes factor over the plain base; more modes than one have their price here."""
+        """Ln B, of the fitted samples alone; more modes than one have their price here."""
         if of.fit not in self._known:
-            self._known[of.fit] = evidence(self.base, of.fit, self.colour)
+            self._known[of.fit] = evidence(self.base.fit, of.fit, self.colour)
         return self._known[of.fit] - self.price * sum(c.count - 1 for c in of.causes)
 
+    def held_out(self, of: Hypothesis, before: Hypothesis) -> float:
+        """Ln of what one hypothesis gives the held-out samples over what another one does."""
+        if not self.held:
+            return 0.0
+        ratio = max(before.holdout_rms, 1e-300) / max(of.holdout_rms, 1e-300)
+        gained = self.held / self.colour.inflation * float(np.log(ratio))
+        rows = zip(
+            of.fit.further, self.colour.further, before.held_further, of.held_further, strict=True
+        )
+        for f, own, old, new in rows:
+            ratio = np.hypot(old, f.straight) / max(float(np.hypot(new, f.straight)), 1e-300)
+            gained += self.held / own.inflation * float(np.log(ratio))
+        return gained
+
+    def gain(self, of: Hypothesis, before: Hypothesis) -> float:
+        """Ln of the Bayes factor of one hypothesis over another one, of all samples."""
+        return self.evidence(of) - self.evidence(before) + self.held_out(of, before)
+
     def score(self, of: Hypothesis) -> float:
-        """Evidence less the price of the causes."""
+        """Ln of the Bayes factor over the plain base, of all samples, less the causes' price."""
+        return self.of_fitted(of) + self.held_out(of, self.base)
+
+    def of_fitted(self, of: Hypothesis) -> float:
+        """The score of the fitted samples alone."""
         return self.evidence(of) - self.price * len(of.causes)
+
+
+def held_out_samples(experiments: Sequence[Experiment]) -> int:
+    """Return the number of held-out samples."""
+    return sum(int(e.held_out.sum()) for e in experiments)
 
 
 def tried(of: Hypothesis, state: State, root: Hypothesis, scale: Scale) -> Tried:

@@ -10,12 +10,17 @@ from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.search.fits import to_end
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, tried
+from psa_casadi.diagnosis.search.hypothesis import (
+    Hypothesis,
+    Scale,
+    held_out_samples,
+    root_of,
+    tried,
+)
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import (
     held_out_confirms,
-    held_out_gain,
     in_character,
     shows_memory,
 )
@@ -29,6 +34,8 @@ from psa_casadi.simulation.side_by_side import side_by_side
 SHARE, NEAR = 0.8, 30.0
 #: So many fits of neighbours go to their end.
 FINALISTS = 3
+#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
+_SAME = 1.0
 #: Effects far behind in the screening are fitted afresh where less than this share of the excess
 #: power is explained.
 _EXPLAINED = 0.8
@@ -65,7 +72,9 @@ class Known:
         root = root_of(base, task.experiments)
         first = examine(root, task)
         self.trials = first.trials
-        self.scale = Scale(base, first.screening.colour, thresholds().price)
+        judged = "held out" not in task.method.without
+        held = held_out_samples(task.experiments) if judged else 0
+        self.scale = Scale(root, first.screening.colour, thresholds().price, held)
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
@@ -150,12 +159,9 @@ class Known:
             self.tell(kept, "finished" if kept.final else "fitted")
 
     def replaces(self, found: Hypothesis, old: Hypothesis) -> bool:
-        """Whether a fit has more evidence than another one of the same causes."""
+        """Whether a fit is another minimum of the same causes, with more evidence and gain."""
         gained = self.scale.evidence(found) - self.scale.evidence(old)
-        if gained <= 0.0 or "held out" in self.task.method.without:
-            return gained > 0.0
-        held = held_out_gain(found, old, self.task.experiments, self.scale)
-        return gained + held > 0.0
+        return gained > _SAME and self.scale.gain(found, old) > 0.0
 
     def tell(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""
@@ -218,8 +224,8 @@ class Known:
 
     def rejected(self) -> list[Hypothesis]:
         """Return what would be better than the answer if held-out samples confirmed it."""
-        least = self.scale.score(self.best())
-        better = [h for h in self.ranked() if self.scale.score(h) > least]
+        best, fitted = self.best(), self.scale.of_fitted
+        better = [h for h in self.ranked() if fitted(h) > fitted(best)]
         return [h for h in better if self.worth(h, confirmed=False)]
 
     def so_far(self) -> Hypothesis:

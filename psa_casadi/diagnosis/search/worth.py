@@ -40,36 +40,19 @@ def held_out_confirms(
     )[held]
     after = max(of.holdout_rms, 1e-300)
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2
-    gained = held_out_gain(of, before, experiments, scale)
+    gained = scale.held_out(of, before)
     return confirmed(gained, promise, scale.score(of) - scale.score(before))
 
 
-def held_out_gain(
-    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale
-) -> float:
-    """Return what a hypothesis adds to the log-likelihood of held-out samples over another one."""
-    held, colour = np.concatenate([e.held_out for e in experiments]), scale.colour
-    if not np.any(held):
-        return 0.0
-    ratio = max(before.holdout_rms, 1e-300) / max(of.holdout_rms, 1e-300)
-    gained = np.count_nonzero(held) / colour.inflation * float(np.log(ratio))
-    beside = zip(of.fit.further, colour.further, before.held_further, of.held_further, strict=True)
-    for f, own, old, new in beside:
-        count = np.count_nonzero(held) / own.inflation
-        ratio = np.hypot(old, f.straight) / max(float(np.hypot(new, f.straight)), 1e-300)
-        gained += count * float(np.log(ratio))
-    return gained
-
-
 def confirmed(gained: float, promise: float, score: float) -> bool:
-    """Whether a gain of the held-out log-likelihood is enough, beside that of the score [nats].
+    """Whether a gain of the held-out log-likelihood is enough, and that of the score [nats].
 
     A promised gain p is found give or take sqrt(2 p). Found must be `held_out`, or, where these
     samples can hardly show the cause, two such errors less than what is promised; and so much must
-    the fitted samples' score and what is found be together.
+    the score of all samples be.
     """
     least = min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
-    return bool(gained > least and score + gained > thresholds().held_out)
+    return bool(gained > least and score > thresholds().held_out)
 
 
 def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
