@@ -31,10 +31,15 @@ BOTH = cast(OdeHypothesis, _hypothesis(("constant", "drag"), (0.01, 0.06)))
 def _known(evidence: dict[frozenset[str], float], alarm: bool = True) -> Known:
     """A search that has found the three sets of causes, of which `constant` adds little."""
     found = {h.names: h for h in (ROOT, LOOP, BOTH)}
+
+    def of_fitted(h: SimpleNamespace) -> float:
+        return evidence[frozenset(h.names)] - 8.0 * len(h.causes)
+
     told = SimpleNamespace(
         found=found,
         evidence=lambda h: evidence[h.names],
-        score=lambda h: evidence[h.names] - 8.0 * len(h.causes),
+        of_fitted=of_fitted,
+        score=of_fitted,
         view=lambda h: SimpleNamespace(test=SimpleNamespace(alarm=alarm)),
         slight=lambda h: ("constant",) if "constant" in h.names else (),
         stands=lambda h: True,

@@ -181,24 +181,38 @@ def can_be_told(of: OdeHypothesis, before: OdeHypothesis) -> bool:
     return any(old**2 - new**2 > o.straight**2 for o, old, new in rows)
 
 
+def held_out_gain(
+    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour
+) -> float:
+    """Return what a hypothesis adds to the log-likelihood of held-out samples over another one.
+
+    Summed over the outputs.
+    """
+    gained = 0.0
+    for k, (o, own) in enumerate(zip(of.fit.outputs, colour.each, strict=True)):
+        samples = sum(int(r.judged(o.index).sum()) for r in runs) / own.inflation
+        if samples:
+            after = max(float(np.hypot(of.held[k], o.straight)), 1e-300)
+            gained += samples * float(np.log(np.hypot(before.held[k], o.straight) / after))
+    return gained
+
+
 def held_out_confirms(
     of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, score: float
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
-    The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.worth.confirmed`), the gains in
-    log-likelihood and what is promised summed over the outputs; `score` is what is gained of it.
+    The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.worth.confirmed`), what is
+    promised summed over the outputs; `score` is what is gained of it.
     """
-    gained = promise = 0.0
+    gained, promise = held_out_gain(of, before, runs, colour), 0.0
     for k, (o, own) in enumerate(zip(of.fit.outputs, colour.each, strict=True)):
         old = errors_at(runs, before.predicted, o.index, Run.judged)
         new = errors_at(runs, of.predicted, o.index, Run.judged)
         if not old.size:
             continue
-        samples = old.size / own.inflation
         after = max(float(np.hypot(of.held[k], o.straight)), 1e-300)
-        gained += samples * float(np.log(np.hypot(before.held[k], o.straight) / after))
-        promise += 0.5 * samples * float(np.mean((new - old) ** 2)) / after**2
+        promise += 0.5 * old.size / own.inflation * float(np.mean((new - old) ** 2)) / after**2
     if promise == 0.0 and gained == 0.0:
         return True
     return confirmed(gained, promise, score)

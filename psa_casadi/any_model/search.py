@@ -16,6 +16,7 @@ from psa_casadi.any_model.hypothesis import (
     OdeView,
     can_be_told,
     held_out_confirms,
+    held_out_gain,
     hypothesis_of,
     look,
 )
@@ -75,16 +76,21 @@ class Known:
         """Ln of the Bayes factor over the base."""
         return 0.0 if h.fit is self.base else evidence(self.base, h.fit, self.colour)
 
-    def score(self, h: OdeHypothesis) -> float:
-        """Evidence less the price of the causes."""
+    def of_fitted(self, h: OdeHypothesis) -> float:
+        """Evidence less the price of the causes: the score of the fitted samples alone."""
         return self.evidence(h) - thresholds().price * len(h.causes)
+
+    def score(self, h: OdeHypothesis) -> float:
+        """The score of all samples, with what the fitted ones predict of those held out."""
+        return self.of_fitted(h) + held_out_gain(h, self.root, self.runs, self.colour)
 
     def note(self, h: OdeHypothesis | None) -> None:
         """Keep a hypothesis if it is the best of its causes."""
         if h is None:
             return
         old = self.found.get(h.names)
-        if old is None or self.evidence(h) > self.evidence(old):
+        more = old is None or self.evidence(h) > self.evidence(old)
+        if old is None or (more and self.score(h) > self.score(old)):
             self.found[h.names] = h if old is None else replace(h, causes=old.causes)
 
     def children(self, h: OdeHypothesis) -> list[OdeHypothesis]:

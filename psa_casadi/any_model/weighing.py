@@ -96,7 +96,7 @@ def beaten_by(
     evidence, form = known.evidence(best), thresholds().form
     for f in free:
         clearly = thresholds().clearly * temperature(max(evidence, f.evidence))
-        if f.evidence - thresholds().price <= known.score(best) + clearly:
+        if f.evidence - thresholds().price <= known.of_fitted(best) + clearly:
             continue
         theirs = weighed(known.found[frozenset()], f.errors, noise, f.share).named
         more = {n: theirs[n] - share for n, share in own.named.items()}
