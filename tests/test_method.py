@@ -8,7 +8,7 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, held_out_samples, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis, scale_of
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import held_out_confirms, in_character
@@ -77,7 +77,7 @@ def creeping(
     return (
         seen.of,
         to_end(quick, experiments),
-        Scale(seen.of, seen.screening.colour, 8.0, held_out_samples(experiments)),
+        scale_of(seen.of, seen.screening.colour, 8.0, experiments),
         experiments,
     )
 

@@ -81,7 +81,12 @@ class Known:
         return self.evidence(h) - thresholds().price * len(h.causes)
 
     def score(self, h: OdeHypothesis) -> float:
-        """The score of all samples, with what the fitted ones predict of those held out."""
+        """The score of all samples, with what the fitted ones predict of held-out blocks.
+
+        Experiments that are held out whole judge alone.
+        """
+        if any(r.held_out_whole for r in self.runs):
+            return self.of_fitted(h)
         return self.of_fitted(h) + held_out_gain(h, self.root, self.runs, self.colour)
 
     def note(self, h: OdeHypothesis | None) -> None:
@@ -121,7 +126,7 @@ class Known:
                 continue
             if not can_be_told(h, before):
                 return False
-            gained = self.score(h) - self.score(before)
+            gained = self.of_fitted(h) - self.of_fitted(before)
             if not held_out_confirms(h, before, self.runs, self.colour, gained):
                 return False
         return True

@@ -6,7 +6,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.screening.evidence import credible_set
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
-from psa_casadi.diagnosis.search.hypothesis import Scale, held_out_samples, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import hypothesis, scale_of
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.search.view import examine
 from psa_casadi.diagnosis.task import Task, same_curves
@@ -32,7 +32,7 @@ def contenders(
     """
     names = names or credible_set(step.probability, thresholds().credible)
     found = dict(step.fitted)
-    scale = Scale(step.view.of, step.screening.colour, 0.0, held_out_samples(experiments))
+    scale = scale_of(step.view.of, step.screening.colour, 0.0, experiments)
     known = dict(step.evidence)
     for name in names:
         scores = [] if name in found else step.view.starts_of(name)

@@ -10,8 +10,8 @@ on the unknowns that the base has not, those it has projected out, and P their p
 deviations. An unknown that the data do not tell costs nothing, a sharp one costs what its prior
 range is wider than its interval (MacKay, Neural Computation 4 (1992), 415). L is what the fitted
 samples predict of the held-out ones: E are the rms of their errors, m their number over the
-inflation by the noise's colour. The evidence of all samples is the product of the two. The price is
-the prior of a cause.
+inflation by the noise's colour. The evidence of all samples is the product of the two. Records that
+are held out whole judge alone: of these the score has no L. The price is the prior of a cause.
 """
 
 from collections.abc import Sequence
@@ -118,13 +118,14 @@ def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
 class Scale:
     """What hypotheses are compared by: the plain base, the colour of the noise, the price.
 
-    `held` is the number of held-out samples that count.
+    `held` is the number of held-out samples; they choose between hypotheses, or `judge_only`.
     """
 
     base: Hypothesis
     colour: Colour
     price: float
     held: int = 0
+    judge_only: bool = False
     _known: dict[Fit, float] = field(init=False, default_factory=dict)
 
     def evidence(self, of: Hypothesis) -> float:
@@ -148,21 +149,25 @@ class Scale:
         return gained
 
     def gain(self, of: Hypothesis, before: Hypothesis) -> float:
-        """Ln of the Bayes factor of one hypothesis over another one, of all samples."""
-        return self.evidence(of) - self.evidence(before) + self.held_out(of, before)
+        """Ln of the Bayes factor of one hypothesis over another one, of all samples that choose."""
+        held_out = 0.0 if self.judge_only else self.held_out(of, before)
+        return self.evidence(of) - self.evidence(before) + held_out
 
     def score(self, of: Hypothesis) -> float:
-        """Ln of the Bayes factor over the plain base, of all samples, less the causes' price."""
-        return self.of_fitted(of) + self.held_out(of, self.base)
+        """Ln of the Bayes factor over the plain base, less the price of the causes."""
+        return self.gain(of, self.base) - self.price * len(of.causes)
 
     def of_fitted(self, of: Hypothesis) -> float:
         """The score of the fitted samples alone."""
         return self.evidence(of) - self.price * len(of.causes)
 
 
-def held_out_samples(experiments: Sequence[Experiment]) -> int:
-    """Return the number of held-out samples."""
-    return sum(int(e.held_out.sum()) for e in experiments)
+def scale_of(
+    base: Hypothesis, colour: Colour, price: float, experiments: Sequence[Experiment]
+) -> Scale:
+    """Return the scale of a search; blocks of fitted records choose, whole records judge alone."""
+    held = sum(int(e.held_out.sum()) for e in experiments)
+    return Scale(base, colour, price, held, any(e.held_out_whole for e in experiments))
 
 
 def tried(of: Hypothesis, state: State, root: Hypothesis, scale: Scale) -> Tried:

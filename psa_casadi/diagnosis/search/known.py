@@ -10,13 +10,7 @@ from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.search.fits import to_end
-from psa_casadi.diagnosis.search.hypothesis import (
-    Hypothesis,
-    Scale,
-    held_out_samples,
-    root_of,
-    tried,
-)
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, scale_of, tried
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import (
@@ -72,9 +66,8 @@ class Known:
         root = root_of(base, task.experiments)
         first = examine(root, task)
         self.trials = first.trials
-        judged = "held out" not in task.method.without
-        held = held_out_samples(task.experiments) if judged else 0
-        self.scale = Scale(root, first.screening.colour, thresholds().price, held)
+        own = scale_of(root, first.screening.colour, thresholds().price, task.experiments)
+        self.scale = replace(own, held=0) if "held out" in task.method.without else own
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}

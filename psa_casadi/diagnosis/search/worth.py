@@ -41,18 +41,18 @@ def held_out_confirms(
     after = max(of.holdout_rms, 1e-300)
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2
     gained = scale.held_out(of, before)
-    return confirmed(gained, promise, scale.score(of) - scale.score(before))
+    return confirmed(gained, promise, scale.of_fitted(of) - scale.of_fitted(before))
 
 
 def confirmed(gained: float, promise: float, score: float) -> bool:
-    """Whether a gain of the held-out log-likelihood is enough, and that of the score [nats].
+    """Whether a gain of the held-out log-likelihood is enough, beside that of the score [nats].
 
     A promised gain p is found give or take sqrt(2 p). Found must be `held_out`, or, where these
     samples can hardly show the cause, two such errors less than what is promised; and so much must
-    the score of all samples be.
+    the fitted samples' score and what is found be together.
     """
     least = min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
-    return bool(gained > least and score > thresholds().held_out)
+    return bool(gained > least and score + gained > thresholds().held_out)
 
 
 def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
