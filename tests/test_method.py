@@ -18,7 +18,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
 from psa_casadi.records import Record
-from psa_casadi.records.split import Experiment, split
+from psa_casadi.records.split import Experiment, judging, split
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import simulate
 from tests.benchmarks.ablation import (
@@ -96,9 +96,16 @@ def test_the_score_is_the_evidence_less_the_price_of_the_causes(creeping: Creepi
     assert held > 0.0
     assert scale.held_out(creep, plain) == pytest.approx(held)
     assert scale.score(creep) == pytest.approx(scale.evidence(creep) - 8.0 + held)
-    fitted_alone = replace(scale, held=0)
-    assert fitted_alone.score(creep) == pytest.approx(scale.of_fitted(creep))
-    assert fitted_alone.score(creep) == pytest.approx(scale.evidence(creep) - 8.0)
+    for fitted_alone in (replace(scale, held=0), replace(scale, judge_only=True)):
+        assert fitted_alone.score(creep) == pytest.approx(scale.of_fitted(creep))
+        assert fitted_alone.score(creep) == pytest.approx(scale.evidence(creep) - 8.0)
+
+
+def test_records_that_are_held_out_whole_judge_and_do_not_choose(creeping: Creeping) -> None:
+    plain, _, scale, experiments = creeping
+    whole = judging(experiments[0].record)
+    assert not scale.judge_only
+    assert scale_of(plain, scale.colour, 8.0, [*experiments, whole]).judge_only
 
 
 def test_held_out_data_speak_against_what_they_do_not_show(creeping: Creeping) -> None:

@@ -96,10 +96,11 @@ class Known:
     def answer(self) -> Hypothesis:
         """Return the best hypothesis; where that removes too little, one that is nearly as likely.
 
-        Too little of the held-out error, so that its causes would not be named.
+        Too little of the held-out error, so that its causes would not be named. Of records that are
+        held out whole the best one stays: they choose nothing.
         """
         best = self.best()
-        if not self.removes_little(best):
+        if self.scale.judge_only or not self.removes_little(best):
             return best
         own = self.scale.evidence(best)
         least = self.scale.score(best) - thresholds().clearly * temperature(own)
