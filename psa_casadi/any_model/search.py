@@ -90,12 +90,14 @@ class Known:
         return self.of_fitted(h) + held_out_gain(h, self.root, self.runs, self.colour)
 
     def note(self, h: OdeHypothesis | None) -> None:
-        """Keep a hypothesis if it is the best of its causes."""
+        """Keep a hypothesis if it is the best of its causes, and held-out samples do not object."""
         if h is None:
             return
         old = self.found.get(h.names)
-        more = old is None or self.evidence(h) > self.evidence(old)
-        if old is None or (more and self.score(h) > self.score(old)):
+        gained = 0.0 if old is None else self.evidence(h) - self.evidence(old)
+        if old is None or (
+            gained > 0.0 and gained + held_out_gain(h, old, self.runs, self.colour) > 0.0
+        ):
             self.found[h.names] = h if old is None else replace(h, causes=old.causes)
 
     def children(self, h: OdeHypothesis) -> list[OdeHypothesis]:

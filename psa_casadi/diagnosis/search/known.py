@@ -97,7 +97,7 @@ class Known:
         """Return the best hypothesis; where that removes too little, one that is nearly as likely.
 
         Too little of the held-out error, so that its causes would not be named. Of records that are
-        held out whole the best one stays: they choose nothing.
+        held out whole the best one stays: they rank nothing.
         """
         best = self.best()
         if self.scale.judge_only or not self.removes_little(best):
@@ -153,9 +153,12 @@ class Known:
             self.tell(kept, "finished" if kept.final else "fitted")
 
     def replaces(self, found: Hypothesis, old: Hypothesis) -> bool:
-        """Whether a fit is another minimum of the same causes, with more evidence and gain."""
+        """Whether a fit is another minimum of the same causes, with more evidence.
+
+        Held-out samples may object, by more than that.
+        """
         gained = self.scale.evidence(found) - self.scale.evidence(old)
-        return gained > _SAME and self.scale.gain(found, old) > 0.0
+        return gained > _SAME and gained + self.scale.held_out(found, old) > 0.0
 
     def tell(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""
