@@ -52,9 +52,9 @@ class Cause:
 class Candidate:
     """An effect that was tried: share of the excess it explains, and its evidence over the base.
 
-    `evidence` is ln of the Bayes factor, estimated from the screening where nothing was `fitted`,
-    and of effects that bend the same curve that of the best one;
-    `probability` that of being the cause, given that one effect of the table is.
+    `evidence` is ln of the Bayes factor, held-out blocks included; estimated from the screening of
+    fitted samples where nothing was `fitted`, and of effects that bend the same curve that of the
+    best one; `probability` that of being the cause, given that one effect of the table is.
     """
 
     effect: str

@@ -149,9 +149,11 @@ class _Search:
         It is the answer then, whatever more causes would explain.
         """
         old = self.known.views.get(h.names)
-        if h.names in self.known.closed or old is None:
-            return False
-        if not self.known.gained(old.of, h) or is_left(self.known.view(h)):
+        return h.names not in self.known.closed and old is not None and self.closed(old.of, h)
+
+    def closed(self, before: Hypothesis, h: Hypothesis) -> bool:
+        """Close a hypothesis of which nothing is left and which has gained; whether that is so."""
+        if not self.known.gained(before, h) or is_left(self.known.view(h)):
             return False
         self.known.closed.add(h.names)
         return True
@@ -166,8 +168,8 @@ class _Search:
         if not series and self.resonances(h, view):
             self.done.discard(("challenged", h.names))
             return
-        self.expanded[h.names] = h
-        if self.several_modes(h, view):
+        seen, self.expanded[h.names] = self.expanded.get(h.names), h
+        if (seen is not None and self.closed(seen, h)) or self.several_modes(h, view):
             return
         if view.shows and len(h.causes) < thresholds().most_causes:
             if h.causes and not series:

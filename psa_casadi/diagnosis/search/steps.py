@@ -27,11 +27,12 @@ class Step:
     """A hypothesis on the way to the best one, and the cause that comes next.
 
     `fitted` are the hypotheses with one more effect; `alone` is ln B of every effect over this
-    hypothesis, `evidence` of all samples over all other causes where there are later ones, and of
-    effects that bend the same curve the best one's; `probability` that of being the cause, given
-    that one effect of the table is. `chosen` is the hypothesis with the next cause, None of the
-    last step; `without` the one with all causes but this, `beside` what that one still shows, and
-    `instead` the hypotheses with other effects in this cause's place.
+    hypothesis, of all samples that choose (`Scale.gain`), `evidence` that over all other causes
+    where there are later ones, and of effects that bend the same curve the best one's;
+    `probability` that of being the cause, given that one effect of the table is. `chosen` is the
+    hypothesis with the next cause, None of the last step; `without` the one with all causes but
+    this, `beside` what that one still shows, and `instead` the hypotheses with other effects in
+    this cause's place.
     """
 
     view: View
@@ -121,16 +122,14 @@ def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) ->
     if chosen is not None:
         fitted[chosen.causes[-1].name] = chosen
     gain, own = found.scale.gain, found.scale.evidence(view.of)
-    estimated = view.estimated()
-    alone = {**estimated, **{n: found.scale.evidence(c) - own for n, c in fitted.items()}}
-    every = {**estimated, **{n: gain(c, view.of) for n, c in fitted.items()}}
+    alone = {**view.estimated(), **{n: gain(c, view.of) for n, c in fitted.items()}}
     if chosen is None:
         refused = {n for n, c in fitted.items() if c.names not in found.worth}
-        return _judged(Step(view, fitted, alone=alone), every, fitted, refused, own, task)
+        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, own, task)
     cause = chosen.causes[-1]
     less = _without(found, task, cause)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
-        return _judged(Step(view, fitted, chosen, alone=alone), every, fitted, set(), own, task)
+        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), own, task)
     there = _view(found, less, task)
     beside = {**_fitted(found, less), cause.name: found.best}
     evidence = {**there.estimated(), **{n: gain(c, less) for n, c in beside.items()}}
