@@ -14,6 +14,7 @@ from psa_casadi.any_model.fit import FittedOutput, OdeFit
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.trials import Table, trial_directions
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.held_out.errors import output_gain
 from psa_casadi.diagnosis.noise.colour import Colour, noise_rms
 from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
 from psa_casadi.diagnosis.screening.evidence import estimated
@@ -188,13 +189,13 @@ def held_out_gain(
 
     Summed over the outputs.
     """
-    gained = 0.0
-    for k, (o, own) in enumerate(zip(of.fit.outputs, colour.each, strict=True)):
-        samples = sum(int(r.judged(o.index).sum()) for r in runs) / own.inflation
-        if samples:
-            after = max(float(np.hypot(of.held[k], o.straight)), 1e-300)
-            gained += samples * float(np.log(np.hypot(before.held[k], o.straight) / after))
-    return gained
+    rows = zip(of.fit.outputs, colour.each, before.held, of.held, strict=True)
+    return sum(
+        output_gain(
+            sum(int(r.judged(o.index).sum()) for r in runs) / own.inflation, old, new, o.straight
+        )
+        for o, own, old, new in rows
+    )
 
 
 def held_out_confirms(

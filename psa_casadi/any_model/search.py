@@ -28,7 +28,7 @@ from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.evidence import evidence
 from psa_casadi.diagnosis.screening.screen import Score
 from psa_casadi.diagnosis.screening.sets import Together, best_sets
-from psa_casadi.diagnosis.search.worth import inside_ranges
+from psa_casadi.diagnosis.search.worth import another_minimum, inside_ranges
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -58,8 +58,10 @@ class Known:
     found: dict[Names, OdeHypothesis] = field(default_factory=dict)
     views: dict[Names, OdeView] = field(default_factory=dict)
     colour: Colour = field(init=False)
+    judge_only: bool = field(init=False)
 
     def __post_init__(self) -> None:
+        self.judge_only = any(r.held_out_whole for r in self.runs)
         self.base, self.found[NONE] = self.root.fit, self.root
         self.colour = self.view(self.root).screening.colour
 
@@ -85,7 +87,7 @@ class Known:
 
         Experiments that are held out whole judge alone.
         """
-        if any(r.held_out_whole for r in self.runs):
+        if self.judge_only:
             return self.of_fitted(h)
         return self.of_fitted(h) + held_out_gain(h, self.root, self.runs, self.colour)
 
@@ -94,11 +96,12 @@ class Known:
         if h is None:
             return
         old = self.found.get(h.names)
-        gained = 0.0 if old is None else self.evidence(h) - self.evidence(old)
-        if old is None or (
-            gained > 0.0 and gained + held_out_gain(h, old, self.runs, self.colour) > 0.0
-        ):
-            self.found[h.names] = h if old is None else replace(h, causes=old.causes)
+        if old is None:
+            self.found[h.names] = h
+            return
+        gained = self.evidence(h) - self.evidence(old)
+        if another_minimum(gained, held_out_gain(h, old, self.runs, self.colour)):
+            self.found[h.names] = replace(h, causes=old.causes)
 
     def children(self, h: OdeHypothesis) -> list[OdeHypothesis]:
         """Return the hypotheses with one more cause, the likeliest first."""

@@ -67,15 +67,15 @@ def diagnose(
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
     `records` are those of one device: a record, the path of a file, a data frame or a mapping of
-    arrays (see `record_from`), or several of these.
-    Held-out data are the records `holdout`, else a quarter of every record in blocks (see
-    `divided`). No fit uses them; they may reject an extension, and blocks help to choose between
-    fitted models. `model` is where the base fit
-    starts; `stiffness` [N/m] fixes the force scale; `hysteresis` is the form of the base's (see
-    `identify`); `effects` is the table to search; `method` can leave parts of the method out (for
-    its ablation). `progress` gets what is done in words, `watch` every hypothesis of the search
-    (`Tried`). Raises InputError, and DiagnosisInterrupted with the best model so far at a keyboard
-    interrupt once there is one.
+    arrays (see `record_from`), or several of these. Held-out data are the records `holdout`, else a
+    quarter of every record in blocks (see `divided`). No fit uses them; they may reject an
+    extension, and blocks help to choose between fitted models.
+
+    `model` is where the base fit starts; `stiffness` [N/m] fixes the force scale; `hysteresis` is
+    the form of the base's (see `identify`); `effects` is the table to search; `method` can leave
+    parts of the method out (for its ablation). `progress` gets what is done in words, `watch` every
+    hypothesis of the search (`Tried`). Raises InputError, and DiagnosisInterrupted with the best
+    model so far at a keyboard interrupt once there is one.
     """
     method = method or Method()
     given, kept = records_given(records), records_given(holdout)

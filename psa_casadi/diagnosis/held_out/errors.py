@@ -72,6 +72,16 @@ def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     return tuple(found)
 
 
+def output_gain(samples: float, before: float, after: float, straight: float = 0.0) -> float:
+    """Return m ln(E0 / E): what held-out samples of one output give a model over another one.
+
+    `samples` are m, counted as those of white noise; E0 and E the rms errors `before` and `after`,
+    each with what cannot be told of the output, `straight`, in the output's unit.
+    """
+    old, new = (max(float(np.hypot(e, straight)), 1e-300) for e in (before, after))
+    return samples * float(np.log(old / new))
+
+
 def whole_residuals(
     experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
 ) -> list[FloatArray]:

@@ -21,7 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.held_out.errors import held_out_further, held_out_rms, whole_residuals
+from psa_casadi.diagnosis.held_out.errors import (
+    held_out_further,
+    held_out_rms,
+    output_gain,
+    whole_residuals,
+)
 from psa_casadi.diagnosis.noise.colour import Colour, rms
 from psa_casadi.diagnosis.screening.evidence import evidence
 from psa_casadi.diagnosis.task import State, Tried
@@ -138,15 +143,15 @@ class Scale:
         """Ln of what one hypothesis gives the held-out samples over what another one does."""
         if not self.held:
             return 0.0
-        ratio = max(before.holdout_rms, 1e-300) / max(of.holdout_rms, 1e-300)
-        gained = self.held / self.colour.inflation * float(np.log(ratio))
+        samples = self.held / self.colour.inflation
+        gained = output_gain(samples, before.holdout_rms, of.holdout_rms)
         rows = zip(
             of.fit.further, self.colour.further, before.held_further, of.held_further, strict=True
         )
-        for f, own, old, new in rows:
-            ratio = np.hypot(old, f.straight) / max(float(np.hypot(new, f.straight)), 1e-300)
-            gained += self.held / own.inflation * float(np.log(ratio))
-        return gained
+        return gained + sum(
+            output_gain(self.held / own.inflation, old, new, f.straight)
+            for f, own, old, new in rows
+        )
 
     def gain(self, of: Hypothesis, before: Hypothesis) -> float:
         """Ln of the Bayes factor of one hypothesis over another one, of all samples that choose."""

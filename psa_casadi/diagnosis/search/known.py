@@ -14,6 +14,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, s
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.search.worth import (
+    another_minimum,
     held_out_confirms,
     in_character,
     shows_memory,
@@ -28,8 +29,6 @@ from psa_casadi.simulation.side_by_side import side_by_side
 SHARE, NEAR = 0.8, 30.0
 #: So many fits of neighbours go to their end.
 FINALISTS = 3
-#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
-_SAME = 1.0
 #: Effects far behind in the screening are fitted afresh where less than this share of the excess
 #: power is explained.
 _EXPLAINED = 0.8
@@ -153,12 +152,9 @@ class Known:
             self.tell(kept, "finished" if kept.final else "fitted")
 
     def replaces(self, found: Hypothesis, old: Hypothesis) -> bool:
-        """Whether a fit is another minimum of the same causes, with more evidence.
-
-        Held-out samples may object, by more than that.
-        """
+        """Whether a fit of the same causes takes another one's place."""
         gained = self.scale.evidence(found) - self.scale.evidence(old)
-        return gained > _SAME and gained + self.scale.held_out(found, old) > 0.0
+        return another_minimum(gained, self.scale.held_out(found, old))
 
     def tell(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""

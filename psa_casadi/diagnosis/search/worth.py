@@ -17,6 +17,8 @@ from psa_casadi.simulation.linear_part import linear_part
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
+_SAME = 1.0
 #: Terms of a static curve.
 _CURVE = 8
 #: Damping ratio of a sharp resonance, and halves of its width within which a tone is its ringing.
@@ -53,6 +55,14 @@ def confirmed(gained: float, promise: float, score: float) -> bool:
     """
     least = min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
     return bool(gained > least and score + gained > thresholds().held_out)
+
+
+def another_minimum(gained: float, held_out: float) -> bool:
+    """Whether a fit of the same causes is another minimum that takes the other one's place.
+
+    It has `gained` more evidence, and held-out samples do not object by more than that [nats].
+    """
+    return gained > _SAME and gained + held_out > 0.0
 
 
 def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
