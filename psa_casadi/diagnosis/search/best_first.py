@@ -248,7 +248,7 @@ class _Search:
             if best.fit.rms < _SETTLED * floor:
                 break
             self.tell(h, f"{child.causes[-1].name} afresh")
-            self.known.note(afresh(h, self.task.experiments, child))
+            self.known.note(afresh(h, self.task.experiments, child, self.known.near(h, best)))
 
     @stage("fits afresh")
     def all_afresh(self) -> None:
@@ -267,9 +267,9 @@ class _Search:
         task = self.task
         if "base again" not in task.method.without:
             for cause in h.causes:
-                if not cause.more_of:
+                less = self.known.get(h.names - {cause.name})
+                if less is None or not cause.more_of:
                     task.progress(f"without {cause.name}")
-                    less = self.known.get(h.names - {cause.name})
                     self.known.note(without(h, cause, task.experiments, less))
         before = self.known.get(h.names_upto(len(h.causes) - 1))
         if "resonances" in task.method.without or before is None or has_series(h):

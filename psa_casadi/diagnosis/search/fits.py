@@ -106,16 +106,17 @@ def _with_all(
 
 
 def afresh(
-    before: Hypothesis, experiments: Sequence[Experiment], first: Hypothesis
+    before: Hypothesis, experiments: Sequence[Experiment], first: Hypothesis, goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit the last cause of a hypothesis again from an ordinary base and gains of both signs.
 
     A base fit without the effect has bent its loop and its lags to imitate it, and may hold the
     search there. Where the gain acts by thresholds or lags, it starts at their steps as well.
+    What is found is of use below the cost of the first fit, and below the `goal`.
     """
     effect = first.causes[-1]
     fits = _from_ordinary(before.fit, experiments, effect, first.fit.model.values)
-    goal = cost_beside(first.fit, before.fit, experiments)
+    goal = min(goal, cost_beside(first.fit, before.fit, experiments))
     final = _best_continued(fits, experiments, _CONTINUED, goal)
     return hypothesis(first.causes, final, experiments)
 
@@ -228,16 +229,24 @@ def together(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | 
     return hypothesis(of.causes, found, experiments, final=True)
 
 
-def to_end(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis:
-    """Continue a fit until it converges, loosely first, then at full tolerance."""
+def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.inf) -> Hypothesis:
+    """Continue a fit until it converges, loosely first, then at full tolerance.
+
+    One whose cost will stay above the `goal` is not final.
+    """
     current = of.fit
     loosest = quick_rtol(current.sigma, experiments)
     for rtol, tolerance, evaluations in _POLISHING:
         try:
-            current = continued(current, experiments, min(rtol, loosest), tolerance, evaluations)
+            current = continued(
+                current, experiments, min(rtol, loosest), tolerance, evaluations, goal
+            )
         except PsaError:
             return ended(of)
-    return hypothesis(of.causes, current, experiments, final=True) or ended(of)
+        if current.cost > goal:
+            break
+    final = current.cost <= goal
+    return hypothesis(of.causes, current, experiments, final=final) or ended(of)
 
 
 def _from_ordinary(

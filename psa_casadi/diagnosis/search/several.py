@@ -52,7 +52,7 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     fitted = [f for f in found if f is not None]
     better = [f for f in fitted if f.names in beside and known.scale.evidence(f) > 0.0]
     others = [f for f in fitted if f not in better]
-    for f in _best_to_end(better, others, known, task):
+    for f in _best_to_end(better, others, known, task, goal):
         known.note(f)
 
 
@@ -80,14 +80,19 @@ def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
 
 
 def _best_to_end(
-    pairs: Sequence[Hypothesis], found: Sequence[Hypothesis], known: Known, task: Task
+    pairs: Sequence[Hypothesis],
+    found: Sequence[Hypothesis],
+    known: Known,
+    task: Task,
+    goal: float,
 ) -> list[Hypothesis]:
     """Return fits of sets, the pairs and the best others of them to their end.
 
-    Of two fits of one set the better one so far need not be the one that ends lower.
+    Of two fits of one set the better one so far need not be the one that ends lower. One whose cost
+    will stay above the `goal` ends before.
     """
     ranked = sorted(found, key=lambda h: -known.scale.score(h))
     best, others = [*pairs, *ranked[:FINALISTS]], ranked[FINALISTS:]
     said = ", ".join("+".join(sorted(h.names)) for h in best)
     task.progress(f"{said} to the end")
-    return [*side_by_side(lambda h: to_end(h, task.experiments), best), *others]
+    return [*side_by_side(lambda h: to_end(h, task.experiments, goal), best), *others]
