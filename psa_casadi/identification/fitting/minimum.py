@@ -28,6 +28,9 @@ FloatArray = npt.NDArray[np.float64]
 #: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
 #: then the stepper is taken.
 _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
+#: Multiple of the whole range that is missed (rms) where a loop has diverged. It would come down by
+#: decades a step, each of which takes a hundred times as long as one of a loop that is stable.
+_DIVERGED = 1e6
 
 
 @dataclass(frozen=True)
@@ -121,9 +124,10 @@ def objective(
 ) -> Evaluate:
     """Return the weighted residuals (predicted - measured, then priors) with their Jacobian.
 
-    Those of the displacement, then those of the further columns.
+    Those of the displacement, then those of the further columns. None where the model diverges.
     """
     target = np.concatenate([measured(e.record)[e.used] for e in experiments])
+    reach = float(np.max(np.ptp(target) / weights)) if np.ptp(target) > 0.0 else np.inf
     used = [e.used[: e.stop] for e in experiments]
     prior, samples, share = 1.0 / unknowns.prior, len(target), 1.0 / weights
 
@@ -148,6 +152,7 @@ def objective(
         jacobian[samples:] = np.vstack([*more, np.diag(prior)])
         with np.errstate(over="ignore", invalid="ignore"):
             finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
-        return (residual, jacobian) if finite else None
+            near = np.linalg.norm(residual[:samples]) < _DIVERGED * reach * np.sqrt(samples)
+        return (residual, jacobian) if finite and near else None
 
     return evaluate

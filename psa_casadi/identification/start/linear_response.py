@@ -123,19 +123,20 @@ def plays(u: FloatArray, radii: npt.ArrayLike) -> FloatArray:
     length = max(int(sqrt(u.size)), 1)
     blocks = -(-u.size // length)
     padded = np.concatenate([u, np.full(blocks * length - u.size, u[-1])]).reshape(blocks, length)
-    low = np.empty((blocks, length, r.size))
-    high = np.empty_like(low)
-    low[:, 0], high[:, 0] = padded[:, :1] - r, padded[:, :1] + r
+    steps = np.ascontiguousarray(padded.T)[:, :, None]
+    bottom, top = steps - r, steps + r
+    levels = np.empty((length, 2, blocks, r.size))  # the lower and the upper one of every block
+    levels[0, 0], levels[0, 1] = bottom[0], top[0]
     for i in range(1, length):
-        bottom, top = padded[:, i : i + 1] - r, padded[:, i : i + 1] + r
-        low[:, i] = np.minimum(np.maximum(low[:, i - 1], bottom), top)
-        high[:, i] = np.minimum(np.maximum(high[:, i - 1], bottom), top)
-    out = np.empty_like(low)
+        np.maximum(levels[i - 1], bottom[i], out=levels[i])
+        np.minimum(levels[i], top[i], out=levels[i])
+    before = np.empty((blocks, r.size))
     state = np.full(r.size, u[0])
-    for k in range(blocks):
-        out[k] = np.minimum(np.maximum(state, low[k]), high[k])
-        state = out[k, -1]
-    return out.reshape(blocks * length, r.size)[: u.size]
+    for k, (low, high) in enumerate(zip(*levels[-1], strict=True)):
+        before[k] = state
+        state = np.minimum(np.maximum(state, low), high)
+    out = np.minimum(np.maximum(before, levels[:, 0]), levels[:, 1])
+    return out.transpose(1, 0, 2).reshape(blocks * length, r.size)[: u.size]
 
 
 def orthonormal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
