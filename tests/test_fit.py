@@ -265,6 +265,25 @@ def test_a_trial_whose_numbers_overflow_has_failed(monkeypatch: pytest.MonkeyPat
     assert evaluate(found.theta) is None
 
 
+@pytest.mark.parametrize(("ranges", "evaluated"), [(1e4, True), (1e8, False)])
+def test_a_loop_that_has_left_the_record_far_behind_has_diverged(
+    ranges: float, evaluated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its numbers are finite, and each further evaluation would take a hundred times as long."""
+    model = model_with()
+    experiments = [whole(record_of(model, 1))]
+    found = fitted(model, experiments)
+    weights = np.full(experiments[0].record.n, SIGMA)
+    evaluate = objective(model, experiments, found.unknowns, weights, found.way)
+    far = np.full(len(weights), ranges * experiments[0].record.range_m)
+    slopes = np.zeros((len(weights), found.unknowns.size))
+    monkeypatch.setattr(
+        "psa_casadi.identification.fitting.minimum.predict",
+        lambda *_, **__: [Prediction(far, slopes, "exact")],
+    )
+    assert (evaluate(found.theta) is not None) == evaluated
+
+
 def test_a_fit_without_samples_is_refused() -> None:
     record = record_of(model_with(), 1)
     none = np.zeros(record.n, dtype=np.bool_)

@@ -101,6 +101,21 @@ def test_the_score_is_the_evidence_less_the_price_of_the_causes(creeping: Creepi
         assert fitted_alone.score(creep) == pytest.approx(scale.evidence(creep) - 8.0)
 
 
+def test_a_fit_that_will_stay_above_the_goal_is_not_final(
+    fitted: tuple[Fit, tuple[Experiment, ...]], creeping: Creeping
+) -> None:
+    """It may be taken up again, and spends less."""
+    _, creep, _, experiments = creeping
+    seen = _seen(fitted, names=("slow_creep",))
+    quick = with_cause(seen.of, experiments, seen.starts_of("slow_creep"))
+    assert quick is not None
+    assert creep.final
+    assert to_end(quick, experiments, 1.01 * creep.fit.cost).final
+    behind = to_end(quick, experiments, 0.5 * creep.fit.cost)
+    assert not behind.final
+    assert to_end(behind, experiments).fit.cost == pytest.approx(creep.fit.cost, rel=1e-3)
+
+
 def test_records_that_are_held_out_whole_judge_and_do_not_choose(creeping: Creeping) -> None:
     plain, _, scale, experiments = creeping
     whole = judging(experiments[0].record)
