@@ -104,7 +104,7 @@ def test_the_score_is_the_evidence_less_the_price_of_the_causes(creeping: Creepi
 def test_a_fit_that_will_stay_above_the_goal_is_not_final(
     fitted: tuple[Fit, tuple[Experiment, ...]], creeping: Creeping
 ) -> None:
-    """It may be taken up again, and spends less."""
+    """It may be taken up again, and ends where it would have ended."""
     _, creep, _, experiments = creeping
     seen = _seen(fitted, names=("slow_creep",))
     quick = with_cause(seen.of, experiments, seen.starts_of("slow_creep"))

@@ -244,9 +244,8 @@ def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.i
         except PsaError:
             return ended(of)
         if current.cost > goal:
-            break
-    final = current.cost <= goal
-    return hypothesis(of.causes, current, experiments, final=final) or ended(of)
+            return hypothesis(of.causes, current, experiments) or ended(of)
+    return hypothesis(of.causes, current, experiments, final=True) or ended(of)
 
 
 def _from_ordinary(
