@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
+from psa_casadi.identification.start.linear_response import plays
 from psa_casadi.records.quality.filtering import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
@@ -98,15 +99,15 @@ def _reading_curve(s: Signals, k: int) -> FloatArray:
 
 def _direction(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
-    side = (q[:, None] - _plays(q, np.array([NARROW]))) / NARROW
+    side = (q[:, None] - plays(q, [NARROW])) / NARROW
     return s.respond(k, side * _cosines(q, 0, BRANCH))
 
 
 def _memory(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
     radii = np.array([radius(k) for k in range(ELEMENTS)])
-    plays = _plays(q, radii)
-    return s.respond(k, np.hstack([q[:, None] - plays, plays**2, plays**3]))
+    followed = plays(q, radii)
+    return s.respond(k, np.hstack([q[:, None] - followed, followed**2, followed**3]))
 
 
 def _relaxation(s: Signals, k: int) -> FloatArray:
@@ -144,17 +145,6 @@ def _time(s: Signals, k: int) -> FloatArray:
 
 def _gain_in_time(s: Signals, k: int) -> FloatArray:
     return s.displacement(k)[:, None] * _time(s, k)
-
-
-def _plays(q: FloatArray, radii: FloatArray) -> FloatArray:
-    """Return play operators (n, k) of a signal; they begin where the signal does."""
-    low, high = q[:, None] - radii, q[:, None] + radii
-    found = np.empty_like(low)
-    state = np.full(len(radii), q[0])
-    for least, most, row in zip(low, high, found, strict=True):  # `clip` takes 20 times as long
-        np.maximum(state, least, out=row)
-        state = np.minimum(row, most, out=row)
-    return found
 
 
 def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
