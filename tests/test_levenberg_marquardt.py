@@ -170,3 +170,28 @@ def test_a_short_step_does_not_end_a_search_for_a_goal_within_reach(
     found = minimise(valley, np.array(begun), OPEN, tolerance=1e-10, evaluations=200, goal=1e-2)
     assert found is not None
     assert found.cost < 1e-2
+
+
+def noisy_valley(begun: tuple[float, float], steep: float, *, patient: bool) -> Minimum:
+    """Search Rosenbrock's valley above noise of 100, which hides what short steps gain."""
+
+    def above(x: FloatArray) -> Pair:
+        residual = np.array([steep * (x[1] - x[0] ** 2), 1.0 - x[0], 10.0])
+        return residual, np.array([[-2.0 * steep * x[0], steep], [-1.0, 0.0], [0.0, 0.0]])
+
+    start, most = np.array(begun), 500
+    found = minimise(
+        above, start, OPEN, tolerance=1e-3, evaluations=most, radius=0.1, patient=patient
+    )
+    return solved(found)
+
+
+@pytest.mark.parametrize("steep", [30.0, 100.0, 300.0, 1000.0])
+@pytest.mark.parametrize("begun", [(-2.0, 4.0), (-3.0, 9.0), (-4.0, 16.0)])
+def test_a_patient_search_does_not_end_where_a_valley_bends(
+    begun: tuple[float, float], steep: float
+) -> None:
+    """It ends where no step promises over ten tolerances, 1 % of the cost; the end is at 100."""
+    assert noisy_valley(begun, steep, patient=True).cost < 101.1
+    if steep >= 300.0:
+        assert noisy_valley(begun, steep, patient=False).cost > 101.8

@@ -239,7 +239,7 @@ def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.i
     for rtol, tolerance, evaluations in _POLISHING:
         try:
             current = continued(
-                current, experiments, min(rtol, loosest), tolerance, evaluations, goal
+                current, experiments, min(rtol, loosest), tolerance, evaluations, goal, patient=True
             )
         except PsaError:
             return ended(of)

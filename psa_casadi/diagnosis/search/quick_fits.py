@@ -118,10 +118,12 @@ def continued(
     tolerance: float,
     evaluations: int,
     goal: float = np.inf,
+    *,
+    patient: bool = False,
 ) -> Fit:
     """Go on with a fit from where it stopped, with all that is free. Raises PsaError.
 
-    It ends early where its cost will stay above the `goal`.
+    It ends early where its cost will stay above the `goal`; `patient` it goes on along a valley.
     """
     names = current.unknowns.names
     return fit(
@@ -134,6 +136,7 @@ def continued(
         tolerance=tolerance,
         rtol=rtol,
         goal=goal,
+        patient=patient,
         radius=float(np.clip(current.radius, LEAST_RADIUS, FIRST_RADIUS)),
     )
 

@@ -159,6 +159,7 @@ def fit(
     rtol: float = FIT_RTOL,
     goal: float = np.inf,
     radius: float = FIRST_RADIUS,
+    patient: bool = False,
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
@@ -166,8 +167,9 @@ def fit(
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
     those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
-    cost will stay above the `goal`; its first step is of the `radius`. Raises InputError when no
-    sample can be used, SimulationError when the start cannot be simulated or its numbers overflow.
+    cost will stay above the `goal`; its first step is of the `radius`, and where it is `patient` it
+    does not stop in a curved valley (`minimise`). Raises InputError when no sample can be used,
+    SimulationError when the start cannot be simulated or its numbers overflow.
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
@@ -182,7 +184,7 @@ def fit(
         [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
     )
     linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
-    effort = Effort(tolerance, evaluations, goal, linear, radius)
+    effort = Effort(tolerance, evaluations, goal, linear, radius, patient)
     minimum, way, told = accurate_minimum(
         model, experiments, unknowns, weights, theta, sigma, rtol, effort
     )

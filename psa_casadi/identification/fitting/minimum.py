@@ -42,6 +42,7 @@ class Effort:
     goal: float
     linear: tuple[int, ...]
     radius: float
+    patient: bool = False
 
 
 def accurate_minimum(
@@ -71,6 +72,7 @@ def accurate_minimum(
                 evaluations=max(effort.evaluations - spent, 2),
                 goal=goal,
                 linear=effort.linear,
+                patient=effort.patient,
                 radius=effort.radius if before is None else max(before[0].radius, LEAST_RADIUS),
             )
         except KeyboardInterrupt:
