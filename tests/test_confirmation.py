@@ -89,18 +89,20 @@ def held(record: Record, count: int) -> tuple[Experiment, ...]:
 
 
 @pytest.mark.parametrize(
-    ("count", "interval", "partly", "hidden", "told"),
+    ("count", "interval", "lost", "partly", "hidden", "told"),
     [
-        (15, (50.0, 60.0), False, 0.0, "only 15 of the readings that count"),
-        (16, (50.0, 60.0), False, 0.51, "saturated in 51 % of the readings"),
-        (16, (-101.0, 98.0), False, 0.0, "gain, -101 to 98 %, reaches from an error that doubles"),
-        (16, (-101.0, 97.0), False, 0.0, ""),
-        (16, (-99.0, 98.0), True, 0.5, ""),
+        (15, (50.0, 60.0), -9.0, False, 0.0, "only 15 of the readings that count"),
+        (16, (50.0, 60.0), -9.0, False, 0.51, "saturated in 51 % of the readings"),
+        (16, (-101.0, 98.0), 1.1, False, 0.0, "gain, -101 to 98 %, reaches from an error that"),
+        (16, (-101.0, 98.0), 0.9, False, 0.0, ""),
+        (16, (-101.0, 97.0), 1.1, False, 0.0, ""),
+        (16, (-99.0, 98.0), 1.1, True, 0.5, ""),
     ],
 )
 def test_what_held_out_samples_confirm(
     count: int,
     interval: tuple[float, float],
+    lost: float,
     partly: bool,
     hidden: float,
     told: str,
@@ -108,7 +110,7 @@ def test_what_held_out_samples_confirm(
 ) -> None:
     experiments = held(triangle, count)
     gain = Gain(40.0, interval)
-    said = unconfirmed(experiments, gain, whole=97.5, partly=partly, hidden=hidden)
+    said = unconfirmed(experiments, gain, whole=97.5, lost=lost, partly=partly, hidden=hidden)
     assert told in said
     assert bool(said) == bool(told)
     few = [n for n in coverage_notes(experiments) if n.startswith("Only")]

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.held_out.errors import gain_of
+from psa_casadi.diagnosis.held_out.errors import gain_of, lost_elsewhere
 from psa_casadi.diagnosis.noise.colour import colour_of
 from psa_casadi.diagnosis.noise.residual_tests import omnibus
 from psa_casadi.records.drive import among_harmonics, drive_frequency, mains_line
@@ -144,6 +144,20 @@ def test_gain_is_the_reduction_of_the_held_out_rms() -> None:
     assert gain.interval[0] < gain.holdout_rms_reduction_percent < gain.interval[1]
     assert gain.held_out_records == 0
     assert gain_of([experiment] * 4, [base] * 4, [truth] * 4).held_out_records == 4
+
+
+def test_what_the_other_parts_lose_is_counted_without_the_one_that_gains_most() -> None:
+    """Eight parts of 125: one falls from 10 to 1, the others rise by a tenth or stay."""
+    time = grid(1e-3)
+    record = Record(name="r", time=time, voltage=time, displacement=np.zeros(N))
+    held = np.arange(N) >= N - 1000
+    experiment = Experiment(record, ~held, held)
+    first = np.arange(N) < N - 1000 + 125
+    base, after = np.where(first, 10.0, 1.0), np.where(first, 1.0, 1.1)
+    lost = lost_elsewhere([experiment], [base], [after], 2.0)
+    assert lost == pytest.approx(875 / 2.0 * np.log(1.1))
+    still = np.where(first, 1.0, 1.0)
+    assert lost_elsewhere([experiment], [base], [still], 2.0) == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,16 @@ from numpy.typing import NDArray
 from scipy.signal import lsim
 
 import psa_casadi as psa
+from psa_casadi.diagnosis.search.hypothesis import hypothesis, root_of
+from psa_casadi.diagnosis.search.modes import one_mode
 from psa_casadi.effects.modal_series import MODAL_SERIES
+from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.start.modes import Shaken, modes_of
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine
+from psa_casadi.records.split import split
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
 from tests.plants.structural_mode import contribution
@@ -149,6 +154,36 @@ def test_several_modes_are_found_together_and_again_from_what_was_found() -> Non
     again = psa.diagnose([shaken_stack(11)], model=found.model, effects=like)
     assert again.base_errors.holdout_nrmse_percent > 1.0
     assert [c.effect.startswith("modal_series") for c in again.causes] == [True]
+
+
+@slow
+def test_one_mode_is_enough_where_a_series_stands_for_one() -> None:
+    """The base alone has bent itself to the mode; the series has led it back.
+
+    The plant's mode is driven by the force, the effect by the displacement behind it.
+    """
+    frequency, damping, share = HIDDEN[0]
+    straight = psa.diagnose([shaken_stack(11, ())], effects=[STRUCTURAL_MODE]).base_fit
+    record = shaken_stack(11, HIDDEN[:1])
+    experiments = [split(record)]
+    names, sigma = straight.unknowns.names, straight.sigma
+    bent = fit(straight.model, experiments, names, sigma=sigma)
+    modes = {1: (1.08 * frequency, damping, share), 2: (0.9 * frequency, 0.2, 0.5 * share)}
+    values = {
+        f"series_{name}_{k}": value
+        for k, mode in modes.items()
+        for name, value in zip(("frequency", "damping", "share"), mode, strict=True)
+    }
+    model = straight.model.with_effect(MODAL_SERIES[2], {**values, "series_gain": 1.0})
+    led = fit(model, experiments, [*names, *MODAL_SERIES[2].fitted], sigma=sigma, evaluations=20)
+    series = hypothesis((MODAL_SERIES[2],), led, experiments)
+    assert series is not None
+    root = root_of(bent, experiments)
+    single = min(one_mode(series, root, experiments), key=lambda h: h.fit.rms)
+    assert single.names == {"structural_mode"}
+    assert single.final
+    assert single.fit.model.values["mode_frequency"] == pytest.approx(frequency, rel=5e-3)
+    assert single.holdout_rms < 1.2e-3 * record.range_m  # the noise is 1e-3
 
 
 @slow

@@ -18,6 +18,7 @@ from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import (
     errors_of,
     gain_of,
+    lost_elsewhere,
     whole_residuals,
 )
 from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
@@ -96,7 +97,8 @@ def conclude(
     gain = gain_of(experiments, first.predicted, last.predicted)
     partly = last.test.alarm and len(steps) > 1
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
-    doubt = unconfirmed(experiments, gain, whole=whole, partly=partly, hidden=hidden)
+    lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
+    doubt = unconfirmed(experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden)
     vague = {} if beaten is not None or doubt else balance.vague(steps)
     verdict: Verdict = (
         "not_driven"

@@ -1,4 +1,7 @@
-"""The benchmark `stability`: the same verdict and names where data change far below their noise."""
+"""The benchmark `stability`: the same verdict and names where data change far below their noise.
+
+Cases of the study, the records of the exam, and the measured micromanipulator.
+"""
 
 import os
 import tempfile
@@ -10,27 +13,50 @@ from pathlib import Path
 
 import numpy as np
 
+from psa_casadi import datasets
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden_cases import Case, names_of, records_of, study
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.exam.play import write
+from tests.exam.record import Record as ExamRecord
+from tests.exam.records import RECORDS
 from tests.plants.table import FOREIGN, KNOWN
 
 #: The first of the seeds, which no other benchmark uses.
 FIRST = 480201
-#: Cases and draws of each; the change, over the rms of the noise.
+#: Cases of the study and draws of each; the change, over the rms of the noise.
 CASES, DRAWS, QUICK_CASES, QUICK_DRAWS, CHANGE = 40, 20, 6, 3, 0.01
+#: Draws of records of the exam, of which a quick run takes one of so many, and of measured rows.
+EXAM_DRAWS, QUICK_EXAM, MEASURED_DRAWS, QUICK_MEASURED_DRAWS = 3, 12, 9, 1
 _KINDS = ("known", "weak", "clean", "foreign", "left out", "two", "poor", "design", "ringing")
+#: Rows of `docs/measured.md`, and the noise that a diagnosis tells of these records [m].
+MEASURED, _MEASURED_NOISE = ("sine_1hz", "minor_loops", "both files"), 67e-9
 
 Said = tuple[str, frozenset[str], frozenset[str]]
 
 
 @dataclass(frozen=True)
-class Repeated:
-    """What was said of a case, and of it with the data changed."""
+class Given:
+    """What is diagnosed: its kind, its name, where its records come from, and a seed.
 
-    case: Case
+    Of a row of the measured ones that is its name.
+    """
+
+    kind: str
+    name: str
+    source: Case | ExamRecord | str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """What was said of records, and of them with their data changed."""
+
+    given: Given
     first: Said
     changed: tuple[Said, ...]
 
@@ -46,17 +72,34 @@ class Repeated:
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose cases of every kind as they are, then with white noise of 1 % of theirs added."""
-    cases = chosen_cases(QUICK_CASES if quick else CASES)
-    draws = QUICK_DRAWS if quick else DRAWS
+    """Diagnose everything as it is, then with white noise of 1 % of its own added."""
+    jobs = [(g, QUICK_DRAWS if quick else DRAWS) for g in _study(QUICK_CASES if quick else CASES)]
+    exam = RECORDS[::QUICK_EXAM] if quick else RECORDS
+    jobs += [(g, 1 if quick else EXAM_DRAWS) for g in map(_of_exam, exam)]
+    draws = QUICK_MEASURED_DRAWS if quick else MEASURED_DRAWS
+    jobs += [(Given("measured", row, row, k), draws) for k, row in enumerate(MEASURED)]
+    return Outcome((table(repeated(jobs, progress)),))
+
+
+def repeated(jobs: Sequence[tuple[Given, int]], progress: Progress) -> list[Repeated]:
+    """Return what is said of records, and with their data changed so many times."""
     found = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [(c, [pool.submit(said_of, c, k) for k in range(draws + 1)]) for c in cases]
-        for case, own in jobs:
+        asked = [(g, [pool.submit(said_of, g, k) for k in range(n + 1)]) for g, n in jobs]
+        for given, own in asked:
             first, *changed = (job.result() for job in own)
-            found.append(Repeated(case, first, tuple(changed)))
-            progress(f"{case.kind}, {case.effect}: {found[-1].same_verdict} of {draws} alike")
-    return Outcome((table(found),))
+            found.append(Repeated(given, first, tuple(changed)))
+            alike = f"{found[-1].same_verdict} of {len(changed)} alike"
+            progress(f"{given.kind}, {given.name}: {alike}")
+    return found
+
+
+def _study(count: int) -> list[Given]:
+    return [Given(c.kind, c.effect or "nothing", c, c.seed) for c in chosen_cases(count)]
+
+
+def _of_exam(record: ExamRecord) -> Given:
+    return Given("exam", record.name, record, record.seed)
 
 
 def chosen_cases(count: int) -> list[Case]:
@@ -68,21 +111,36 @@ def chosen_cases(count: int) -> list[Case]:
     return [own[k] for k in range(each) for own in spread][:count]
 
 
-def said_of(case: Case, draw: int) -> Said:
-    """Return verdict, names, and the whole set, of the case with its data changed; draw 0 is not.
+def said_of(given: Given, draw: int) -> Said:
+    """Return verdict, names, and the whole set, of records with their data changed; draw 0 is not.
 
     Readings are changed by white noise of `CHANGE` times the rms of their own.
     """
     with tempfile.TemporaryDirectory() as folder:
-        truth, records = records_of(case, Path(folder))
-    rng = np.random.default_rng([case.seed, draw])
-    size = CHANGE * truth.sigma if draw else 0.0
+        noise, records = _records(given, Path(folder))
+    rng = np.random.default_rng([given.seed, draw])
+    size = CHANGE * noise if draw else 0.0
     changed = [
         replace(r, displacement=r.displacement + size * rng.standard_normal(r.n))
         for r in records
         if r.displacement is not None
     ]
     return _said(diagnose(changed))
+
+
+def _records(given: Given, folder: Path) -> tuple[float, Sequence[Record]]:
+    """Return the rms of the noise of the readings [m], and the records."""
+    if isinstance(given.source, Case):
+        truth, records = records_of(given.source, folder)
+        return truth.sigma, records
+    if isinstance(given.source, ExamRecord):
+        path = folder / f"{given.name}.csv"
+        write(given.source, path)
+        record = read_record(path)
+        return 1e-2 * given.source.test.noise * record.range_m, [record]
+    sine, loops = datasets.micromanipulator()
+    rows = dict(zip(MEASURED, ([sine], [loops], [sine, loops]), strict=True))
+    return _MEASURED_NOISE, rows[given.source]
 
 
 def _said(d: Diagnosis) -> Said:
@@ -93,8 +151,8 @@ def _said(d: Diagnosis) -> Said:
 def table(found: Sequence[Repeated]) -> TitledTable:
     """Return how often verdict and names stayed, by kind of case."""
     rows = []
-    for kind in (*dict.fromkeys(r.case.kind for r in found), "all"):
-        own = [r for r in found if kind in (r.case.kind, "all")]
+    for kind in (*dict.fromkeys(r.given.kind for r in found), "all"):
+        own = [r for r in found if kind in (r.given.kind, "all")]
         draws = sum(len(r.changed) for r in own)
         rows.append(
             (
@@ -110,5 +168,5 @@ def table(found: Sequence[Repeated]) -> TitledTable:
     return TitledTable(
         "Data changed by 1 % of their noise",
         Table(head, tuple(rows)),
-        "Each case is diagnosed as it is, and with white noise of 1 % of its own added.",
+        "Everything is diagnosed as it is, and with white noise of 1 % of its own added.",
     )

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from psa_casadi.diagnosis.held_out.errors import Gain
+from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.start.doubts import doubtful_voltage
 from psa_casadi.identification.start.other_quantities import doubtful_quantity
 from psa_casadi.records.checks import FEWEST_SAMPLES
@@ -30,6 +31,7 @@ def unconfirmed(
     gain: Gain,
     *,
     whole: float,
+    lost: float,
     partly: bool,
     hidden: float,
 ) -> str:
@@ -37,8 +39,10 @@ def unconfirmed(
 
     `hidden` is the share of the readings that a saturated sensor has made. The interval of the
     held-out `gain` tells nothing where it reaches from an error that doubles to the `whole` gain
-    [%], which leaves the noise alone. The voltage must be one that stacks bear and, where the
-    causes explain the records `partly` and much remains, the displacement no other quantity.
+    [%], which leaves the noise alone; that of a saturation which shows in one of eight parts does
+    too, so that all but the part that gains most must also have `lost` something [nats]. The
+    voltage must be one that stacks bear and, where the causes explain the records `partly` and
+    much remains, the displacement no other quantity.
     """
     few = too_few_held_out(experiments)
     if few:
@@ -49,10 +53,10 @@ def unconfirmed(
             " motion is hidden than shown"
         )
     low, high = gain.interval
-    if low <= _DOUBLED and high >= whole:
+    if low <= _DOUBLED and high >= whole and lost > thresholds().held_out:
         return (
             f"the 95 % interval of the held-out gain, {low:.0f} to {high:.0f} %, reaches from an"
-            " error that doubles to noise alone"
+            " error that doubles to noise alone, and most held-out samples lose by it"
         )
     return _columns(experiments, partly=partly)
 

@@ -153,6 +153,24 @@ def gain_of(
     return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), told)
 
 
+def lost_elsewhere(
+    experiments: Sequence[Experiment],
+    base: Sequence[FloatArray],
+    extended: Sequence[FloatArray],
+    inflation: float,
+) -> float:
+    """Return what held-out samples lose, but for the part that gains most [nats].
+
+    That is m ln(E/E_0) over the other parts of `held_out_parts`: m their samples over the noise's
+    `inflation`, E_0 and E the errors' rms. Infinite where there is only one part.
+    """
+    sums, counts = held_out_parts(experiments, base, extended)
+    if len(sums) < 2:
+        return np.inf
+    others = np.arange(len(sums)) != int(np.argmax(sums[:, 0] - sums[:, 1]))
+    return float(counts[others].sum()) / inflation * _log_ratio(np.sum(sums[others], axis=0))
+
+
 def _log_ratio(sums: FloatArray) -> float:
     """Logarithm of the errors' ratio [-], from their sums of squares before and after [m^2]."""
     before, after = (max(float(s), 1e-300) for s in sums)

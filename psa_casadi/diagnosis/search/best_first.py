@@ -29,7 +29,7 @@ from psa_casadi.diagnosis.search.fits import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names, Searched, is_left
-from psa_casadi.diagnosis.search.modes import with_modes
+from psa_casadi.diagnosis.search.modes import one_mode, with_modes
 from psa_casadi.diagnosis.search.several import fit_from_other_parents, fit_sets
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
@@ -263,7 +263,10 @@ class _Search:
             self.known.remember(root, found.causes[-1].name)
 
     def challenge(self, h: Hypothesis) -> None:
-        """Fit with every cause taken out, and with resonances of the stack's own in its place."""
+        """Fit with every cause taken out, and with resonances of the stack's own in its place.
+
+        Several modes that leave structure are challenged by a single one.
+        """
         task = self.task
         if "base again" not in task.method.without:
             for cause in h.causes:
@@ -272,6 +275,11 @@ class _Search:
                     task.progress(f"without {cause.name}")
                     self.known.note(without(h, cause, task.experiments, less))
         before = self.known.get(h.names_upto(len(h.causes) - 1))
+        if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
+            task.progress("one mode in the place of several")
+            for one in one_mode(h, before, task.experiments):
+                self.known.note(one)
+            self.known.remember(before, STRUCTURAL_MODE.name)
         if "resonances" in task.method.without or before is None or has_series(h):
             return
         last, found = h.causes[-1], None

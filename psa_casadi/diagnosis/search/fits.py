@@ -156,7 +156,7 @@ def in_place(
         values[effect.gain or ""],
         tuple({**s, **r} for s, r in zip(own.starts(), reached.starts(), strict=True)),
     )
-    return _exchanged(whole, less, effect, start, reached, experiments, goal)
+    return exchanged(whole, less, effect, start, reached, experiments, goal)
 
 
 def like(
@@ -174,19 +174,22 @@ def like(
     effect, direction = copy.direction.effect, copy.direction
     usable = copy.gain > 0 or not direction.one_sided
     start = (direction.values, copy.gain if usable else direction.unit_gain, direction.memory)
-    return _exchanged(whole, less, effect, start, whole.fit, experiments, goal)
+    return exchanged(whole, less, effect, start, whole.fit, experiments, goal)
 
 
-def _exchanged(
+def exchanged(
     whole: Hypothesis,
     less: Hypothesis,
     effect: Component,
     start: Start,
     reached: Fit,
     experiments: Sequence[Experiment],
-    goal: float,
+    goal: float = np.inf,
 ) -> Hypothesis | None:
-    """Fit an effect where the `whole` has the cause that `less` lacks, the rest as `reached`."""
+    """Fit an effect where the `whole` has the cause that `less` lacks, the rest as `reached`.
+
+    `start` are the effect's values without its gain, the gain, and the records' memories.
+    """
     values = reached.model.values
     base = {n: values[n] for n in less.fit.unknowns.names if n in values}
     causes = tuple(effect if c not in less.causes else c for c in whole.causes)

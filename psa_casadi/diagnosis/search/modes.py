@@ -6,9 +6,11 @@ from dataclasses import asdict, replace
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.diagnosis.search.fits import exchanged, to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.quick_fits import fit_with_all
+from psa_casadi.diagnosis.search.quick_fits import Start, fit_with_all
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES, MOST
+from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
@@ -17,6 +19,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.scales import stiffness_scale
+from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.ways import accurate
@@ -28,6 +31,8 @@ _ENOUGH, _EVALUATIONS = 20_000, 20
 #: To what share of the rms each mode must bring the residual. The seven largest of a mirror's axis
 #: do, the next one does not; noise has no mode that does.
 _LOWERED = 0.95
+#: So many fits of one mode in the place of several go to their end.
+_ALONE = 3
 _RTOL = 1e-4
 
 
@@ -67,6 +72,34 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
         modes, states = ringing, tuple(found.starts())
         fit = replace(before.fit, model=base)
     return None
+
+
+def one_mode(
+    series: Hypothesis, less: Hypothesis, experiments: Sequence[Experiment]
+) -> list[Hypothesis]:
+    """Fit one mode in the place of a series, from each of those, and the best to the end.
+
+    The series is the last cause; `less` is the hypothesis without it. The base begins where the
+    series has led it: modes may stand for what the base without them had bent itself to.
+    """
+    fit = series.fit
+    states = tuple(fit.starts())
+    starts = [_alone(mode, states) for mode in _modes(fit, series.causes[-1].count)]
+    found = side_by_side(
+        lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit, experiments), starts
+    )
+    best = sorted((h for h in found if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
+    return side_by_side(lambda h: to_end(h, experiments), best)
+
+
+def _alone(mode: Mode, states: tuple[dict[str, float], ...]) -> Start:
+    """Return where a single mode begins that stands for one of a series."""
+    low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
+    lead = np.clip(mode.ahead / (mode.share or 1e-300), low, high)
+    form = {
+        "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": float(lead)
+    }  # fmt: skip
+    return form, mode.share, states
 
 
 def _even(time: FloatArray) -> bool:

@@ -20,8 +20,8 @@ Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 FIRST_RADIUS, LEAST_RADIUS = 1.0, 0.1
 _SMALLEST_RADIUS = 1e-6
 #: Where a step of any length promises more than this multiple of the tolerance, short steps are
-#: those of a curved valley. At a tolerance of 1e-3 fits that had ended promised 0.7 % of the cost
-#: at most; 3 to 12 % where the one of a measured pair of records stopped 20 % above its minimum.
+#: those of a curved valley. At a tolerance of 1e-3 most fits that had ended promised 0 to 0.7 % of
+#: the cost; 3 to 12 % where that of two measured records stopped 13 % above its least error.
 _LEFT = 10.0
 _NEWTON_STEPS = 60
 #: Changes of the active set per coordinate; two or three are ordinary.
