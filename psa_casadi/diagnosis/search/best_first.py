@@ -276,7 +276,7 @@ class _Search:
                     self.known.note(without(h, cause, task.experiments, less))
         before = self.known.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
-            task.progress("one mode in the place of several")
+            task.progress(f"without {h.causes[-1].name}, with one mode in its place")
             for one in one_mode(h, before, task.experiments):
                 self.known.note(one)
             self.known.remember(before, STRUCTURAL_MODE.name)
