@@ -12,7 +12,6 @@ import psa_casadi as psa
 from psa_casadi.diagnosis.search.hypothesis import hypothesis, root_of
 from psa_casadi.diagnosis.search.modes import one_mode
 from psa_casadi.effects.modal_series import MODAL_SERIES
-from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.start.modes import Shaken, modes_of
 from psa_casadi.model.model_file import dumps, loads
@@ -156,15 +155,29 @@ def test_several_modes_are_found_together_and_again_from_what_was_found() -> Non
     assert [c.effect.startswith("modal_series") for c in again.causes] == [True]
 
 
+@pytest.fixture(scope="module")
+def healthy() -> psa.Diagnosis:
+    """Of a fast record without modes."""
+    effects = [psa.EFFECTS[n] for n in ("structural_mode", "drive_lag", "sensor_delay", "backlash")]
+    return psa.diagnose([shaken_stack(14, ())], effects=effects)
+
+
 @slow
-def test_one_mode_is_enough_where_a_series_stands_for_one() -> None:
+@pytest.mark.xdist_group("healthy")
+def test_a_fast_record_without_modes_has_none(healthy: psa.Diagnosis) -> None:
+    assert healthy.verdict == "adequate"
+
+
+@slow
+@pytest.mark.xdist_group("healthy")
+def test_one_mode_is_enough_where_a_series_stands_for_one(healthy: psa.Diagnosis) -> None:
     """The base alone has bent itself to the mode; the series has led it back.
 
     The plant's mode is driven by the force, the effect by the displacement behind it.
     """
     frequency, damping, share = HIDDEN[0]
-    straight = psa.diagnose([shaken_stack(11, ())], effects=[STRUCTURAL_MODE]).base_fit
-    record = shaken_stack(11, HIDDEN[:1])
+    straight = healthy.base_fit
+    record = shaken_stack(14, HIDDEN[:1])
     experiments = [split(record)]
     names, sigma = straight.unknowns.names, straight.sigma
     bent = fit(straight.model, experiments, names, sigma=sigma)
@@ -184,12 +197,6 @@ def test_one_mode_is_enough_where_a_series_stands_for_one() -> None:
     assert single.final
     assert single.fit.model.values["mode_frequency"] == pytest.approx(frequency, rel=5e-3)
     assert single.holdout_rms < 1.2e-3 * record.range_m  # the noise is 1e-3
-
-
-@slow
-def test_a_fast_record_without_modes_has_none() -> None:
-    effects = [psa.EFFECTS[n] for n in ("structural_mode", "drive_lag", "sensor_delay", "backlash")]
-    assert psa.diagnose([shaken_stack(14, ())], effects=effects).verdict == "adequate"
 
 
 @slow
