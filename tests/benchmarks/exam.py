@@ -14,6 +14,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record as Measured
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable
 from tests.exam.marks import Answer, Named, mark
@@ -77,12 +78,17 @@ def sat(
 def marked(record: Record, method: Method | None = None) -> Marked:
     """Make a record as a file, diagnose the file, and mark what is said."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{record.name}.csv"
-        write(record, path)
-        read = read_record(path)
+        read = read_back(record, Path(folder))
     begin = time.process_time()
     answer = _answer(diagnose([read], method=method))
     return Marked(record, answer, mark(record, answer), time.process_time() - begin)
+
+
+def read_back(record: Record, folder: Path) -> Measured:
+    """Make a record as a file in a folder, and read that."""
+    path = folder / f"{record.name}.csv"
+    write(record, path)
+    return read_record(path)
 
 
 def _answer(found: Diagnosis) -> Answer:

@@ -16,12 +16,11 @@ import numpy as np
 from psa_casadi import datasets
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
+from tests.benchmarks.exam import read_back
 from tests.benchmarks.hidden_cases import Case, names_of, records_of, study
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
-from tests.exam.play import write
 from tests.exam.record import Record as ExamRecord
 from tests.exam.records import RECORDS
 from tests.plants.table import FOREIGN, KNOWN
@@ -43,7 +42,7 @@ Said = tuple[str, frozenset[str], frozenset[str]]
 class Given:
     """What is diagnosed: its kind, its name, where its records come from, and a seed.
 
-    Of a row of the measured ones that is its name.
+    The source of a measured row is the row's name.
     """
 
     kind: str
@@ -134,9 +133,7 @@ def _records(given: Given, folder: Path) -> tuple[float, Sequence[Record]]:
         truth, records = records_of(given.source, folder)
         return truth.sigma, records
     if isinstance(given.source, ExamRecord):
-        path = folder / f"{given.name}.csv"
-        write(given.source, path)
-        record = read_record(path)
+        record = read_back(given.source, folder)
         return 1e-2 * given.source.test.noise * record.range_m, [record]
     sine, loops = datasets.micromanipulator()
     rows = dict(zip(MEASURED, ([sine], [loops], [sine, loops]), strict=True))
