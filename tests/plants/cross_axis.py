@@ -49,5 +49,5 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 CROSS_AXIS = HiddenEffect(
-    "cross_axis", "g", "m", draw, contribution, (1e-9, 3e-6), linear=True, foreign=True
+    "cross_axis", "g", "m", draw, contribution, (1e-9, 3e-6), linear=True, foreign=True, random=True
 )

@@ -25,7 +25,8 @@ class HiddenEffect:
     so its visible ratio is that of a base fitted again. called: its name in the project's table,
     where that is another one. driven: of an effect before the stack, (run, secondary parameters,
     gain) -> the run behind it. of_sensor: it acts on the reading. With these two, several effects
-    of one record act on each other (tests/plants/several.py).
+    of one record act on each other (tests/plants/several.py). random: it is a random signal of its
+    own, which goes on in held-out samples as no model can know.
     """
 
     name: str
@@ -41,3 +42,4 @@ class HiddenEffect:
     called: str = ""
     driven: Callable[[Run, Parameters, float], Run] | None = None
     of_sensor: bool = False
+    random: bool = False

@@ -49,5 +49,13 @@ def _band(rng: np.random.Generator, times: FloatArray, frequency: float, q: floa
 
 
 FLOOR_VIBRATION = HiddenEffect(
-    "floor_vibration", "g", "m", draw, contribution, (1e-9, 1e-6), linear=True, foreign=True
+    "floor_vibration",
+    "g",
+    "m",
+    draw,
+    contribution,
+    (1e-9, 1e-6),
+    linear=True,
+    foreign=True,
+    random=True,
 )

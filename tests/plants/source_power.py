@@ -39,5 +39,13 @@ def contribution(run: Run, parameters: Parameters, gain: float) -> FloatArray:
 
 
 SOURCE_POWER = HiddenEffect(
-    "source_power", "g", "1", draw, contribution, (1e-4, 0.1), linear=True, foreign=True
+    "source_power",
+    "g",
+    "1",
+    draw,
+    contribution,
+    (1e-4, 0.1),
+    linear=True,
+    foreign=True,
+    random=True,
 )
