@@ -20,6 +20,7 @@ from psa_casadi.records import write_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from psa_casadi.report.words.text import story
+from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
 from tests.report_cases import diagnosis
@@ -61,6 +62,7 @@ def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
     assert (
         "the sign of the displacement flipped the base model explains 100.00 %" in found.notes[-1]
     )
+    assert "falls while the voltage rises" in verdict_sentence(found)
 
 
 @pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))

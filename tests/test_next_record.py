@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.diagnosis.next_record import useful_records
+from psa_casadi.diagnosis.next_record import next_experiment, useful_records
+from psa_casadi.diagnosis.result import Cause
 from psa_casadi.records.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -47,3 +48,13 @@ def test_records_that_hold_all_of_it_lead_to_other_conditions() -> None:
     # several records count together
     parts = [_record([*LOOP, *FAST]), _record([*LOOP, *SMALLER]), _record([*LOOP, *HELD])]
     assert useful_records(parts) == said
+
+
+def test_causes_that_bend_one_curve_ask_for_a_column_also_where_structure_remains() -> None:
+    bends = ("load_stiffness", "sensor_nonlinearity")
+    causes = [Cause("hysteresis_memory", "plant", 0.99, {}, (), 0.7),
+              Cause(bends[0], "plant", 0.5, {}, bends[1:], 0.2)]  # fmt: skip
+    found = next_experiment(causes, "partly_explained", [bends], [_record(LOOP)], doubted=False)
+    assert found.separates == bends
+    assert "`displacement_2`" in found.why
+    assert "Record what these records lack" in found.why

@@ -100,6 +100,7 @@ def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power(
     assert Share("all", 1.01, (0.9, 1.2)).shown == (1.0, 0.9, 1.0)
     assert Share("half", 0.5, (0.4, 0.62)).text == "50 % (40 to 62 %)"
     assert Share("all", 0.9995, (0.9992, 0.9999)).text == "99.95 % (99.92 to 99.99 %)"
+    assert Share("most", 0.996, (0.98, 1.01)).text == "99.6 % (98.0 to 100.0 %)"
     assert Share("nothing", 0.0004, (0.0, 0.005)).percents == ("under 0.1", "0.0", "0.5")
     assert Share("little", 0.004, (0.0, 0.02)).text == "under 1 % (0 to 2 %)"
     runs, one, _ = _drawn(np.random.default_rng(2), 1)

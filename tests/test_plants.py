@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psa_casadi.cli.demo import HIDDEN
 from tests.plants.base import (
     SUB_INTERVALS,
     Run,
@@ -166,6 +167,8 @@ def test_demo_fits_its_size(tmp_path: Path) -> None:
     truth = make_demo(tmp_path / "demo.csv")
     assert truth.effect == "slow_creep"
     assert (tmp_path / "demo.csv").stat().st_size < 300_000
+    assert f"{100 * truth.gain:.1f} % of the elongation for each decade" in HIDDEN
+    assert f"from {truth.parameters['t_0']:.2f} s on" in HIDDEN
 
 
 def test_creep_is_straight_in_log_time() -> None:

@@ -1,23 +1,27 @@
 import json
 import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.result import Verdict
+from psa_casadi.diagnosis.budget import Budget
+from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.result import Cause, Estimate, Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport, CheckRow
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.plots.figure import save_figure
-from psa_casadi.report.words.phrases import length_scale, listing, number
+from psa_casadi.report.words.phrases import length_scale, listing, number, share_text
 from psa_casadi.report.words.residuals import noise_density, spectrum
 from psa_casadi.report.words.series import series_of, telling_window
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
 from psa_casadi.report.words.text import check_sentence, effect_page, story
+from psa_casadi.report.words.verdict_words import cause_size, verdict_sentence
 from tests.html_page import Page, figures
 from tests.report_cases import ADDED, NOISE, diagnosis
 from tests.tiers import slow
@@ -89,15 +93,46 @@ def test_long_records_stay_small(tmp_path: Path) -> None:
     assert (tmp_path / "r.html").stat().st_size < 1.5e6
 
 
-def test_the_window_shows_where_the_difference_is_easiest_to_see() -> None:
+def test_the_window_shows_where_the_error_falls_most() -> None:
     (series,) = series_of(diagnosis("cause_named"))
     window = telling_window(series)
-    base, extended = (c.values for c in series.curves)
-    difference = np.abs(extended - base)
+    base, extended = (np.nan_to_num(series.residual(c)) for c in series.curves)
+    reached = series.curves[0].values
     assert series.held_out[window].all()
-    assert 48 <= len(difference[window]) <= len(base) // 8
-    shown = np.mean(difference[window]) / np.ptp(base[window])
-    assert shown > 2 * np.mean(difference) / np.ptp(base)
+    assert 48 <= len(base[window]) <= len(base) // 8
+
+    def shown(part: slice) -> float:
+        errors = [float(np.sqrt(np.mean(e[part] ** 2))) for e in (base, extended)]
+        return (errors[0] - errors[1]) / float(np.ptp(reached[part]))
+
+    assert shown(window) > 2 * shown(slice(None))
+
+
+def test_the_verdict_names_the_rival_of_a_later_cause_and_weights_as_what_they_are() -> None:
+    d = diagnosis("partly_explained")
+    memory = EFFECTS["hysteresis_memory"]
+    size = Estimate(0.1, "1", (0.08, 0.12))
+    second = Cause(memory.name, "plant", 0.6, {"memory_threshold": size} |
+                   dict.fromkeys(memory.linear, size), ("backlash",), 0.2)  # fmt: skip
+    d = replace(d, causes=(*d.causes, second), model=d.model.with_effect(memory))
+    assert "hysteresis memory (plant, confidence 60 %; or backlash)" in verdict_sentence(d)
+    said = cause_size(d, second)
+    assert "memory_threshold = 0.100" in said
+    assert said.endswith("9 weights, which shape its loop together")
+    assert "memory_cube_2" not in said
+    assert cause_size(d, d.causes[0]).startswith("creep_gain = 0.0400")
+
+
+def test_the_share_of_a_named_cause_among_several_is_told_beside_that_of_it_alone() -> None:
+    d = diagnosis("partly_explained")
+    own, other = (Share(n, s, (s - 0.05, s + 0.05)) for n, s in (("slow_creep", 0.6), ("hum", 0.3)))
+    spent = Budget(4e-8, NOISE, own, (own, other), None, 1e-9, 0.1)
+    first = d.candidates[0]
+    assert share_text(first, d) == "93 %"
+    hum = replace(d.causes[0], effect="hum")
+    d = replace(d, budget=spent, causes=(*d.causes, hum))
+    assert share_text(first, d) == "93 %; with others 60 %"
+    assert share_text(d.candidates[2], d) == "0 % (screened)"
 
 
 def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:

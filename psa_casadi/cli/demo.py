@@ -26,6 +26,11 @@ FILES = {
     "extended.fmu": "the extended model as an FMU (FMI 2.0), checked",
 }
 _ORIGIN = "synthetic"
+#: What its plant has, which no step of the demonstration is told.
+HIDDEN = (
+    "Hidden in the record: slow creep by 2.0 % of the elongation for each decade of time, from"
+    " 0.08 s on, without end."
+)
 #: What to do after the demonstration.
 NEXT = """
 Next: open {report} in a browser. Then the same with a record of your own:
@@ -77,7 +82,7 @@ def demo(
         atomic_write(paths["diagnosis.json"], d.to_json())
         write_report(d, paths["report.html"], origin=_ORIGIN)
         save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
-    show(f"\n{story(d, origin=_ORIGIN, width=width())}\n", quiet)
+    show(f"\n{story(d, origin=_ORIGIN, width=width())}\n\n{HIDDEN}\n", quiet)
     with working("exporting and checking the FMU", quiet):
         exported.result()
         checked = check_fmu(paths["extended.fmu"], d.model)

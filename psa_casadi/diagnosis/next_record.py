@@ -9,10 +9,10 @@ from psa_casadi.diagnosis.search.contenders import same_curve_note
 from psa_casadi.records.quality.repeats import repeats
 from psa_casadi.records.quality.repetitions import held
 from psa_casadi.records.record import Record
-from psa_casadi.records.stretches import counts
+from psa_casadi.records.stretches import counts, loop_sizes
 
 #: A hold lasts so long [s]; the durations of the largest rises lie in so many bands, each a factor
-#: of four wide, and rises have so many sizes.
+#: of four wide, and loops have so many sizes.
 _HOLD, _RATES, _SIZES = 3.0, 2, 3
 
 _AGAIN = "Correct the record, or record again, so that what the verdict says of it no longer holds."
@@ -32,14 +32,14 @@ def next_experiment(
         return NextExperiment(None, (), _COLUMNS)
     if doubted:
         return NextExperiment(None, (), _AGAIN)
-    rivals = tuple(dict.fromkeys(n for c in causes for n in (c.effect, *c.cannot_be_told_from)))
-    if verdict == "ambiguous":
-        own = (causes[0].effect, *causes[0].cannot_be_told_from)
-        if len(own) > 1 and any(set(own) <= set(group) for group in alike):
-            return NextExperiment(None, rivals, same_curve_note(own))
-        return NextExperiment(None, rivals, useful_records(records))
-    if verdict in ("unexplained", "partly_explained"):
-        return NextExperiment(None, (), useful_records(records))
+    open_ones = [(c.effect, *c.cannot_be_told_from) for c in causes if c.cannot_be_told_from]
+    rivals = tuple(dict.fromkeys(n for own in open_ones for n in own))
+    same = [own for own in open_ones if any(set(own) <= set(group) for group in alike)]
+    notes = [same_curve_note(own) for own in same]
+    if verdict in ("unexplained", "partly_explained") or len(same) < len(open_ones):
+        notes.append(useful_records(records))
+    if notes:
+        return NextExperiment(None, rivals, " ".join(notes))
     return NextExperiment(None, (), "None is needed for this verdict.")
 
 
@@ -58,7 +58,7 @@ def useful_records(records: Sequence[Record]) -> str:
         lacking.append("a hold of several seconds, which separates creep and drift")
     if len({k.band for k in moves if k.size == largest}) < _RATES:
         lacking.append("the same loop at three rates, which separate delay, lag and creep")
-    if len({k.size for k in moves}) < _SIZES:
+    if loop_sizes(records, span) < _SIZES:
         lacking.append("the loop at three amplitudes, which separate asymmetry and memory")
     if all(repeats(r) is None for r in records):
         lacking.append("a voltage that repeats, which shows the noise")

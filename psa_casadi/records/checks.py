@@ -46,11 +46,13 @@ class Located:
 
 def check_length(path: str, samples: int, problems: Problems) -> None:
     """Demand at least `FEWEST_SAMPLES` samples."""
-    if samples < FEWEST_SAMPLES:
-        problems.add(
-            f"{path}: found {samples} samples, expected at least {FEWEST_SAMPLES}; record for "
-            f"longer or name the right file."
-        )
+    if samples >= FEWEST_SAMPLES:
+        return
+    more = "record for longer" if samples else "fill the rows below its header"
+    problems.add(
+        f"{path}: found {samples} samples, expected at least {FEWEST_SAMPLES}; {more}, or name the"
+        " right file."
+    )
 
 
 def check_time(time: Located, problems: Problems) -> None:

@@ -65,6 +65,16 @@ def stretches(record: Record, span: float) -> tuple[tuple[Kind, ...], npt.NDArra
     return kinds, place[which]
 
 
+def loop_sizes(records: Sequence[Record], span: float) -> int:
+    """Return how many sizes the ways between two reversals have, a tenth of the `span` [V] apart.
+
+    The ways to the first reversal and from the last one are no part of a loop.
+    """
+    ways = [np.abs(np.diff(r.voltage[reversals(r.voltage, _TURNS * span)])) for r in records]
+    sizes = np.sort(np.concatenate(ways)) / span
+    return int(np.sum(np.diff(sizes) > _SIZES[0])) + 1 if sizes.size else 0
+
+
 def counts(
     records: Sequence[Record], chosen: Sequence[npt.NDArray[np.bool_]], span: float
 ) -> dict[Kind, int]:

@@ -45,12 +45,14 @@ class Share:
     def percents(self) -> tuple[str, str, str]:
         """The same as percentages without their sign, with decimals where all are near 0 or 1.
 
-        A share that is not 0 is never told as 0.
+        A share that is not 0 is never told as 0, one below 1 told as 100 only from 99.995 on.
         """
         share, low, high = self.shown
         off = min(1.0 - self.interval[0], self.interval[1])
         off = 1.0 if off < 0.0 else off  # beyond what is shown
         digits = 0 if off > 0.01 else 1 if off > 0.001 else 2
+        while digits < 2 and share < 1.0 and float(f"{100 * share:.{digits}f}") >= 100.0:
+            digits += 1
         least = 10.0**-digits
         told = f"{100 * share:.{digits}f}"
         if 0.0 < 100 * share < 0.5 * least:

@@ -159,8 +159,9 @@ def doubtful_voltage(records: Sequence[Record]) -> str:
         return ""
     return (
         f"The voltage reaches {top:.5g} V, and no stack bears more than {_SPANS[1]:.0f} V: it"
-        " probably holds the counts of a converter, or an offset. Give it in volts; what depends on"
-        " the level of the voltage cannot be told so."
+        " probably is in millivolts, or holds the counts of a converter or an offset. Give it in"
+        " volts, or its unit (--columns voltage=NAME:mV); what depends on the level of the voltage"
+        " cannot be told so."
     )
 
 

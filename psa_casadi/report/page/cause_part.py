@@ -101,7 +101,7 @@ def _of_the_data(d: Diagnosis, seen: Signature) -> Picture | None:
         data = data_view(d, best, name)
         if data is None or _share(best, name) > 0:
             return data
-        return Picture(data.caption, data.plot, "By itself this view is within the noise here.")
+        return Picture(data.caption, data.plot, "This view alone does not show it for certain.")
     strongest = drawn(d.misfit)
     if not strongest:
         return None

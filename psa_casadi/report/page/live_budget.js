@@ -14,7 +14,8 @@ psaLive.budget = function (box, rows, now, noise, length) {
     return cells('td', [row[0], isFinite(without) ? length(without) : '', removed]);
   });
   box.appendChild(make('p', {className: 'note', text: 'Error above the noise at these values: ' + length(above(now)) +
-    ' rms. Without one effect, nothing fitted again:'}));
+    ' rms. Without one effect, nothing fitted again (effects that cancel each other in part leave more without one' +
+    ' than the base model does):'}));
   box.appendChild(make('table', {}, [
     make('thead', {}, [cells('th', ['without', 'error above the noise', 'it removes'])]), make('tbody', {}, lines)
   ]));

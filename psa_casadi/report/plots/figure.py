@@ -185,7 +185,10 @@ def _time(
         _shade_held_out(axes, s)
         low, high = s.time[zoom][0], s.time[zoom][-1]
         axes.axvspan(low, high, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
-    title = s.title if len(time) == len(s.time) else "The part in the box"
+    inside = (
+        "In the box, where the error falls most" if len(s.curves) > 1 else "The part in the box"
+    )
+    title = s.title if len(time) == len(s.time) else inside
     if zoom is not None:
         title = f"{s.title} (box: the part on the right)"
     style(axes, title, "time [s]", s.label)
@@ -241,16 +244,17 @@ def _evidence(axes: Axes, d: Diagnosis) -> None:
     axes.barh(names, values, color=[bar_colour(c, causes) for c in rows])
     axes.set_xscale("symlog", linthresh=10.0)
     largest = max([abs(v) for v in values], default=1.0)
-    axes.set_xlim(min([0.0, *values]) * 2.0, 100.0 * max(largest, 10.0))
+    room = 1e4 if len(causes) > 1 else 100.0
+    axes.set_xlim(min([0.0, *values]) * 2.0, room * max(largest, 10.0))
     axes.xaxis.set_major_locator(FixedLocator(_TICKS))
     axes.xaxis.set_major_formatter(FuncFormatter(_power))
     axes.xaxis.set_minor_locator(NullLocator())
     for k, c in enumerate(rows):
-        text = f" {share_text(c)}"
+        text = f" {share_text(c, d)}"
         axes.annotate(text, (max(c.evidence, 0.0), k), va="center", fontsize=FONT - 1.5)
     every = len(shown) == len(d.candidates)
-    count = "" if every else f" ({len(shown)} of {len(d.candidates)} effects)"
-    title = f"Evidence{count}"
+    count = "" if every else f" ({len(shown)} of {len(d.candidates)})"
+    title = f"Evidence, each effect alone{count}"
     style(axes, title, "evidence over the base [ln units]", "")
     axes.grid(visible=False, axis="y")
 

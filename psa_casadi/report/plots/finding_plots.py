@@ -145,7 +145,7 @@ def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Plo
     # the figures stand to the right of bar and zero, clear of the names
     plot.add_scatter(
         x=[max(v, 0.0) for v in values], y=names, mode="text", textposition="middle right",
-        text=[f" {c.evidence:,.0f}; {_figure(c, d)}" for c in rows], cliponaxis=False,
+        text=[f" {round(c.evidence):,}; {_figure(c, d)}" for c in rows], cliponaxis=False,
         hoverinfo="skip",
     )  # fmt: skip
     largest = max([abs(v) for v in values], default=1.0) or 1.0

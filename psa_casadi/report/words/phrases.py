@@ -140,8 +140,20 @@ def probability_text(probability: float) -> str:
     return percent(probability) if probability < 0.995 else "> 99 %"
 
 
-def share_text(candidate: Candidate) -> str:
-    """Return the share of the excess that an effect explains, and whether it was only screened."""
+def share_text(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
+    """Return the share of the excess that an effect explains alone, or that it was only screened.
+
+    Of one of several named causes also what it removes beside the others.
+    """
+    alone = _alone(candidate)
+    if not isinstance(d, Diagnosis) or d.budget is None or len(d.causes) < 2:
+        return alone
+    named = {c.effect for c in d.causes}
+    own = next((c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None)
+    return alone if own is None else f"{alone}; with others {own.percents[0]} %"
+
+
+def _alone(candidate: Candidate) -> str:
     if not candidate.fitted and candidate.explained_share == 0:
         return "screened"
     if candidate.explained_share < 0:

@@ -170,24 +170,25 @@ def most_telling(series: Sequence[Series]) -> Series:
 
 
 def telling_window(s: Series) -> slice:
-    """Return the samples where the curves' difference is easiest to see.
+    """Return the samples where it is easiest to see what the last curve does better than the first.
 
-    Windows of 1/8 to 1/64 of the record, of 48 samples at least, in held-out data if there are any;
-    the score is the difference over the range that the displacement covers in the window.
+    Windows of 1/8 to 1/256 of the record, of 48 samples at least, in held-out data if there are
+    any; the score is by how much the error falls, of a single curve the error above the noise, over
+    the range that the displacement covers there.
     """
     n = len(s.time)
     first = s.curves[0]
-    miss = s.curves[1].values - first.values if len(s.curves) > 1 else s.residual(first)
-    miss = np.nan_to_num(miss)
+    miss = [np.nan_to_num(s.residual(c)) for c in s.curves]
     best, window = -1.0, slice(0, n)
-    for share in (8, 16, 32, 64):
+    for share in (8, 16, 32, 64, 128, 256):
         width = max(48, n // share)
         for start in range(0, max(1, n - width), max(1, width // 4)):
             part = slice(start, start + width)
             if s.held_out.any() and not s.held_out[part].all():
                 continue
             y = first.values[part]
-            seen = abs(float(np.mean(miss[part]))) + float(np.std(miss[part]))
+            errors = [float(np.sqrt(np.mean(m[part] ** 2))) for m in miss]
+            seen = max(errors[0] - (errors[-1] if len(errors) > 1 else s.noise), 0.0)
             score = seen / (float(np.ptp(y)) + 6.0 * s.noise + seen) * width**0.25
             if score > best:
                 best, window = score, part

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
+from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words.phrases import (
     either,
     interval_text,
@@ -55,10 +56,12 @@ def gain_sentence(d: Diagnosis) -> str:
     return f"the held-out error falls by {told[0]} % (95 % interval {told[1]} to {told[2]} %)"
 
 
-_PLAIN = {
-    "adequate": "Nothing beyond the noise is missing from the base model",
-    "not_driven": "The displacement does not follow the voltage: nothing can be diagnosed",
-}
+_ADEQUATE = "Nothing beyond the noise is missing from the base model"
+_FLIPPED = (
+    "The displacement falls while the voltage rises: correct the sign of one of them. Nothing was"
+    " diagnosed"
+)
+_NOT_DRIVEN = "The displacement does not follow the voltage: nothing can be diagnosed"
 
 
 def verdict_sentence(d: Diagnosis) -> str:
@@ -74,8 +77,11 @@ def verdict_sentence(d: Diagnosis) -> str:
         f"the base model's held-out error is {number(d.base_errors.holdout_nrmse_percent, 2)} %"
         " of the range"
     )
-    if d.verdict in _PLAIN:
-        return f"{_PLAIN[d.verdict]}; {error}."
+    if d.verdict == "adequate":
+        return f"{_ADEQUATE}; {error}."
+    if d.verdict == "not_driven":
+        flipped = doubtful_sign([e.record for e in d.experiments])
+        return f"{_FLIPPED if flipped else _NOT_DRIVEN}; {error}."
     if d.verdict == "unexplained" or not d.causes:
         return (
             "Something is missing, and no effect in the table explains it: no cause is named; "
@@ -102,7 +108,9 @@ def naming_sentence(
         )
     are = f"{'cause is' if len(causes) == 1 else 'causes are'} {listing(causes)}"
     if d.verdict == "partly_explained":
-        of = "" if share is None else f" ({share} of its power above the noise)"
+        # where something remains, what is removed is never all of it
+        most = "nearly all" if share is not None and share.startswith("100") else share
+        of = "" if share is None else f", {most} of its power above the noise"
         return f"The closest known {are}: {gain}{of}; more than noise remains."
     return f"The {are}: {gain}."
 
@@ -135,7 +143,10 @@ def _unnamed(d: Diagnosis) -> str:
 
 
 def _cause(cause: Cause) -> str:
-    return f"{plain(cause.effect)} ({cause.belongs_to}, confidence {percent(cause.confidence)})"
+    sure = f"{cause.belongs_to}, confidence {percent(cause.confidence)}"
+    if cause.cannot_be_told_from:
+        sure += f"; or {either(cause.cannot_be_told_from)}"
+    return f"{plain(cause.effect)} ({sure})"
 
 
 def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
@@ -163,16 +174,23 @@ def column_sentence(d: Diagnosis, c: Decision) -> str:
 def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str:
     """Return "name = value unit (low to high)" for every parameter of a cause.
 
-    Of one that is several of a kind, and has many, at which frequencies they are.
+    Of one that is several of a kind, and has many, at which frequencies they are; of weights that
+    mean something only together, how many there are.
     """
     several = next((c for c in d.model.components if c.name == cause.effect and c.count > 1), None)
     if several is not None:
         tones = sorted(d.model.values[p.name] for p in several.parameters if p.unit == "Hz")
         return f"at {', '.join(number(v) for v in tones)} Hz"
+    effect = next((c for c in d.model.components if c.name == cause.effect), None)
+    weights = [n for n in cause.parameters if effect is not None and n in effect.linear]
     texts = []
     for name, e in cause.parameters.items():
+        if name in weights:
+            continue
         unit, display = shown_in(d.model, name)
         value, low, high = (convert(v, unit, display) for v in (e.value, *e.interval))
         estimate = with_unit(number(value), display)
         texts.append(f"{name} = {estimate} ({interval_text(low, high)})")
+    if weights:
+        texts.append(f"{len(weights)} weights, which shape its loop together")
     return ", ".join(texts)
