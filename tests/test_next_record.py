@@ -56,5 +56,5 @@ def test_causes_that_bend_one_curve_ask_for_a_column_also_where_structure_remain
               Cause(bends[0], "plant", 0.5, {}, bends[1:], 0.2)]  # fmt: skip
     found = next_experiment(causes, "partly_explained", [bends], [_record(LOOP)], doubted=False)
     assert found.separates == bends
-    assert "`displacement_2`" in found.why
+    assert "column displacement_2" in found.why
     assert "Record what these records lack" in found.why

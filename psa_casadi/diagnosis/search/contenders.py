@@ -63,8 +63,8 @@ def same_curve_note(names: Sequence[str]) -> str:
     """Return the sentence on effects that bend the same curve."""
     return (
         f"{' and '.join(names)} bend the same curve: no voltage below the resonances tells one from"
-        " another. Measure the displacement with a second sensor (column `displacement_2`) or the"
-        " load's force (`load_force`), elsewhere in the range of this sensor, or without the load;"
+        " another. Measure the displacement with a second sensor (column displacement_2) or the"
+        " load's force (load_force), elsewhere in the range of this sensor, or without the load;"
         " or sample fast enough to excite and see the resonances."
     )
 

@@ -13,6 +13,7 @@ from psa_casadi.report.page.live_part import add_live, live_diagnosis
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
 from psa_casadi.report.page.own_model_page import write_own_report
 from psa_casadi.report.page.record_part import add_records, add_worst
+from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.phrases import (
     in_page_unit,
     length_scale,
@@ -66,8 +67,9 @@ def write_report(
     counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
     with one_unit(length_scale(d.base_errors.holdout_rms_m, counts=counts)):
         page.paragraph(verdict_sentence(d), "verdict")
-        add_worst(page, series, origin)
+        page.bullets(_answers(d))
         page.tiles(_tiles(d))
+        add_worst(page, series, origin)
         add_budget(page, d)
         if live is not None:
             add_live(page, live)
@@ -87,6 +89,16 @@ def _badges(d: Diagnosis, origin: str) -> list[str]:
     sure = d.causes[:1] if d.verdict != "ambiguous" else ()
     badges = [f"confidence {percent(c.confidence)}" for c in sure]
     return [*badges, f"{origin} data", f"{count} record{'s' if count > 1 else ''}"]
+
+
+def _answers(d: Diagnosis) -> list[str]:
+    """Return where the error goes, what remains and what to do next, in a sentence each."""
+    told = [("Remains", rest_sentence(d)), ("Next", d.next_experiment.why)]
+    if d.budget is not None and d.verdict not in ("adequate", "not_driven"):
+        counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
+        scale = length_scale(d.budget.excess_rms_m, counts=counts)
+        told.insert(0, ("Where the error goes", f"{budget_sentence(d, scale)}."))
+    return [f"{label}: {text}" for label, text in told if text]
 
 
 def _tiles(d: Diagnosis) -> list[tuple[str, str, str]]:
