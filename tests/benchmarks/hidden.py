@@ -72,6 +72,11 @@ def _wrong(f: Found) -> bool:
     return f.alone is not None and f.alone not in f.case.hidden
 
 
+def _all_within(f: Found) -> bool:
+    """Whether as many are named as are hidden, and all of these are in the named sets."""
+    return len(f.named) == len(f.case.hidden) and set(f.case.hidden) <= set(f.within)
+
+
 def _removed(found: Sequence[Found]) -> str:
     shares = [f.patched for f in found] or [np.nan]
     return f"{100.0 * np.median(shares):.0f} % of {len(found)}"
@@ -120,8 +125,10 @@ def _summary(found: Sequence[Found]) -> TitledTable:
          _removed(known_ahead)),
         ("two causes: both named, no third", "90 %",
          _share(two, lambda f: set(f.named) == set(f.case.hidden))),
+        ("two causes: both in the named sets, no third name", "-", _share(two, _all_within)),
         ("three causes: all named, no fourth", "70 %",
          _share(three, lambda f: set(f.named) == set(f.case.hidden))),
+        ("three causes: all in the named sets, no fourth name", "-", _share(three, _all_within)),
         ("six records of a device: right name in the named set", "98 %",
          _share(six, lambda f: f.case.right in f.within)),
         ("one cause: a second named beside the right one", "at most 3 %",
