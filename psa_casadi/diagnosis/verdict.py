@@ -258,7 +258,7 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
             Candidate(
                 effect=name,
                 explained_share=float(np.clip(gone / excess, 0.0, 1.0)),
-                evidence=round(first.alone[name], 6) + 0.0,  # no -0, and no rounding of 0
+                evidence=first.alone[name],
                 fitted=known is not None,
                 probability=first.probability.get(name, 0.0) if named else 0.0,
             )

@@ -5,7 +5,7 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.patch_plot import patch_plot
 from psa_casadi.report.words.budget_words import budget_table, patch_text
-from psa_casadi.report.words.phrases import length_scale
+from psa_casadi.report.words.phrases import scale_of
 from psa_casadi.report.words.verdict_words import added
 
 
@@ -14,8 +14,7 @@ def add_budget(page: Document, d: Diagnosis) -> None:
     b = d.budget
     if b is None or b.excess_rms_m <= 0.0:
         return
-    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
-    scale = length_scale(b.excess_rms_m, counts=counts)
+    scale = scale_of(d.experiments, b.excess_rms_m)
     page.section("Where the error goes")
     page.paragraph(
         f"The base model's held-out error above the noise is {scale.text(b.excess_rms_m)} rms."

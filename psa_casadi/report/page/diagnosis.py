@@ -16,12 +16,12 @@ from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.phrases import (
     in_page_unit,
-    length_scale,
     listing,
     number,
     one_unit,
     percent,
     rest_sentence,
+    scale_of,
 )
 from psa_casadi.report.words.residuals import residual_figures
 from psa_casadi.report.words.series import Series, most_telling, series_of
@@ -64,8 +64,7 @@ def write_report(
     d, series = diagnosis, series_of(diagnosis)
     live = None if still else live_diagnosis(d, series)  # compiles beside what follows
     page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin))
-    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
-    with one_unit(length_scale(d.base_errors.holdout_rms_m, counts=counts)):
+    with one_unit(scale_of(d.experiments, d.base_errors.holdout_rms_m)):
         page.paragraph(verdict_sentence(d), "verdict")
         page.bullets(_answers(d))
         page.tiles(_tiles(d))
@@ -95,16 +94,14 @@ def _answers(d: Diagnosis) -> list[str]:
     """Return where the error goes, what remains and what to do next, in a sentence each."""
     told = [("Remains", rest_sentence(d)), ("Next", d.next_experiment.why)]
     if d.budget is not None and d.verdict not in ("adequate", "not_driven"):
-        counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
-        scale = length_scale(d.budget.excess_rms_m, counts=counts)
+        scale = scale_of(d.experiments, d.budget.excess_rms_m)
         told.insert(0, ("Where the error goes", f"{budget_sentence(d, scale)}."))
     return [f"{label}: {text}" for label, text in told if text]
 
 
 def _tiles(d: Diagnosis) -> list[tuple[str, str, str]]:
     """Return the main figures: held-out errors, noise, gain."""
-    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
-    scale = length_scale(d.base_errors.holdout_rms_m, counts=counts)
+    scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
     models = [("base model, held-out rms", d.base_errors)]
     models += [("extended model, held-out rms", d.extended_errors)] if added(d) else []
     tiles = [

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
 from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
 
 if TYPE_CHECKING:  # which take long to load
     from psa_casadi.any_model.result import OdeDiagnosis
@@ -60,6 +61,12 @@ def length_scale(largest: float, *, counts: bool = False) -> Scale:
     if counts or page is None or page.unit == "counts":
         return handy_scale(largest, counts=counts)
     return page
+
+
+def scale_of(experiments: Iterable[Experiment], largest: float) -> Scale:
+    """Return the unit of errors of size `largest` [m] of records, which may be in counts."""
+    counts = any(e.record.displacement_unit == "counts" for e in experiments)
+    return length_scale(largest, counts=counts)
 
 
 def handy_scale(largest: float, *, counts: bool = False) -> Scale:

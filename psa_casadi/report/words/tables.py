@@ -86,7 +86,7 @@ def _status(model: Model, name: str, found: Identification | None) -> str:
 def candidate_table(d: "Diagnosis | OdeDiagnosis") -> Table:
     """Return every effect tried: evidence, share of the excess, and probability if one is named."""
     head = ["effect", "evidence over the base [ln]", "explains of the excess, alone"]
-    rows = [[plain(c.effect), number(c.evidence), share_text(c, d)] for c in d.candidates]
+    rows = [[plain(c.effect), number(round(c.evidence, 6)), share_text(c, d)] for c in d.candidates]
     if added(d):
         head.append("probability")
         for row, c in zip(rows, d.candidates, strict=True):

@@ -18,13 +18,13 @@ from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
     Scale,
-    length_scale,
     listing,
     number,
     percent,
     plain,
     probability_text,
     rest_sentence,
+    scale_of,
     strongest_sentence,
 )
 from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
@@ -63,7 +63,7 @@ def story(d: Diagnosis | OdeDiagnosis, *, origin: str = "measured", width: int =
 
 
 def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
-    scale = _scale(d.experiments, d.base_errors.holdout_rms_m)
+    scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
     lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
     wrong = _EXPLAINS.sub(r" (\1 of the excess)", strongest_sentence(d.misfit))
     lines += [("wrong", wrong)] if wrong else []
@@ -128,7 +128,7 @@ def identification_text(
     found: Identification, *, origin: str = "measured", width: int = 100
 ) -> str:
     """Return an identification: error, parameters with intervals, warnings, what is left open."""
-    scale = _scale(found.experiments, found.fit.rms)
+    scale = scale_of(found.experiments, found.fit.rms)
     span = max(e.record.range_m for e in found.experiments)
     share = number(100.0 * found.fit.rms / span, 2)
     head = [
@@ -180,11 +180,6 @@ def labelled(label: str, text: str, width: int) -> str:
         break_long_words=False,
         break_on_hyphens=False,
     ).replace("\u00a0", " ")
-
-
-def _scale(experiments: Iterable[Experiment], size: float) -> Scale:
-    counts = any(e.record.displacement_unit == "counts" for e in experiments)
-    return length_scale(size, counts=counts)
 
 
 def records_text(experiments: Iterable[Experiment], origin: str) -> str:

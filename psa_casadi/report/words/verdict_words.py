@@ -9,11 +9,11 @@ from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words.phrases import (
     either,
     interval_text,
-    length_scale,
     listing,
     number,
     percent,
     plain,
+    scale_of,
     shown_in,
     with_unit,
 )
@@ -151,8 +151,7 @@ def _cause(cause: Cause) -> str:
 
 def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
     """Say which of two causes an exported plant holds, and what that makes of its displacement."""
-    counts = any(e.record.displacement_unit == "counts" for e in d.experiments)
-    apart = length_scale(a.plant_differs_m, counts=counts).text(a.plant_differs_m, 2)
+    apart = scale_of(d.experiments, a.plant_differs_m).text(a.plant_differs_m, 2)
     inside = any(c.name == a.cause for c in d.model.plant().components)
     holds = "holds" if inside else "leaves out"
     return (
@@ -177,11 +176,10 @@ def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str
     Of one that is several of a kind, and has many, at which frequencies they are; of weights that
     mean something only together, how many there are.
     """
-    several = next((c for c in d.model.components if c.name == cause.effect and c.count > 1), None)
-    if several is not None:
-        tones = sorted(d.model.values[p.name] for p in several.parameters if p.unit == "Hz")
-        return f"at {', '.join(number(v) for v in tones)} Hz"
     effect = next((c for c in d.model.components if c.name == cause.effect), None)
+    if effect is not None and effect.count > 1:
+        tones = sorted(d.model.values[p.name] for p in effect.parameters if p.unit == "Hz")
+        return f"at {', '.join(number(v) for v in tones)} Hz"
     weights = [n for n in cause.parameters if effect is not None and n in effect.linear]
     texts = []
     for name, e in cause.parameters.items():
