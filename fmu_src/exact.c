@@ -231,23 +231,43 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
 }
 
 #if PSA_SENSITIVE
+/* Whether an unknown leaves a group's states and its driver's way as they are */
+static int passes_by(const psa_exact *run, int g, int c) {
+    if (run->which[c] >= 0 && ex_group_by[g][run->which[c]]) return 0;
+    for (int i = 0; i < EX_NX; ++i)
+        if (ex_group_behind[g][i] && run->s0[i * run->count + c] != 0.0) return 0;
+    return 1;
+}
+
+static int passes_by_all(const psa_exact *run, int c) {
+    for (int g = 0; g < EX_NG; ++g)
+        if (!passes_by(run, g, c)) return 0;
+    return 1;
+}
+
 /* Columns for the unknowns: parameters of the linear part first; 0, or 2 where memory is out */
 APART static int set_up_columns(psa_state *state, int *theta) {
     psa_exact *const run = state->run;
     if (run->count > MOST_UNKNOWNS) return 2;
     int found = 0;
-    for (int m = 0; m < EX_NTHETA; ++m)
-        for (int c = 0; c < run->count; ++c)
-            if (run->which[c] == ex_theta[m]) {
-                theta[found] = m;
-                state->place[c] = found++;
-            }
+    for (int near = 0; near < 2; ++near) /* those that pass by all groups stand together, at both ends */
+        for (int m = 0; m < EX_NTHETA; ++m)
+            for (int c = 0; c < run->count; ++c)
+                if (run->which[c] == ex_theta[m] && passes_by_all(run, c) != near) {
+                    theta[found] = m;
+                    state->place[c] = found++;
+                }
     state->thetas = found;
-    for (int c = 0; c < run->count; ++c) {
-        int linear = 0;
-        for (int m = 0; m < EX_NTHETA; ++m) linear |= run->which[c] == ex_theta[m];
-        if (!linear) state->place[c] = found++;
-    }
+    for (int far = 0; far < 2; ++far)
+        for (int c = 0; c < run->count; ++c) {
+            int linear = 0;
+            for (int m = 0; m < EX_NTHETA; ++m) linear |= run->which[c] == ex_theta[m];
+            if (!linear && passes_by_all(run, c) == far) state->place[c] = found++;
+        }
+    memset(state->apart, 1, sizeof state->apart);
+    for (int g = 0; g < EX_NG; ++g)
+        for (int c = 0; c < run->count; ++c)
+            if (!passes_by(run, g, c)) state->apart[g][state->place[c] / COLUMNS] = 0;
     int zero[EX_NU + 1];
     for (int q = 0; q < EX_NU; ++q) {
         zero[q] = 1;

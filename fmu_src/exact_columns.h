@@ -254,6 +254,14 @@ static void do_group_columns(const psa_state *state, psa_columns *to, int g) {
     for (int i = 0; i < size; ++i) to->x[WHOLE][ex_group_states[first + i]] = own.end[i];
 }
 
+/* Columns of a group that feels none of a block's unknowns */
+static void rest_columns(psa_columns *to, int g) {
+    for (int i = 0; i < ex_group_size[g]; ++i) {
+        const int q = ex_group_states[ex_group_first[g] + i];
+        to->x[HALF][q] = to->x[WHOLE][q] = NONE;
+    }
+}
+
 #if EX_NLOOP > 0
 static void do_loop_columns(const psa_state *state, psa_columns *to, const int *ports, int count) {
     static const int AT[2] = {HALF, WHOLE};
@@ -308,7 +316,8 @@ static void step_columns(psa_state *state, const column *slopes) {
         linear_columns(state, &to, own ? slopes + (size_t)b * state->slopes_size : NULL, tail);
         for (int k = 0; k < EX_NITEMS; ++k) {
             const psa_item *const item = ex_items + k;
-            if (item->kind == EX_GROUP) do_group_columns(state, &to, item->members[0]);
+            if (item->kind == EX_GROUP && state->apart[item->members[0]][b]) rest_columns(&to, item->members[0]);
+            else if (item->kind == EX_GROUP) do_group_columns(state, &to, item->members[0]);
             else if (item->kind == EX_PORT) do_port_columns(state, &to, item->members[0]);
 #if EX_NLOOP > 0
             else do_loop_columns(state, &to, item->members, item->count);

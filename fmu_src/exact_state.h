@@ -105,6 +105,7 @@ typedef struct {
     int slopes_size;                      /* vectors of one block of columns in those of a level */
     column *slopes;                       /* [lengths][finest + 1][blocks of thetas][slopes_size] */
     int blocks;                           /* of columns */
+    char apart[EX_NG + 1][MOST_UNKNOWNS / COLUMNS + 1]; /* blocks that a group does not feel */
     column *s, *sport, *unit;             /* [blocks][EX_NX], [blocks][EX_NPORT + 1], [blocks][EX_NP] */
     psa_trial trial;
 } psa_state;

@@ -15,6 +15,8 @@ class Parameter:
     `log` says that the parameter spans decades and is searched on a logarithmic scale.
     `scale` is the size of an ordinary change in SI units, where the value itself may be zero.
     What is not `fitted` only sets a scale, or chooses between two forms; records never tell it.
+    `limit` says that the lower end of the bounds is a form of its own (a corner that is sharp, a
+    filter of one pole): a value there is as good as any other.
     """
 
     name: str
@@ -26,6 +28,7 @@ class Parameter:
     log: bool = False
     scale: Nominal | None = None
     fitted: bool = True
+    limit: bool = False
 
     def typical(self, values: Values) -> float:
         """Return the size of an ordinary change: `scale`, else the magnitude of the value."""
@@ -45,6 +48,8 @@ class State:
     unless the start is said to be known. A memory that `settles` (creep) has an equilibrium; one
     that does not (hysteresis) rests at any value.
     `nominal` is the size the state usually has, a number or a function of the parameter values.
+    Exact steps hold its error against `whole`, where that is given: a stop element is a part of
+    the voltage, and shows by a share of what the voltage does.
     """
 
     name: str
@@ -55,6 +60,12 @@ class State:
     display_unit: str | None = None
     memory: bool = False
     settles: bool = True
+    whole: Nominal | None = None
+
+    @property
+    def errs_over(self) -> Nominal:
+        """The size against which an error counts."""
+        return self.nominal if self.whole is None else self.whole
 
 
 @dataclass(frozen=True)

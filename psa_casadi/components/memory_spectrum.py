@@ -3,7 +3,7 @@
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.components.wafers import HOLD_RATE
 from psa_casadi.plays import spectrum_force, spectrum_parameters
-from psa_casadi.scales import stop_scale
+from psa_casadi.scales import stop_scale, voltage_scale
 from psa_casadi.smooth import stop_rate
 from psa_casadi.variables import State
 
@@ -34,6 +34,7 @@ def _state(index: int) -> State:
         stop_scale,
         memory=True,
         settles=False,
+        whole=voltage_scale,
     )
 
 

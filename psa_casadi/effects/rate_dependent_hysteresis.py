@@ -14,7 +14,7 @@ leaves the memory as it is.
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.scales import stop_scale
+from psa_casadi.scales import stop_scale, voltage_scale
 from psa_casadi.smooth import direction, magnitude_power, signed_power, stop_rate
 from psa_casadi.variables import Parameter, State
 
@@ -95,6 +95,7 @@ RATE_DEPENDENT_HYSTERESIS = Component(
             stop_scale,
             memory=True,
             settles=False,
+            whole=voltage_scale,
         ),
     ),
     equations=_equations,

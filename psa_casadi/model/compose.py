@@ -114,6 +114,10 @@ class Model:
         """Return the usual size of every state, shape (nx,)."""
         return np.array([nominal_value(s.nominal, self.values) for s in self.structure.states])
 
+    def error_sizes(self) -> npt.NDArray[np.float64]:
+        """Return the size against which an error of every state counts, shape (nx,)."""
+        return np.array([nominal_value(s.errs_over, self.values) for s in self.structure.states])
+
     def output_nominals(self) -> npt.NDArray[np.float64]:
         """Return the usual size of every output, shape (ny,)."""
         return np.array([nominal_value(o.nominal, self.values) for o in self.structure.outputs])

@@ -16,7 +16,7 @@ from psa_casadi.simulation.exact.columns import (
     of_linear_part,
     sensitive,
 )
-from psa_casadi.simulation.exact.dependence import closure
+from psa_casadi.simulation.exact.dependence import closure, dependence
 from psa_casadi.simulation.exact.emit import Printer
 from psa_casadi.simulation.exact.split import Split
 
@@ -96,6 +96,7 @@ def generate(split: Split, output: str) -> str:
         _table("ex_reach", reach.astype(int).tolist(), len(split.linear)),
         _table("ex_feed", feeds, sizes["EX_NFEED"] + 1),
         _table("ex_port_along", _along(split), max(1, len(split.groups))),
+        *(_table(f"ex_group_{name}", *rows) for name, rows in _behind(split).items()),
         *tables,
         *_items(split),
     ]  # fmt: skip
@@ -211,6 +212,19 @@ def _along(split: Split) -> list[list[int]]:
     """Return for every port which groups' drivers or states it reads."""
     read = [_read(split, q.value) for q in split.ports]
     return [[int(bool(r & {g.driver, *g.states})) for g in split.groups] or [0] for r in read]
+
+
+def _behind(split: Split) -> dict[str, tuple[list[list[int]], int]]:
+    """Return for every group which parameters and states it, or its driver's way, depends on."""
+    s = split.structure
+    reach = closure(dependence(s.xdot, s.x))
+    by = dependence(s.xdot, s.p)
+    states = [np.any(reach[[*g.states, g.driver]], axis=0) for g in split.groups]
+    parameters = [np.any(by[behind], axis=0) for behind in states]
+    return {
+        "behind": ([row.astype(int).tolist() for row in states], len(s.states)),
+        "by": ([row.astype(int).tolist() for row in parameters], max(1, len(s.parameters))),
+    }
 
 
 def _linear_reach(split: Split) -> npt.NDArray[np.bool_]:

@@ -172,7 +172,7 @@ def run_exact(
 ) -> ExactSteps:
     """Integrate a model over times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
 
-    `tolerance` bounds the estimated error of a step, over the states' nominal sizes; every sample
+    `tolerance` bounds the estimated error of a step, over the states' `error_sizes`; every sample
     is divided by 2^coarsest at least. `unknowns` and `s0` are those of the stepper's `run`;
     `everything` asks for all states and outputs. Raises NotExact where this way is not possible,
     where it fails, or where it needs so many steps that the stepper is no slower.
@@ -187,7 +187,7 @@ def run_exact(
     start = np.zeros((nx, count)) if s0 is None else s0
     arrays: dict[str, npt.NDArray[Any]] = {
         "p": np.array([given[name] for name in names]), "x0": _doubles(x0),
-        "nominal": model.state_nominals(), "shown": np.empty(n), "which": which,
+        "nominal": model.error_sizes(), "shown": np.empty(n), "which": which,
         "s0": _doubles(start), "dy": np.empty((n, count)),
     }  # fmt: skip
     if everything:
