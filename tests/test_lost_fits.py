@@ -9,7 +9,13 @@ import pytest
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.search.best_first import best_first
-from psa_casadi.diagnosis.search.fits import any_afresh, to_end, without
+from psa_casadi.diagnosis.search.fits import (
+    any_afresh,
+    begun_again,
+    to_end,
+    with_cause,
+    without,
+)
 from psa_casadi.diagnosis.search.hypothesis import hypothesis
 from psa_casadi.diagnosis.search.steps import steps_of
 from psa_casadi.diagnosis.search.view import View, examine
@@ -25,7 +31,11 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
 from psa_casadi.simulation.simulate import simulate_record
 from tests.plants.again import play_again
+from tests.plants.base import simulate_base
+from tests.plants.drive_lag import DRIVE_LAG
+from tests.plants.excitations import draw_excitation
 from tests.plants.make import make_record
+from tests.plants.stack import draw_stack
 from tests.tiers import slow
 
 #: A fit to a piece of a measured record, whose causes hold each other.
@@ -130,6 +140,27 @@ def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
     assert any_ is not None
     assert any_.names == {"drive_lag"}
     assert to_end(any_, task.experiments).fit.rms < 1.02 * truth.sigma
+
+
+def test_a_cause_at_the_end_of_its_range_begins_again() -> None:
+    """Half of the lag with one pole is a minimum; the lag with two is another one."""
+    rng = np.random.default_rng(np.random.SeedSequence(961076).spawn(3)[0])
+    stack = draw_stack(rng)
+    run = simulate_base(stack, *draw_excitation(rng, "rich", stack.u_rated))
+    lag, zeta = 4e-3, 0.93
+    moved = run.displacement + DRIVE_LAG.contribution(run, {"zeta": zeta}, lag)
+    read = moved + 2e-8 * rng.standard_normal(moved.size)
+    record = Record(name="r", time=run.times, voltage=run.command, displacement=read)
+    seen, task = _begun(record.slice(0, 3000), ("drive_lag",))
+    first = with_cause(seen.of, task.experiments, seen.starts_of("drive_lag"))
+    assert first is not None
+    at_end = to_end(first, task.experiments)
+    assert at_end.fit.model.values["drive_lag_shape"] < 2e-4
+    again = begun_again(at_end, task.experiments)
+    assert again is not None
+    assert again.fit.model.values["drive_lag_time"] == pytest.approx(2.0 * zeta * lag, rel=0.01)
+    assert again.fit.rms < 0.95 * at_end.fit.rms
+    assert begun_again(again, task.experiments) is None
 
 
 @slow

@@ -181,6 +181,22 @@ def test_a_parameter_at_its_bound_is_out_of_character(creeping: Creeping) -> Non
     assert not in_character(replace(creep.fit, model=model), cause, experiments)
 
 
+def test_an_end_that_is_a_limit_of_the_law_is_in_character(creeping: Creeping) -> None:
+    """One pole of a lag, a sharp jump, a thermometer on the ceramic: lower ends, not upper ones."""
+    _, creep, _, experiments = creeping
+    limits = {("drive_lag", "drive_lag_shape"), ("sensor_jump", "jump_width")}
+    limits |= {("temperature", "temperature_lag")}
+    assert {(e.name, p.name) for e in EFFECTS.values() for p in e.parameters if p.limit} == limits
+    for name, parameter in limits:
+        effect, bounds = (
+            EFFECTS[name],
+            creep.fit.model.with_effect(EFFECTS[name]).parameter(parameter).bounds,
+        )
+        for end, fits in zip(bounds, (True, False), strict=True):
+            model = creep.fit.model.with_effect(effect, {parameter: end})
+            assert in_character(replace(creep.fit, model=model), effect, experiments) is fits
+
+
 def test_a_hum_where_the_stack_rings_is_out_of_character(creeping: Creeping) -> None:
     """Within the width of a sharp resonance, 2 % of its frequency on each side at a ratio of 0.01;
     a damped one hides no line of the mains.

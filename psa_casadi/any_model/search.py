@@ -124,7 +124,7 @@ class Known:
     def stands(self, h: OdeHypothesis) -> bool:
         """Whether every cause is itself, can be told, and is confirmed by held-out data."""
         for cause in h.causes:
-            if not inside_ranges(h.fit.model.values, cause, self.table.attached(cause).ideal):
+            if not inside_ranges(h.fit.model.values, cause):
                 return False
             before = self.found.get(h.names - {cause.name})
             if before is None:

@@ -48,6 +48,7 @@ DRIVE_LAG = Component(
             (1e-4, 2.0),
             "square of the second-order time over that of the first",
             log=True,
+            limit=True,
         ),
     ),
     states=(

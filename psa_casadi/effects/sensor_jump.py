@@ -46,7 +46,15 @@ SENSOR_JUMP = Component(
         Parameter(
             "jump_place", 5e-6, "m", (-1e-2, 1e-2), "displacement of it", "um", scale=_place_scale
         ),
-        Parameter("jump_width", 0.01, "1", (1e-6, 0.05), "half its rise over the stroke", log=True),
+        Parameter(
+            "jump_width",
+            0.01,
+            "1",
+            (1e-6, 0.05),
+            "half its rise over the stroke",
+            log=True,
+            limit=True,
+        ),
     ),
     equations=_equations,
     probe={"jump_place": DISPLACEMENT_STEPS, "jump_width": (0.003, 0.03)},

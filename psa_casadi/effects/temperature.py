@@ -56,6 +56,7 @@ TEMPERATURE = Component(
             (1e-4, 1e5),
             "time constant from the thermometer to the stack",
             log=True,
+            limit=True,
         ),
         Parameter(
             "temperature_reference",

@@ -17,7 +17,7 @@ from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
 from tests.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN
 
 #: Seeds for each effect, and the first of them.
-SEEDS, QUICK_SEEDS, FIRST = 5, 1, 961001
+SEEDS, QUICK_SEEDS, FIRST = 5, 1, 971001
 #: Below the resonances a bent sensor and a load that bends are the same curve: these stay a pair.
 ALIKE = ("load_stiffness", "sensor_nonlinearity")
 _PAIR = " and ".join(ALIKE)

@@ -20,15 +20,11 @@ Law = Callable[[Symbols, Own], tuple[dict[str, Expression], Expression]]
 
 @dataclass(frozen=True)
 class Attached:
-    """An effect, the port that it is at, and further ports whose sums it reads.
-
-    Parameters that are `ideal` may be at the lower ends of their ranges: a corner that is sharp.
-    """
+    """An effect, the port that it is at, and further ports whose sums it reads."""
 
     component: Component
     port: Port
     reads: tuple[Port, ...] = ()
-    ideal: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -55,7 +51,6 @@ def at_port(
     belongs_to: str = "plant",
     signal: str = "q",
     reads: tuple[Port, ...] = (),
-    ideal: tuple[str, ...] = (),
 ) -> Attached:
     """Return an effect that adds a term to a port's sum; its parameters begin with its name.
 
@@ -85,7 +80,7 @@ def at_port(
         looks_like=looks,
         belongs_to=belongs_to,
     )
-    return Attached(component, port, reads, tuple(f"{name}_{short}" for short in ideal))
+    return Attached(component, port, reads)
 
 
 def extended(base: Model, effects: Iterable[Attached]) -> Model:

@@ -115,11 +115,10 @@ def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
             ),
             Parameter(
                 f"{name}_width", 0.02 * size, state_unit(model, v), (5e-4 * size, 0.7 * size),
-                f"{v} below which it fades", log=True
+                f"{v} below which it fades", log=True, limit=True
             ),
         ),
         probe={"width": (0.01 * size, 0.05 * size)},
-        ideal=("width",),
     )  # fmt: skip
 
 

@@ -162,7 +162,6 @@ def _saturation(port: Port, sizes: Sizes) -> Attached:
             _corner(f"{name}_corner", size, port.unit),
         ),
         probe={"level": tuple(share * size for share in (0.4, 0.6, 0.75, 0.9))},
-        ideal=("corner",),
     )  # fmt: skip
 
 
@@ -187,7 +186,6 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
             _corner(f"{name}_corner", size, port.unit),
         ),
         probe={"level": tuple(share * size for share in (0.04, 0.1, 0.25))},
-        ideal=("corner",),
     )  # fmt: skip
 
 
@@ -253,7 +251,7 @@ def level_of(
 def _corner(name: str, size: float, unit: str) -> Parameter:
     bounds = (_SHARPEST * size, _ROUNDEST * size)
     words = "width over which the corner at the level is rounded"
-    return Parameter(name, _CORNER * size, unit, bounds, words, log=True)
+    return Parameter(name, _CORNER * size, unit, bounds, words, log=True, limit=True)
 
 
 def _floor(name: str, value: float) -> Parameter:

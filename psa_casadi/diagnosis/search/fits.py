@@ -33,6 +33,9 @@ _BESIDE, _SET_AFRESH, _AFRESH = 12, 17, 45
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Shares of their gains with which the causes begin that are left without another.
 _SHARES = (1.0, 0.3, 0.0)
+#: Share of a range that counts as its end, where a cause begins again with these shares of its
+#: gain.
+_END, _AGAIN = 0.1, (0.5, 2.0)
 #: Tolerance of stepper and fit, and evaluations, to the end.
 _POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
 
@@ -251,6 +254,35 @@ def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.i
     return hypothesis(of.causes, current, experiments, final=True) or ended(of)
 
 
+def begun_again(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+    """Fit once more where a cause has come near the end of its range: another minimum may hold it.
+
+    That cause begins with its declared values, at half and at twice its gain; what is found is of
+    use below the cost of the fit. None where no cause is near an end.
+    """
+    values = of.fit.model.values
+    at_end = next((c for c in of.causes if _near_end(values, c)), None)
+    if at_end is None:
+        return None
+    kept = {at_end.gain, *at_end.linear}
+    own = {n: _declared(at_end, n) for n in at_end.fitted if n not in kept}
+    gains = at_end.linear or (at_end.gain or "",)
+
+    def begin(share: float) -> Fit | None:
+        try:
+            model = of.fit.model.with_values({**own, **{n: share * values[n] for n in gains}})
+            start = replace(of.fit, model=model)
+            rtol = quick_rtol(of.fit.sigma, experiments)
+            return continued(start, experiments, rtol, 1e-3, _AFRESH, of.fit.cost)
+        except PsaError:
+            return None
+
+    fits = [f for f in side_by_side(begin, _AGAIN) if f is not None and f.cost < of.fit.cost]
+    best = min(fits, key=lambda f: f.cost, default=None)
+    found = hypothesis(of.causes, best, experiments)
+    return None if found is None else to_end(found, experiments)
+
+
 def _from_ordinary(
     before: Fit,
     experiments: Sequence[Experiment],
@@ -300,6 +332,18 @@ def _ordinary_form(effect: Component, known: Mapping[str, float]) -> dict[str, f
         n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
         for n, grid in effect.probe.items()
     }
+
+
+def _near_end(values: Mapping[str, float], effect: Component) -> bool:
+    """Whether a parameter of an effect, its gain and weights apart, is near an end of its range."""
+    for p in effect.parameters:
+        if not p.fitted or p.name in (effect.gain, *effect.linear):
+            continue
+        scale = np.log if p.log else float
+        low, high, value = scale(p.bounds[0]), scale(p.bounds[1]), scale(values[p.name])
+        if not _END < (value - low) / (high - low) < 1.0 - _END:
+            return True
+    return False
 
 
 def _declared(effect: Component, name: str) -> float:

@@ -9,7 +9,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.screening.probes import Direction
-from psa_casadi.diagnosis.search.fits import to_end
+from psa_casadi.diagnosis.search.fits import begun_again, to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, scale_of, tried
 from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.search.view import View, examine
@@ -235,6 +235,11 @@ class Known:
             better = self.scale.evidence(ended) >= self.scale.evidence(old)
             self.found[ended.names] = kept = ended if better else replace(old, final=True)
             self.tell(kept, "finished")
+        if "begun again" in self.task.method.without:
+            return
+        final = [self.found[h.names] for h in hypotheses]
+        for again in side_by_side(lambda h: begun_again(h, self.task.experiments), final):
+            self.note(again)
 
     def worth(self, h: Hypothesis, *, confirmed: bool = True) -> bool:
         """Whether every cause removes what can be told, and held-out data confirm it."""

@@ -1,6 +1,6 @@
 """Which hypotheses may be the answer: what a cause must remove, and what held-out data must say."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -116,17 +116,15 @@ def _rings_at(fit: Fit, frequency: float) -> bool:
     return bool(np.any(sharp & near))
 
 
-def inside_ranges(
-    values: Mapping[str, float], cause: Component, ideal: Collection[str] = ()
-) -> bool:
+def inside_ranges(values: Mapping[str, float], cause: Component) -> bool:
     """Whether no parameter of a cause but its gain was pushed to the end of its range.
 
-    Those named `ideal` may be at their lower end, where the cause is its own limit.
+    One whose lower end is a limit of the law may be there.
     """
     for p in cause.parameters:
         if not p.fitted or p.name == cause.gain:
             continue
-        low, high = p.bounds if p.name not in ideal else (0.0, p.bounds[1])
+        low, high = (0.0, p.bounds[1]) if p.limit else p.bounds
         margin = 1e-3 * (high - low) if not p.log else 0.0
         value = values[p.name]
         if p.log and (value < 1.01 * low or value > high / 1.01):
