@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from psa_casadi.component import Expression
 from psa_casadi.model.structure import Structure
@@ -37,7 +36,7 @@ def order_of(
 ) -> tuple[Item, ...]:
     """Return the order in which groups and ports are evaluated, each after what feeds it."""
     items: list[Item] = [("group", (k,)) for k in range(len(groups))]
-    _, label = connected_components(reach & reach.T, directed=False)
+    label = np.argmax(reach & reach.T, axis=1)  # the first of those that reach each other
     loops: dict[int, list[int]] = {}
     for k, port in enumerate(ports):
         if port.feedback:
