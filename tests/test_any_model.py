@@ -22,6 +22,7 @@ from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.from_casadi.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
+from psa_casadi.report.words.own_words import own_verdict_sentence
 from tests import own_plants as plants
 from tests.browser import DARK, find_browser
 from tests.fmu_models import model_named
@@ -97,6 +98,10 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
         f" the held-out error falls by {gain:.0f} %." in page.text
     )
     assert f"position: held-out rms {rms:.2f} µm" in page.text
+    rival = replace(d.causes[0], confidence=0.6, cannot_be_told_from=("stop_of_x",))
+    assert "(the rate of v, confidence 60 %; or stop of x)" in own_verdict_sentence(
+        replace(d, causes=(rival,))
+    )
     assert re.search(r"hysteresis_of_x_in_v_n 0\.99\d+ 0\.99\d+ to 1\.0\d+ 1 fit", page.text)
     assert page.loaded == []
     assert page.targets <= page.names

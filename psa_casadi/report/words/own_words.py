@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from psa_casadi.any_model.identify import OdeIdentification
-from psa_casadi.any_model.result import OdeDiagnosis, OutputError, PortCause
+from psa_casadi.any_model.result import OdeDiagnosis, OutputError
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
@@ -24,6 +24,7 @@ from psa_casadi.report.words.verdict_words import (
     VERDICTS,
     added,
     cause_size,
+    named_cause,
     naming_sentence,
     within,
 )
@@ -49,9 +50,8 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
             "Something is missing, and no effect in the table explains it: no cause is named;"
             f" {words}{_base_errors(d)}."
         )
-    return naming_sentence(
-        d, [_cause(c) for c in d.causes], own_gain(d), percent(within(d.explained_share))
-    )
+    named = [named_cause(c, c.port) for c in d.causes]
+    return naming_sentence(d, named, own_gain(d), percent(within(d.explained_share)))
 
 
 def own_gain(d: OdeDiagnosis) -> str:
@@ -92,10 +92,6 @@ def _spans(d: OdeDiagnosis) -> dict[str, float]:
     return dict(zip(d.model.output_names, map(float, spans), strict=True))
 
 
-def _cause(c: PortCause) -> str:
-    return f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
-
-
 def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
     """Return the lines of a terminal's story: a label and what is told."""
     lines = [("verdict", f"{VERDICTS[d.verdict]}. {own_verdict_sentence(d)}")]
@@ -106,7 +102,8 @@ def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
         text = f"{e.output}: held-out rms {shown[0]} of the base{extended}; noise {shown[2]}"
         lines.append(("error", text))
     for c in d.causes:
-        lines.append(("cause", f"{_cause(c)}: {cause_size(d, c)}"))
+        told = f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
+        lines.append(("cause", f"{told}: {cause_size(d, c)}"))
         if c.cannot_be_told_from:
             rivals = either(c.cannot_be_told_from)
             lines.append(("rivals", f"these data cannot distinguish it from {rivals}"))

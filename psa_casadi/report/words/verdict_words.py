@@ -88,7 +88,8 @@ def verdict_sentence(d: Diagnosis) -> str:
             f"{_kept(d)}{_unnamed(d)}{error}."
         )
     share = None if d.budget is None else f"{d.budget.together.percents[0]} %"
-    return naming_sentence(d, [_cause(c) for c in d.causes], gain_sentence(d), share)
+    named = [named_cause(c, c.belongs_to) for c in d.causes]
+    return naming_sentence(d, named, gain_sentence(d), share)
 
 
 def naming_sentence(
@@ -142,8 +143,9 @@ def _unnamed(d: Diagnosis) -> str:
     return f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
 
 
-def _cause(cause: Cause) -> str:
-    sure = f"{cause.belongs_to}, confidence {percent(cause.confidence)}"
+def named_cause(cause: "Cause | PortCause", where: str) -> str:
+    """Name a cause with its place, how sure it is, and what it cannot be told from."""
+    sure = f"{where}, confidence {percent(cause.confidence)}"
     if cause.cannot_be_told_from:
         sure += f"; or {either(cause.cannot_be_told_from)}"
     return f"{plain(cause.effect)} ({sure})"
