@@ -54,7 +54,8 @@ def case(
     """Return what a page is asked for: the model's values on a voltage."""
     return {
         "values": model.parameter_vector().tolist(),
-        "nominals": model.state_nominals().tolist(), "t": doubles(time), "rtol": rtol,
+        "nominals": model.state_nominals().tolist(),
+        "error_sizes": model.error_sizes().tolist(), "t": doubles(time), "rtol": rtol,
         "inputs": {"voltage": doubles(voltage)}, **more,
     }  # fmt: skip
 

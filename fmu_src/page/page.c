@@ -18,7 +18,8 @@
 enum { NO_EQUILIBRIUM = 10, NO_MEMORY = 11 };
 enum { STEPPER, EXACT_STEPS };
 
-static double parameters[PSA_NP + 1], nominal[PSA_NX], deviation[PSA_NX], start[PSA_NX], no_state[PSA_NS + 1];
+static double parameters[PSA_NP + 1], nominal[PSA_NX], error_size[PSA_NX];
+static double deviation[PSA_NX], start[PSA_NX], no_state[PSA_NS + 1];
 
 static struct {
     long samples;
@@ -53,6 +54,7 @@ EXPORT int page_reserve(long samples) {
 
 EXPORT double *page_parameters(void) { return parameters; }
 EXPORT double *page_nominal(void) { return nominal; }
+EXPORT double *page_error_size(void) { return error_size; }
 EXPORT double *page_deviation(void) { return deviation; }
 EXPORT double *page_start(void) { return start; }
 EXPORT double *page_times(void) { return record.t; }
@@ -149,7 +151,7 @@ static int run_exactly(double tolerance, int coarsest, int hold, long *forced) {
     run.sets = 1;
     run.p = parameters;
     run.x0 = start;
-    run.nominal = nominal;
+    run.nominal = error_size;
     run.tolerance = tolerance;
     run.coarsest = coarsest;
     run.finest = coarsest > PAGE_FINEST ? coarsest : PAGE_FINEST;

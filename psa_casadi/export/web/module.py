@@ -39,8 +39,8 @@ from psa_casadi.simulation.ways import (
 _PAGE_SOURCES = ("page/page.c", "page/settle.c", "page/library.c")
 #: What a page calls, and how many bytes of stack it has.
 _EXPORTS = (
-    "reserve", "parameters", "nominal", "deviation", "start", "times", "inputs", "states",
-    "outputs", "steps", "way", "run",
+    "reserve", "parameters", "nominal", "error_size", "deviation", "start", "times", "inputs",
+    "states", "outputs", "steps", "way", "run",
 )  # fmt: skip
 _STACK = 1 << 20
 #: For the compiler, of every module.
@@ -94,7 +94,7 @@ def _compiled(structure: Structure) -> Callable[[], bytes]:
     command = [*zig_command(), *WEB_FLAGS]  # before anything is made: raises where there is none
     texts = module_texts(structure)
     folder = sources_directory()
-    digest = hashlib.sha256(repr((version("ziglang"), command[1:])).encode())
+    digest = hashlib.sha256(repr((version("ziglang"), command[1:], _EXPORTS)).encode())
     digest.update(repr(sorted(texts.items())).encode())
     for path in sorted([*folder.glob("*.[ch]"), *folder.glob("page/*.[ch]")]):
         digest.update(path.name.encode() + path.read_bytes())

@@ -58,6 +58,7 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
             for q in s.states
         ],
         "nominals": model.state_nominals().tolist(),
+        "error_sizes": model.error_sizes().tolist(),
         "shown": shown,
         "shown_nominal": (
             0.0 if shown is None else float(model.output_nominals()[outputs.index(shown)])

@@ -22,6 +22,7 @@ psaLive.load = function (told) {
     if (page.page_reserve(n)) { return {status: 11, reason: psaLive.reasons[11]}; }
     view(page.page_parameters(), told.parameters.length).set(asked.values);
     view(page.page_nominal(), told.states.length).set(asked.nominals || told.nominals);
+    view(page.page_error_size(), told.states.length).set(asked.error_sizes || told.error_sizes);
     view(page.page_deviation(), told.states.length).set(told.states.map(function (s) {
       return (asked.deviation && asked.deviation[s.name]) || 0;
     }));

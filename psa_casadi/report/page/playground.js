@@ -9,7 +9,7 @@ psaLive.playground = function (box, told, run) {
   var UM = {unit: '\u00b5m', factor: 1e6};
 
   function asked(at, t, v, quick) {
-    return run({values: at, nominals: stack.nominals, t: t, inputs: {voltage: v}, quick: quick, settle: true});
+    return run({values: at, nominals: stack.nominals, error_sizes: stack.error_sizes, t: t, inputs: {voltage: v}, quick: quick, settle: true});
   }
   function bare() {
     var at = values.slice();

@@ -79,5 +79,6 @@ def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str,
         "values": values,
         "rated": model.values.get("u_rated", 1.0),
         "nominals": chosen.state_nominals().tolist(),
+        "error_sizes": chosen.error_sizes().tolist(),
         "fmu": fmu_figures(chosen, model),
     }
