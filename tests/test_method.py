@@ -188,12 +188,10 @@ def test_an_end_that_is_a_limit_of_the_law_is_in_character(creeping: Creeping) -
     limits |= {("temperature", "temperature_lag")}
     assert {(e.name, p.name) for e in EFFECTS.values() for p in e.parameters if p.limit} == limits
     for name, parameter in limits:
-        effect, bounds = (
-            EFFECTS[name],
-            creep.fit.model.with_effect(EFFECTS[name]).parameter(parameter).bounds,
-        )
-        for end, fits in zip(bounds, (True, False), strict=True):
-            model = creep.fit.model.with_effect(effect, {parameter: end})
+        effect = EFFECTS[name]
+        extended = creep.fit.model.with_effect(effect)
+        for end, fits in zip(extended.parameter(parameter).bounds, (True, False), strict=True):
+            model = extended.with_values({parameter: end})
             assert in_character(replace(creep.fit, model=model), effect, experiments) is fits
 
 

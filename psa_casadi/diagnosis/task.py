@@ -23,7 +23,7 @@ STEPS = {
     "finite steps": "effects whose derivative vanishes at their null are not looked for by a step",
     "fits afresh": "no fits from an ordinary base beside those from the fitted one",
     "other parents": "a set is fitted from one of its parents only",
-    "begun again": "a cause that was pushed to the end of its range does not begin once more",
+    "begun again": "a cause that comes near the end of its range does not begin once more",
     "base again": "the base is not fitted again from where a cause has led",
     "resonances": "no resonances that the base has missed are tried",
     "several modes": "no series of modes is fitted where one leaves structure",

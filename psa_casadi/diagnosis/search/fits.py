@@ -19,6 +19,7 @@ from psa_casadi.diagnosis.search.quick_fits import (
     fit_with_all,
     quick_fit,
 )
+from psa_casadi.diagnosis.search.worth import near_end
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.search.refitting import quick_rtol, refit
@@ -33,9 +34,8 @@ _BESIDE, _SET_AFRESH, _AFRESH = 12, 17, 45
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Shares of their gains with which the causes begin that are left without another.
 _SHARES = (1.0, 0.3, 0.0)
-#: Share of a range that counts as its end, where a cause begins again with these shares of its
-#: gain.
-_END, _AGAIN = 0.1, (0.5, 2.0)
+#: Shares of its gain with which a cause near the end of its range begins again.
+_AGAIN = (0.5, 2.0)
 #: Tolerance of stepper and fit, and evaluations, to the end.
 _POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
 
@@ -261,7 +261,7 @@ def begun_again(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis
     use below the cost of the fit. None where no cause is near an end.
     """
     values = of.fit.model.values
-    at_end = next((c for c in of.causes if _near_end(values, c)), None)
+    at_end = next((c for c in of.causes if near_end(values, c)), None)
     if at_end is None:
         return None
     kept = {at_end.gain, *at_end.linear}
@@ -332,18 +332,6 @@ def _ordinary_form(effect: Component, known: Mapping[str, float]) -> dict[str, f
         n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
         for n, grid in effect.probe.items()
     }
-
-
-def _near_end(values: Mapping[str, float], effect: Component) -> bool:
-    """Whether a parameter of an effect, its gain and weights apart, is near an end of its range."""
-    for p in effect.parameters:
-        if not p.fitted or p.name in (effect.gain, *effect.linear):
-            continue
-        scale = np.log if p.log else float
-        low, high, value = scale(p.bounds[0]), scale(p.bounds[1]), scale(values[p.name])
-        if not _END < (value - low) / (high - low) < 1.0 - _END:
-            return True
-    return False
 
 
 def _declared(effect: Component, name: str) -> float:

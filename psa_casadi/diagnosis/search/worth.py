@@ -21,6 +21,8 @@ FloatArray = npt.NDArray[np.float64]
 _SAME = 1.0
 #: Terms of a static curve.
 _CURVE = 8
+#: Share of a range that is near its end.
+_END = 0.1
 #: Damping ratio of a sharp resonance, and halves of its width within which a tone is its ringing.
 _SHARP, _WIDTHS = 0.05, 2.0
 
@@ -132,3 +134,15 @@ def inside_ranges(values: Mapping[str, float], cause: Component) -> bool:
         if not p.log and (value <= low + margin or value >= high - margin):
             return False
     return True
+
+
+def near_end(values: Mapping[str, float], effect: Component) -> bool:
+    """Whether a parameter of an effect, its gain and weights apart, is near an end of its range."""
+    for p in effect.parameters:
+        if not p.fitted or p.name in (effect.gain, *effect.linear):
+            continue
+        scale = np.log if p.log else float
+        low, high, value = scale(p.bounds[0]), scale(p.bounds[1]), scale(values[p.name])
+        if not _END < (value - low) / (high - low) < 1.0 - _END:
+            return True
+    return False
