@@ -23,8 +23,8 @@ from math import copysign, inf, nextafter, sqrt
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 
 from psa_casadi.errors import Problems
 
@@ -184,7 +184,7 @@ class _Segment:
         side = 0 if abs(rate) <= self.stack.p["hold_rate"] else int(copysign(1, rate))
         while begin < end:
             grid, turn = np.union1d(wanted, [begin, end]), _Turn(self, side)
-            solution = solve_ivp(
+            solution = scipy.integrate.solve_ivp(
                 self.rates, (begin, end), state, "LSODA", grid, events=turn, rtol=rtol, atol=atol
             )
             turns = solution.t_events[0] if solution.t_events else np.empty(0)

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from psa_casadi.errors import InputError
 from psa_casadi.population.mixed_regression import MixedFit, mixed_regression
@@ -81,7 +81,7 @@ def batch_test(theta: ArrayLike, errors: ArrayLike, names: Sequence[str]) -> Bat
         )
         for k, kind in enumerate(kinds)
     )  # fmt: skip
-    p_value = float(stats.f.sf(f, len(kinds) - 1, fit.dof))
+    p_value = float(scipy.stats.f.sf(f, len(kinds) - 1, fit.dof))
     return BatchTest(f, p_value, fit.tau, batches)
 
 
@@ -92,7 +92,7 @@ def _against_others(fit: MixedFit, k: int) -> tuple[float, float]:
     contrast[k] = 1.0
     differs = float(contrast @ fit.b)
     error = float(np.sqrt(contrast @ fit.covariance @ contrast))
-    return differs, float(2.0 * stats.t.sf(abs(differs) / error, fit.dof))
+    return differs, float(2.0 * scipy.stats.t.sf(abs(differs) / error, fit.dof))
 
 
 def drift(theta: ArrayLike, errors: ArrayLike, time: ArrayLike) -> Drift:

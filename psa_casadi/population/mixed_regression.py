@@ -21,8 +21,8 @@ Methodol. 15 (2015) 99 (the scale of 1 or more).
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from psa_casadi.errors import InputError
 from psa_casadi.units import FloatArray
@@ -56,13 +56,15 @@ class MixedFit:
 
     def interval(self, k: int = 0) -> tuple[float, float]:
         """Return the 95 % interval of a coefficient."""
-        half = float(stats.t.ppf(0.5 + 0.5 * LEVEL, self.dof)) * float(self.standard_errors[k])
+        half = float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, self.dof)) * float(
+            self.standard_errors[k]
+        )
         return float(self.b[k]) - half, float(self.b[k]) + half
 
     def significance(self, k: int) -> float:
         """Return the two-sided p value of a coefficient that is 0 (Student's t)."""
         t = abs(float(self.b[k])) / float(self.standard_errors[k])
-        return float(2.0 * stats.t.sf(t, self.dof))
+        return float(2.0 * scipy.stats.t.sf(t, self.dof))
 
 
 def mixed_regression(
@@ -90,7 +92,9 @@ def mixed_regression(
     y, s = y / unit, s / unit
     dof = y.size - x.shape[1]
     tau2 = solve_tau2(y, s, x, float(dof))
-    ends = [solve_tau2(y, s, x, float(stats.chi2.ppf(0.5 + h * LEVEL / 2, dof))) for h in (1, -1)]
+    ends = [
+        solve_tau2(y, s, x, float(scipy.stats.chi2.ppf(0.5 + h * LEVEL / 2, dof))) for h in (1, -1)
+    ]
     b, covariance, q = _weighted(y, s, x, tau2)
     scale = max(1.0, q / dof)
     q0 = _weighted(y, s, x, 0.0)[2]
@@ -100,7 +104,7 @@ def mixed_regression(
         float(np.sqrt(tau2)) * unit,
         (float(np.sqrt(ends[0])) * unit, float(np.sqrt(ends[1])) * unit),
         q0,
-        float(stats.chi2.sf(q0, dof)),
+        float(scipy.stats.chi2.sf(q0, dof)),
         dof,
     )
 

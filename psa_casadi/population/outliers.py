@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from psa_casadi.errors import InputError
 from psa_casadi.population.mixed_regression import MOST_STEPS, PRECISION, mixed_regression
@@ -78,7 +78,7 @@ def _tested(
         whole = mixed_regression(y[kept], s[kept])
         spread = s[apart] ** 2 + whole.tau**2 + whole.covariance[0, 0]
         z[apart], dof[apart] = (y[apart] - whole.b[0]) / np.sqrt(spread), whole.dof
-    p = np.asarray(2.0 * stats.t.sf(np.abs(z), dof))
+    p = np.asarray(2.0 * scipy.stats.t.sf(np.abs(z), dof))
     return z, p, adjusted(p, how)
 
 

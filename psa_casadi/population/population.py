@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from psa_casadi.errors import InputError
 from psa_casadi.population.finding import Finding
@@ -167,7 +167,7 @@ def frequencies(words: Sequence[str], of: int | None = None) -> tuple[Frequency,
 
 
 def _wilson(count: int, of: int) -> tuple[float, float]:
-    found = stats.binomtest(count, of).proportion_ci(method="wilson")
+    found = scipy.stats.binomtest(count, of).proportion_ci(method="wilson")
     return float(found.low), float(found.high)
 
 

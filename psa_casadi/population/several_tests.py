@@ -3,8 +3,8 @@
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from psa_casadi.units import FloatArray
 
@@ -27,7 +27,7 @@ def adjusted(p: ArrayLike, how: Adjustment = "benjamini-hochberg") -> FloatArray
     if values.size == 0:
         return values
     if how == "benjamini-hochberg":
-        return np.asarray(stats.false_discovery_control(values), dtype=float)
+        return np.asarray(scipy.stats.false_discovery_control(values), dtype=float)
     order = np.argsort(values)
     steps = np.maximum.accumulate(values[order] * np.arange(values.size, 0, -1))
     found = np.empty_like(values)

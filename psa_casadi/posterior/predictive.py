@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import truncnorm
+import scipy
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.prediction import measured, predict
@@ -36,7 +36,7 @@ def prior_draws(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
     known = np.isfinite(task.unknowns.prior)
     width, found = task.unknowns.prior[known], np.zeros((count, task.unknowns.size))
     low, high = (edge[known] / width for edge in task.unknowns.bounds())
-    found[:, known] = width * truncnorm.rvs(
+    found[:, known] = width * scipy.stats.truncnorm.rvs(
         low, high, size=(count, int(known.sum())), random_state=rng
     )
     return found

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from psa_casadi.design.experiment.designs import ASKED, PLAYS
 from psa_casadi.design.experiment.rivals import Rival
@@ -34,7 +34,7 @@ def naming_probability(
     for other in others:
         t = distances[truth.name, other.name]
         gained = truth.evidence - other.evidence + 0.5 * t - needed
-        chances.append(float(ndtr(gained / np.sqrt(max(t, LEAST)))))
+        chances.append(float(scipy.special.ndtr(gained / np.sqrt(max(t, LEAST)))))
     return min(chances, default=1.0)
 
 

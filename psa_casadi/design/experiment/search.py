@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import Bounds, NonlinearConstraint, minimize
+import scipy
 
 from psa_casadi.design.experiment.candidates import KINDS, Kind, Waveform, draw
 from psa_casadi.design.experiment.criterion import Criterion, Point
@@ -201,13 +201,14 @@ class _Problem:
             return downhill
 
         bounded = wave.slack(wave.start).size > 0
-        minimize(
+        slack = scipy.optimize.NonlinearConstraint(wave.slack, 0.0, np.inf)
+        scipy.optimize.minimize(
             cost,
             wave.start,
             jac=slope,
             method="SLSQP",
-            bounds=Bounds(wave.lower, wave.upper),
-            constraints=[NonlinearConstraint(wave.slack, 0.0, np.inf)] if bounded else [],
+            bounds=scipy.optimize.Bounds(wave.lower, wave.upper),
+            constraints=[slack] if bounded else [],
             options={"maxiter": steps, "ftol": 1e-3},
         )
         return best

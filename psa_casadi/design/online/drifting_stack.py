@@ -11,7 +11,7 @@ from math import copysign, exp, sqrt
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
+import scipy
 
 FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float]
@@ -92,5 +92,5 @@ def _discrete(p: Values, h: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     A[4, 1:5] = [p["k_P"] + p["k_B"], p["c_P"] + p["c_B"], -p["k_B"], -p["c_B"]]
     A[4] /= p["m_B"]
     A[5, 6] = 1.0 / h
-    whole = expm(A * h)
+    whole = scipy.linalg.expm(A * h)
     return whole[:5, :5], whole[:5, 5] - whole[:5, 6], whole[:5, 6]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
+import scipy
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.dynamics import demand_stack, rest_at
@@ -183,9 +183,8 @@ def _lagged(values: FloatArray, constant: float, dt: float) -> FloatArray:
     decay = np.exp(-dt / constant)
     later = 1.0 - constant / dt * (1.0 - decay)
     first = values[0] * (1.0 - later)
-    return np.asarray(
-        lfilter([later, 1.0 - decay - later], [1.0, -decay], values, zi=[first - 0.0])[0]
-    )
+    upper, lower = [later, 1.0 - decay - later], [1.0, -decay]
+    return np.asarray(scipy.signal.lfilter(upper, lower, values, zi=[first - 0.0])[0])
 
 
 def _march(model: Model) -> ca.Function:

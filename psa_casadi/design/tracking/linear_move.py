@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
-from scipy.optimize import linprog
+import scipy
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.errors import PsaError
@@ -110,7 +109,7 @@ class LinearMove:
                 np.hstack([-np.eye(n), bound]),
             ]
         )
-        answer: Any = linprog(
+        answer: Any = scipy.optimize.linprog(
             np.r_[np.zeros(n), 1.0],
             A_ub=upper, b_ub=np.concatenate([tops, near, -near]),
             A_eq=np.hstack([matrix, np.zeros((len(matrix), 1))]), b_eq=right,
@@ -123,7 +122,7 @@ class LinearMove:
         matrix, right = self._conditions(length, offsets)
         rows, tops = self._limited(length)
         k, n = len(right), self.n
-        answer: Any = linprog(
+        answer: Any = scipy.optimize.linprog(
             np.r_[np.zeros(n), np.ones(2 * k)],
             A_ub=np.hstack([rows, np.zeros((len(rows), 2 * k))]) if len(rows) else None,
             b_ub=tops if len(rows) else None,
@@ -184,7 +183,7 @@ class LinearMove:
         nf, n, h = len(self.a), self.n, length / self.n
         block = np.zeros((nf + 2, nf + 2))
         block[:nf, :nf], block[:nf, nf], block[nf, nf + 1] = self.a * h, self.b * h, 1.0
-        power = expm(block)
+        power = scipy.linalg.expm(block)
         step, later = power[:nf, :nf], power[:nf, nf + 1]
         before = power[:nf, nf] - later
         gain, free = np.zeros((nf, n)), self.start

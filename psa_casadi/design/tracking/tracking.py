@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.collocation import (
@@ -180,7 +180,7 @@ def _solve(
     There are fewer, or none, where IPOPT finds no further one.
     """
     nodes = nodes_of(target.time)
-    path = np.asarray(PchipInterpolator(target.time, target.displacement)(nodes))
+    path = np.asarray(scipy.interpolate.PchipInterpolator(target.time, target.displacement)(nodes))
     start = problem.start * problem.interval.nominal
     program, shown = Program(problem), path
     inner = simulated_states(smooth, nodes, target.time, guess, start)

@@ -8,19 +8,16 @@ shows this mean, and the error looks like a further resonance or a lag.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import trace_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-
-if TYPE_CHECKING:
-    from scipy.interpolate import Akima1DInterpolator
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -89,11 +86,9 @@ def _between(record: Record, time: FloatArray, column: FloatArray | None) -> Flo
     return None if column is None else np.interp(time, record.time, column)
 
 
-def _curve(record: Record) -> "Akima1DInterpolator":
+def _curve(record: Record) -> "scipy.interpolate.Akima1DInterpolator":
     """Return a smooth curve through a record's voltage, straight where the samples are."""
-    from scipy.interpolate import Akima1DInterpolator  # noqa: PLC0415 (slow to load, seldom needed)
-
-    return Akima1DInterpolator(record.time, record.voltage)
+    return scipy.interpolate.Akima1DInterpolator(record.time, record.voltage)
 
 
 def _moved(record: Record) -> Record:

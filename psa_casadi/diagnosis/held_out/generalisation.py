@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+import scipy
 
 from psa_casadi.diagnosis.held_out.errors import held_out_residuals
 from psa_casadi.diagnosis.noise.colour import Colour, rms
@@ -88,7 +88,7 @@ def _within(
     ratio = float(np.mean(squares)) / power
     kurtosis = max(3.0, float(np.mean(learnt**2)) / power**2)
     spread = np.sqrt((kurtosis - 1.0) * (1.0 / m + 1.0 / n))
-    chance = float(special.ndtr(-(ratio * (n - k) / (n + k) - 1.0) / spread))
+    chance = float(scipy.special.ndtr(-(ratio * (n - k) / (n + k) - 1.0) / spread))
     return Excess(float(np.sqrt(ratio)), chance) if _tells(ratio, chance) else Excess()
 
 

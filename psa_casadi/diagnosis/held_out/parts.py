@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+import scipy
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -49,4 +49,4 @@ def jackknife(of: Callable[[BoolArray], float], every: BoolArray) -> tuple[float
         return of(every), 0.0
     without = [of(every & (np.arange(k) != i)) for i in range(k)]
     spread = float(np.sqrt((k - 1) * np.var(without)))
-    return of(every), float(special.stdtrit(k - 1, 0.975)) * spread
+    return of(every), float(scipy.special.stdtrit(k - 1, 0.975)) * spread

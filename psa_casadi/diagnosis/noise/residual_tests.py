@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+import scipy
 
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -84,7 +84,7 @@ def _neighbours(white: FloatArray) -> tuple[float, float]:
         return 1.0, 0.0
     r = np.array([centred[k:] @ centred[:-k] / power for k in range(1, _LAGS + 1)])
     statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, _LAGS + 1)))
-    return float(special.chdtrc(_LAGS, statistic)), float(np.max(np.abs(r)))
+    return float(scipy.special.chdtrc(_LAGS, statistic)), float(np.max(np.abs(r)))
 
 
 def _fisher_line(white: FloatArray) -> tuple[float, float]:
@@ -159,5 +159,5 @@ def _f_test(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     freedom = len(y) - rank
     if rest <= 0 or freedom <= 0:
         return 1.0, 0.0
-    p = float(special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
+    p = float(scipy.special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
     return p, explained / (explained + rest)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter1d
+import scipy
 
 from psa_casadi.diagnosis.residual.views import COARSE, FINE, Axis
 from psa_casadi.records.quality.fast_noise import fast_noise
@@ -116,7 +116,7 @@ def drive_of(record: Record) -> Drive:
     wanted = _QUIET * mean_rate * record.sample_time
     ratio = 1.4142 * noise / wanted if wanted > 0 else 0.0
     width = int(np.clip(np.ceil(ratio ** (2.0 / 3.0)), 1, max(1, n // 100)))
-    smooth = uniform_filter1d(v, width, mode="nearest") if width > 1 else v
+    smooth = scipy.ndimage.uniform_filter1d(v, width, mode="nearest") if width > 1 else v
     half = max(1, width // 2)
     k = np.arange(n)
     low, high = np.maximum(k - half, 0), np.minimum(k + half, n - 1)

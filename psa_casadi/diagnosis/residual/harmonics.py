@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+import scipy
 
 from psa_casadi.diagnosis.noise.floor import quantity
 from psa_casadi.records.quality.repetitions import Repetition, repetitions
@@ -131,7 +131,7 @@ def _significant(line: FloatArray, between: FloatArray, periods: int) -> float:
     above = float(np.sum(line)) - noise
     if noise > 0:
         freedom = 4 * (periods - 1) * max(1, line.size // 2)
-        p = float(special.fdtrc(2 * line.size, freedom, float(np.sum(line)) / noise))
+        p = float(scipy.special.fdtrc(2 * line.size, freedom, float(np.sum(line)) / noise))
         above = above if p < _SIGNIFICANT else 0.0
     return max(above, 0.0)
 

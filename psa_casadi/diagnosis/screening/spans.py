@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammainccinv
+import scipy
 
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -102,7 +102,9 @@ class Span:
         """What a chi-square that is passed as rarely as a false alarm is above that of one."""
         freedom = max(float(np.sum(self.covariance * self.information)), 1.0)
         share = thresholds().false_alarm
-        largest, of_one = (2.0 * float(gammainccinv(0.5 * f, share)) for f in (freedom, 1.0))
+        largest, of_one = (
+            2.0 * float(scipy.special.gammainccinv(0.5 * f, share)) for f in (freedom, 1.0)
+        )
         return largest - of_one
 
     @cached_property

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
+import scipy
 
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.dependence import closure
@@ -55,7 +55,7 @@ def responses(m: FloatArray, nominal: FloatArray, *, step: float, share: float) 
     system[:n, :n] = scaled * step * share
     for k in range(3):
         system[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
-    full = expm(system)
+    full = scipy.linalg.expm(system)
     joined = closure(m != 0.0)
     parts = [
         np.where(joined, full[:n, k * n : (k + 1) * n] * nominal[:, None] / nominal, 0.0)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
@@ -152,9 +153,7 @@ def _solved(
     tolerance: float, atol: FloatArray, wanted: FloatArray,
 ) -> list[tuple[float, FloatArray]]:  # fmt: skip
     """Return times and states at the wanted times of a span, and at its end."""
-    from scipy.integrate import solve_ivp  # noqa: PLC0415 - half a second that few need
-
-    solution = solve_ivp(
+    solution = scipy.integrate.solve_ivp(
         rates, span, x, method="LSODA", rtol=tolerance, atol=atol,
         t_eval=np.union1d(wanted, [span[1]]),
     )  # fmt: skip

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag, expm
+import scipy
 
 from psa_casadi.export.ssp.layout import OUTSIDE
 from psa_casadi.export.ssp.structure import WiredParts
@@ -51,7 +51,7 @@ class Linear:
         chain = np.zeros((nx + 2 * nu, nx + 2 * nu))
         chain[:nx, :nx], chain[:nx, nx : nx + nu] = self.A, self.B
         chain[nx : nx + nu, nx + nu :] = np.eye(nu)
-        flow = expm(chain * h)
+        flow = scipy.linalg.expm(chain * h)
         K = self.exchange()
         slopes = K @ (self.A + self.B @ K) if rates else np.zeros((nu, nx))
         held, sloped = flow[:nx, nx : nx + nu], flow[:nx, nx + nu :]
@@ -68,7 +68,7 @@ def linear(wiring: WiredParts) -> Linear:
     Sampled parts hold their outputs, so they take no part in a loop.
     """
     pieces = [_matrices(model) for model in wiring.parts.values()]
-    a, b, c, d = (block_diag(*(p[k] for p in pieces)) for k in range(4))
+    a, b, c, d = (scipy.linalg.block_diag(*(p[k] for p in pieces)) for k in range(4))
     ends = [(part, n) for part, model in wiring.parts.items() for n in model.input_names]
     starts = [(part, n) for part, model in wiring.parts.items() for n in model.output_names]
     wires = np.zeros((len(ends), len(starts)))

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import savgol_coeffs, savgol_filter
+import scipy
 
 from psa_casadi.identification.paper.shapes import Loop
 from psa_casadi.records.quality.noise import high_frequency_noise
@@ -85,11 +85,13 @@ def window_of(loop: Loop) -> tuple[int, float]:
 
 
 def _gain(window: int, sample_time: float) -> float:
-    return float(np.linalg.norm(savgol_coeffs(window, _ORDER, deriv=1, delta=sample_time)))
+    return float(
+        np.linalg.norm(scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=sample_time))
+    )
 
 
 def _filter(values: FloatArray, window: int, derivative: int, sample_time: float) -> FloatArray:
-    smooth: FloatArray = savgol_filter(
+    smooth: FloatArray = scipy.signal.savgol_filter(
         values, window, _ORDER, deriv=derivative, delta=sample_time
     ).astype(np.float64)
     return smooth

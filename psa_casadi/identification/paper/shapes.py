@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import find_peaks
+import scipy
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.record import Record
@@ -127,7 +127,9 @@ def _loop(record: Record) -> Loop | None:
 def _turns(voltage: FloatArray) -> npt.NDArray[np.int64]:
     """Return the samples at which the voltage turns, those at its ends excepted."""
     prominence = _PROMINENCE * float(np.ptp(voltage))
-    peaks = [find_peaks(sign * voltage, prominence=prominence)[0] for sign in (1.0, -1.0)]
+    peaks = [
+        scipy.signal.find_peaks(sign * voltage, prominence=prominence)[0] for sign in (1.0, -1.0)
+    ]
     return np.sort(np.concatenate(peaks)).astype(np.int64)
 
 

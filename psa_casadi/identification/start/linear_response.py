@@ -11,6 +11,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -27,8 +28,6 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
     x, shape (n,) or (n, k), is linear between its samples and 0 before them. A complex pole comes
     with its conjugate, so that the response is real: twice the real part.
     """
-    from scipy.signal import lfilter  # noqa: PLC0415 (half a second to load, which few records need)
-
     now, before, decay = _weights(pole, residue, h)
     if pole.imag:
         other = np.conj(decay)
@@ -36,16 +35,16 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
         lower = [1.0, -2.0 * np.real(decay), abs(decay) ** 2]
     else:
         upper, lower = np.real([now, before]), [1.0, -np.real(decay)]
-    found: FloatArray = lfilter(upper, lower, x, axis=0)
+    found: FloatArray = scipy.signal.lfilter(upper, lower, x, axis=0)
     return found
 
 
 def one_pole(pole: complex, x: FloatArray, h: float) -> ComplexArray:
     """Return the response (n,) of 1/(s - pole) to x (n,), as `mode` takes it, complex."""
-    from scipy.signal import lfilter  # noqa: PLC0415 (see `mode`)
-
     now, before, decay = _weights(pole, 1.0, h)
-    found: ComplexArray = lfilter([now, before], [1.0, -decay], x.astype(np.complex128))
+    found: ComplexArray = scipy.signal.lfilter(
+        [now, before], [1.0, -decay], x.astype(np.complex128)
+    )
     return found
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
+import scipy
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
@@ -79,7 +79,7 @@ def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | No
     high = np.array([_K[1], _N[1], *[_DOUBT] * len(loops)])
     none = [0.0] * len(loops)
     found = [
-        least_squares(weighted, [*start, *none], bounds=(low, high), max_nfev=30)
+        scipy.optimize.least_squares(weighted, [*start, *none], bounds=(low, high), max_nfev=30)
         for start in _STARTS
     ]
     best = min(found, key=lambda f: float(f.cost)).x

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from psa_casadi.identification.start.linear_response import one_pole, orthonormal
 
@@ -90,15 +91,13 @@ class _Search:
 
     def refined(self, poles: FloatArray) -> FloatArray:
         """Return all poles moved to where their modes leave less."""
-        from scipy.optimize import least_squares  # noqa: PLC0415 (slow to load, seldom needed)
-
         count, size = len(poles), float(np.linalg.norm(self.target))
         low, high = np.tile(self.low, count), np.tile(self.high, count)
 
         def rest(p: FloatArray) -> FloatArray:
             return self.left(p.reshape(-1, 2)) / size
 
-        found = least_squares(
+        found = scipy.optimize.least_squares(
             rest,
             np.clip(poles.ravel(), low + 1e-6, high - 1e-6),
             bounds=(low, high),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
+import scipy
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
@@ -50,7 +50,7 @@ def plant_response(plant: Model, position: str | None, period: float, lag: float
             " plants: check its parameters."
         )
     n = len(A)
-    step = expm(period * np.block([[A, B], [np.zeros((1, n + 1))]]))
+    step = scipy.linalg.expm(period * np.block([[A, B], [np.zeros((1, n + 1))]]))
     modes = tuple(
         (float(abs(v) / (2.0 * np.pi)), float(-v.real / abs(v)))
         for v in np.linalg.eigvals(A)

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.linalg.lapack import dtbtrs
+import scipy
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,16 +22,18 @@ def filtered(
     if len(lower) == 1 or not x.size:
         return found
     bands = np.repeat(np.asarray(lower, dtype=float)[: len(x), None], len(x), axis=1)
-    recursive: FloatArray = dtbtrs(bands, found.reshape(len(x), -1), uplo="L")[0].reshape(x.shape)
+    recursive: FloatArray = scipy.linalg.lapack.dtbtrs(bands, found.reshape(len(x), -1), uplo="L")[
+        0
+    ].reshape(x.shape)
     return recursive
 
 
 def convolved(x: FloatArray, kernel: FloatArray) -> FloatArray:
     """Return the columns x (n, k) convolved with a symmetric kernel (2 m + 1,), centred."""
     n, reach = len(x), len(kernel) // 2
-    size = next_fast_len(n + len(kernel) - 1, real=True)
-    spectrum = rfft(x, size, axis=0) * rfft(kernel, size)[:, None]
-    whole: FloatArray = irfft(spectrum, size, axis=0)[reach : reach + n]
+    size = scipy.fft.next_fast_len(n + len(kernel) - 1, real=True)
+    spectrum = scipy.fft.rfft(x, size, axis=0) * scipy.fft.rfft(kernel, size)[:, None]
+    whole: FloatArray = scipy.fft.irfft(spectrum, size, axis=0)[reach : reach + n]
     return whole
 
 

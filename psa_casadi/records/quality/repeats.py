@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.sparse import csr_array
+import scipy
 
 from psa_casadi.records.quality.repetitions import ENOUGH, FEWEST, SHORTEST_HOLD, held, repetitions
 from psa_casadi.records.record import Record
@@ -130,7 +129,9 @@ def _without_drift(change: FloatArray, apart: FloatArray, lag: int) -> tuple[Flo
     third = apart / scale if scale > 0 else apart
     values = np.column_stack([1.0 - share, share, third]).ravel()
     columns = np.column_stack([cell, cell + 1, np.full(n, intervals + 1)]).ravel()
-    x = csr_array((values, columns, np.arange(0, 3 * n + 1, 3)), shape=(n, intervals + 2))
+    x = scipy.sparse.csr_array(
+        (values, columns, np.arange(0, 3 * n + 1, 3)), shape=(n, intervals + 2)
+    )
     there = np.isfinite(change)
     used = x if there.all() else x[np.flatnonzero(there)]
     normal = (used.T @ used).toarray()
@@ -168,9 +169,9 @@ def _pooled(
 
 def _products(d: FloatArray, lags: int) -> FloatArray:
     """Return sum_i d_i d_(i+k) for k < lags."""
-    size = next_fast_len(d.size + lags, real=True)
+    size = scipy.fft.next_fast_len(d.size + lags, real=True)
     result = np.zeros(lags)
-    found = irfft(np.abs(rfft(d, size)) ** 2, size)[: min(lags, d.size)]
+    found = scipy.fft.irfft(np.abs(scipy.fft.rfft(d, size)) ** 2, size)[: min(lags, d.size)]
     result[: found.size] = found
     return result
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
 
 from psa_casadi.records.quality.runs import runs_of
 from psa_casadi.records.record import Record
@@ -88,15 +88,17 @@ def _candidates(voltage: FloatArray) -> list[int]:
     n, span = voltage.size, float(np.ptp(voltage))
     v = voltage - np.mean(voltage)
     width = int(np.clip(n // 64, 24, 4096))
-    size = next_fast_len(n + width, real=True)
-    spectrum = rfft(v, size)
+    size = scipy.fft.next_fast_len(n + width, real=True)
+    spectrum = scipy.fft.rfft(v, size)
     power = _sums(v**2, width)
     lags: list[int] = []
     for a in np.linspace(0, n - width, ANCHORS + 2).astype(int)[:-1].tolist():
         window = v[a : a + width]
         if float(np.ptp(window)) < 0.02 * span:
             continue
-        product = irfft(spectrum * np.conj(rfft(window, size)), size)[: n - width + 1]
+        product = scipy.fft.irfft(spectrum * np.conj(scipy.fft.rfft(window, size)), size)[
+            : n - width + 1
+        ]
         apart = (power + float(window @ window) - 2.0 * product)[a:] / width
         away = np.flatnonzero(apart > (0.02 * span) ** 2)
         if not away.size:

@@ -1,8 +1,8 @@
 """Readings that are repeated although the stack moves: a stuck sensor, a drop-out."""
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import pdtrc
 
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.quality.runs import runs_of
@@ -105,7 +105,7 @@ def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None)
     chance = max(quantum or 0.0, _digit(y)) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
     if noise <= NOISY * span or not _rough(y) or not same.any():
         return found
-    unlikely = pdtrc(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
+    unlikely = scipy.special.pdtrc(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
     if chance < BY_NOISE and unlikely and np.mean(same) < RARELY:
         found[1:] = same
     return found

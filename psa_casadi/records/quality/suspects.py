@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
 
 from psa_casadi.records.quality.quantum import quantum_of
 from psa_casadi.records.quality.runs import runs_of
@@ -174,7 +174,7 @@ def _scale(away: FloatArray) -> FloatArray:
     count = max(1, away.size // BLOCK)
     blocks = np.array_split(np.abs(away), count)
     each = np.array([1.4826 * np.median(b) for b in blocks])
-    each = np.maximum(maximum_filter1d(each, 3, mode="nearest"), np.median(each))
+    each = np.maximum(scipy.ndimage.maximum_filter1d(each, 3, mode="nearest"), np.median(each))
     return np.repeat(each, [b.size for b in blocks])
 
 
@@ -190,12 +190,14 @@ def _explained(record: Record) -> FloatArray:
     if record.load_force is not None:
         limits[_sudden(record.load_force) > 0] = np.inf
     limits[0] = max(limits[0], slope * reach)  # a record may begin while the stack still moves
-    fading = [
-        share
-        * maximum_filter1d(limits, BEFORE + after + 1, mode="nearest", origin=(after - BEFORE) // 2)
-        for share, after in AFTER
-    ]
+    fading = [share * _highest(limits, after) for share, after in AFTER]
     return np.asarray(np.max(fading, axis=0), dtype=float)
+
+
+def _highest(limits: FloatArray, after: int) -> FloatArray:
+    """Return the largest limit from `after` samples before each one to BEFORE after it, (n,)."""
+    width, origin = BEFORE + after + 1, (after - BEFORE) // 2
+    return scipy.ndimage.maximum_filter1d(limits, width, mode="nearest", origin=origin)
 
 
 def _sudden(signal: FloatArray) -> FloatArray:
