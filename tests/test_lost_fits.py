@@ -52,7 +52,7 @@ _HELD = {
 def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
     """Of 7 ms, seventy times the ordinary lag, in a triangle and steps together."""
     path = tmp_path / "triangle.csv"
-    truth = make_record("drive_lag", 11, path, excitation="triangle", visible=(1.0, 2.0))
+    truth = make_record("drive_lag", 11, path, excitation="triangle", gain=4e-3)
     time = np.linspace(0.0, 0.749, 750)
     steps = np.where((time // 0.15) % 2 == 1, 0.8, 0.2) * truth.stack.u_rated
     steps[:20] = 0.0
@@ -128,7 +128,7 @@ def test_two_causes_are_found_whichever_of_their_like_leads(tmp_path: Path) -> N
 def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
     """Four effects lead the screening, none explains the data: an amplifier of 0.9 ms does."""
     path = tmp_path / "record.csv"
-    truth = make_record("drive_lag", 52001, path, visible=(0.3, 3.0))
+    truth = make_record("drive_lag", 52001, path, gain=9.171e-4)
     record = read_record(path)
     names = ("rate_dependent_hysteresis", "voltage_saturation", "preload_loss", "load_stiffness")
     found = diagnose([record], effects=[EFFECTS[n] for n in (*names, "drive_lag")])

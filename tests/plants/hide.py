@@ -61,11 +61,16 @@ def hide(
     noise_rms: float,
     strength: float,
     visible: Visible | None,
+    gain: float | None = None,
 ) -> Hidden:
     """Draw the effect and its gain. strength scales a visible ratio drawn from RATIO; `visible`
-    replaces both.
+    replaces both, and a `gain` that is known the search for it.
     """
     parameters = hidden.draw(rng, run)
+    if gain is not None:
+        added = hidden.contribution(run, parameters, gain)
+        shown = visible_ratio(directions, added, noise_rms)
+        return Hidden(hidden, gain, parameters, shown, gain_limited=False, added=added)
     wanted = strength * float(rng.uniform(*RATIO)) if visible is None else _draw(rng, visible)
     weakest = hidden.plausible[0] * (1.0 if visible is None else WEAK)
     gain, limited = find_gain(

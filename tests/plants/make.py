@@ -79,16 +79,17 @@ def make_record(
     noise: NoiseKind = "white",
     excitation: ExcitationKind = "rich",
     visible: Visible | None = None,
+    gain: float | None = None,
     more: tuple[str, ...] = (),
     more_visible: Visible | None = None,
 ) -> Truth:
     """Write a synthetic record as CSV and return the truth; the same seed gives the same bytes.
 
     effect: a name of `HIDDEN_EFFECTS` or None. strength scales the drawn visible ratio (1.5 to 4);
-    0 removes the effect; `visible` (a ratio or a range) replaces it. The same seed gives the same
-    stack, voltage and noise with every effect, and the same stack with every excitation. more:
-    further effects, each as visible beside the base as `more_visible` says; they act on each other
-    (`added_by`).
+    0 removes the effect; `visible` (a ratio or a range) replaces it, and a `gain` both: where it is
+    known, no search takes its time. The same seed gives the same stack, voltage and noise with
+    every effect, and the same stack with every excitation. more: further effects, each as visible
+    beside the base as `more_visible` says; they act on each other (`added_by`).
     """
     _check(noise, excitation)
     chosen = None if effect is None else effect_called(effect)
@@ -105,7 +106,7 @@ def make_record(
     first = (
         None
         if chosen is None
-        else hide(chosen, run, effect_rng, directions, kind.rms, strength, visible)
+        else hide(chosen, run, effect_rng, directions, kind.rms, strength, visible, gain)
     )
     others = tuple(
         hide(one, run, rng, directions, kind.rms, 1.0, more_visible)
