@@ -19,10 +19,11 @@ def main() -> None:
         Path("extended.fmu").write_bytes(b"PK")
         return
     row = json.dumps({"state": "finished", "causes": [], **TRIED})
-    Path("events.jsonl").write_text(f"{row}\n", encoding="utf-8")
     sys.stderr.write("diagnosing ...\n")
     sys.stderr.flush()
     try:
+        # who reads it may stop this process at once
+        Path("events.jsonl").write_text(f"{row}\n", encoding="utf-8")
         for _ in range(600):
             if Path("let_go").exists():
                 break
