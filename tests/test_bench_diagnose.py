@@ -1,11 +1,14 @@
 """What the benchmark `diagnose` counts: on cases made up here, so that every figure can be told."""
 
+from dataclasses import replace
+
 import pytest
 
-from tests.benchmarks.hidden import result_tables
+from tests.benchmarks.hidden import missed, result_tables
 from tests.benchmarks.hidden_cases import Case, Found, Kind
 from tests.benchmarks.hidden_figure import RELIABILITY, in_class, picture
 from tests.benchmarks.hidden_gain import Covered, intervals_table
+from tests.benchmarks.hidden_limits import limits_row
 
 KNOWN, FOREIGN = ("slow_creep", "offset_drift"), ("dry_friction",)
 
@@ -75,6 +78,18 @@ def test_the_picture_shows_the_share_of_each_row_and_the_reliability() -> None:
     said = [text.get_text() for text in reliability.texts]
     assert "2 of 2" in said
     assert "2 of 3" in said
+
+
+def test_a_missed_case_stands_beside_what_is_said_where_its_effect_is_known() -> None:
+    (drift,) = missed(FOUND)
+    assert drift is FOUND[2]
+    weak = _found("weak", "slow_creep", {})
+    assert missed([weak, FOUND[0]]) == [weak]
+    there = replace(drift, evidence={"slow_creep": 40.0, "offset_drift": 36.5, "ageing": 3.0})
+    told = replace(drift, evidence={"offset_drift": 37.25})
+    assert limits_row(there, told) == (
+        "offset_drift", "1", "1.00", "cause_named: slow_creep", "cause_named, 37.2", "+3.5",
+    )  # fmt: skip
 
 
 def test_an_interval_of_the_gain_is_held_against_the_records_it_does_not_know() -> None:

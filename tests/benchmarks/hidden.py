@@ -13,6 +13,7 @@ from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden_cases import Case, Found, run_case, study
 from tests.benchmarks.hidden_figure import BINS, RELIABILITY, in_class, picture
 from tests.benchmarks.hidden_gain import gain_table
+from tests.benchmarks.hidden_limits import limits_table
 from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
 from tests.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN
 
@@ -28,6 +29,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     found = diagnose_all(study(KNOWN, FOREIGN, QUICK_SEEDS if quick else SEEDS, FIRST), progress)
     tables = result_tables(found)
     if not quick:
+        tables.append(limits_table(missed(found), progress))
         tables.append(gain_table(KNOWN, FIRST, progress))
     return Outcome(tuple(tables), lambda: picture(found, KNOWN, FOREIGN))
 
@@ -62,6 +64,12 @@ def of_kind(found: Sequence[Found], kind: str, noise: str | None = None) -> list
         for f in found
         if f.case.kind == kind and f.reached and (noise is None or f.case.noise == noise)
     ]
+
+
+def missed(found: Sequence[Found]) -> list[Found]:
+    """Return the cases of one effect, no bend, that is not named alone, or not at all if weak."""
+    known = [f for f in of_kind(found, "known") if f.case.right not in ALIKE and not f.right_alone]
+    return known + [f for f in of_kind(found, "weak") if f.case.right not in f.within]
 
 
 def _share(found: Sequence[Found], holds: Callable[[Found], bool]) -> str:

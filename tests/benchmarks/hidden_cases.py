@@ -140,11 +140,16 @@ def records_of(case: Case, folder: Path) -> tuple[Truth, list[Record]]:
     return truth, records
 
 
-def run_case(case: Case, method: Method | None = None) -> Found:
-    """Make the records of a case, diagnose the files, and compare."""
+def run_case(case: Case, method: Method | None = None, *, only: bool = False) -> Found:
+    """Make the records of a case, diagnose the files, and compare.
+
+    With `only`, the right effect is the only one in the table.
+    """
     with tempfile.TemporaryDirectory() as folder:
         truth, records = records_of(case, Path(folder))
     table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.right]
+    if only:
+        table = [EFFECTS[str(case.right)]]
     begin = time.process_time()
     d = diagnose(records, effects=table, method=method)
     return _found(case, d, truth, time.process_time() - begin)
