@@ -176,6 +176,13 @@ def time_at(points: Sequence[Point], way: str, of: str, error: float = WANTED) -
     return float(np.exp(np.interp(np.log(error), errors, times, left=np.nan, right=np.nan)))
 
 
+def _at_wanted(between: float) -> str:
+    """Say the ratio at the error itself, where both ways have larger and smaller errors."""
+    if not np.isfinite(between):
+        return ""
+    return f"; read off between tolerances at {WANTED:.0e} itself: 1/{number(between, 2)}"
+
+
 def run_table(points: Sequence[Point], samples: int) -> TitledTable:
     """Return both ways at all tolerances, and the share of the stepper's time at equal error."""
     rows = tuple(
@@ -193,8 +200,7 @@ def run_table(points: Sequence[Point], samples: int) -> TitledTable:
         said.append(
             f"{words} 1/{number(ratio, 2)} of the stepper's time (tolerances {ours.tolerance:.0e}"
             f" and {theirs.tolerance:.0e}, errors {number(ours.largest, 2)} and"
-            f" {number(theirs.largest, 2)}; read off between tolerances at {WANTED:.0e} itself:"
-            f" 1/{number(between, 2)})"
+            f" {number(theirs.largest, 2)}{_at_wanted(between)})"
         )
     note = (
         f"At errors below {WANTED:.0e} of the range the exact way takes {'; '.join(said)}: of each"
