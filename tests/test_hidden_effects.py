@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.diagnosis.task import Method
 from psa_casadi.units import FloatArray
 from tests.benchmarks.hidden_cases import Case, Found, records_of, run_case
 from tests.plants.make import Truth, make_record
@@ -102,15 +103,18 @@ def test_clean_data_leave_the_diagnosis_silent(seed: int, tmp_path: Path) -> Non
 
 
 @slow
-def test_three_causes_are_found(tmp_path: Path) -> None:
-    """One by one, two of them are: what the step "several at once" is good for."""
+def test_three_causes_are_found_where_one_by_one_ends_with_two(tmp_path: Path) -> None:
     other = ("self_heating", "structural_mode")
     case = Case("three", "temperature", 205877, (1.0, 3.0), other)
     truth, records = records_of(case, tmp_path)
     few = [psa.EFFECTS[n] for n in LIKE_THREE]
-    found = psa.diagnose([r.slice(0, 4000) for r in records], effects=few)
+    found = psa.diagnose(records, effects=few)
     assert {c.effect for c in found.causes} == set(case.hidden)
     assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
+    method = Method(frozenset({"several at once"}))
+    one_by_one = psa.diagnose(records, effects=few, method=method)
+    assert one_by_one.extended_errors.holdout_rms_m > 1.1 * truth.sigma
+    assert {c.effect for c in one_by_one.causes} < set(case.hidden)
 
 
 @slow

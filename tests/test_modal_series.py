@@ -140,7 +140,7 @@ def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN
 @slow
 def test_several_modes_are_found_together_and_again_from_what_was_found() -> None:
     like = [psa.EFFECTS[n] for n in ("structural_mode", "drive_lag", "sensor_delay")]
-    more = [psa.EFFECTS[n] for n in ("slow_creep", "load_stiffness")]
+    more = [psa.EFFECTS[n] for n in ("hysteresis_memory", "slow_creep", "load_stiffness")]
     found = psa.diagnose([shaken_stack(11)], effects=[*like, *more])
     (cause,) = found.causes
     assert cause.effect.startswith("modal_series")

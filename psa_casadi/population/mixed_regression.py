@@ -56,9 +56,8 @@ class MixedFit:
 
     def interval(self, k: int = 0) -> tuple[float, float]:
         """Return the 95 % interval of a coefficient."""
-        half = float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, self.dof)) * float(
-            self.standard_errors[k]
-        )
+        wide = float(scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, self.dof))
+        half = wide * float(self.standard_errors[k])
         return float(self.b[k]) - half, float(self.b[k]) + half
 
     def significance(self, k: int) -> float:

@@ -29,18 +29,24 @@ def run(progress: Progress, quick: bool) -> Outcome:
     found = diagnose_all(study(KNOWN, FOREIGN, QUICK_SEEDS if quick else SEEDS, FIRST), progress)
     tables = result_tables(found)
     if not quick:
-        tables.append(limits_table(missed(found), progress))
+        lost = missed(found)
+        known = diagnose_all([f.case for f in lost], progress, only=True)
+        tables.append(limits_table(lost, known))
         tables.append(gain_table(KNOWN, FIRST, progress))
     return Outcome(tuple(tables), lambda: picture(found, KNOWN, FOREIGN))
 
 
 def diagnose_all(
-    cases: Sequence[Case], progress: Progress, method: Method | None = None
+    cases: Sequence[Case],
+    progress: Progress,
+    method: Method | None = None,
+    *,
+    only: bool = False,
 ) -> list[Found]:
-    """Diagnose the cases side by side."""
+    """Diagnose the cases side by side; with `only`, by a table of the right effect alone."""
     found: list[Found] = []
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [pool.submit(run_case, case, method) for case in cases]
+        jobs = [pool.submit(run_case, case, method, only=only) for case in cases]
         for job in as_completed(jobs):
             one = job.result()
             found.append(one)

@@ -147,9 +147,8 @@ def run_case(case: Case, method: Method | None = None, *, only: bool = False) ->
     """
     with tempfile.TemporaryDirectory() as folder:
         truth, records = records_of(case, Path(folder))
-    table = [e for e in EFFECTS.values() if case.kind != "left out" or e.name != case.right]
-    if only:
-        table = [EFFECTS[str(case.right)]]
+    left_out = case.right if case.kind == "left out" else None
+    table = [e for n, e in EFFECTS.items() if (n == case.right if only else n != left_out)]
     begin = time.process_time()
     d = diagnose(records, effects=table, method=method)
     return _found(case, d, truth, time.process_time() - begin)

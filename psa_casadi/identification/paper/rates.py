@@ -85,9 +85,8 @@ def window_of(loop: Loop) -> tuple[int, float]:
 
 
 def _gain(window: int, sample_time: float) -> float:
-    return float(
-        np.linalg.norm(scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=sample_time))
-    )
+    weights = scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=sample_time)
+    return float(np.linalg.norm(weights))
 
 
 def _filter(values: FloatArray, window: int, derivative: int, sample_time: float) -> FloatArray:

@@ -22,9 +22,8 @@ def filtered(
     if len(lower) == 1 or not x.size:
         return found
     bands = np.repeat(np.asarray(lower, dtype=float)[: len(x), None], len(x), axis=1)
-    recursive: FloatArray = scipy.linalg.lapack.dtbtrs(bands, found.reshape(len(x), -1), uplo="L")[
-        0
-    ].reshape(x.shape)
+    solved = scipy.linalg.lapack.dtbtrs(bands, found.reshape(len(x), -1), uplo="L")[0]
+    recursive: FloatArray = solved.reshape(x.shape)
     return recursive
 
 

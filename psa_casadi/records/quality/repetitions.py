@@ -96,9 +96,8 @@ def _candidates(voltage: FloatArray) -> list[int]:
         window = v[a : a + width]
         if float(np.ptp(window)) < 0.02 * span:
             continue
-        product = scipy.fft.irfft(spectrum * np.conj(scipy.fft.rfft(window, size)), size)[
-            : n - width + 1
-        ]
+        crossed = spectrum * np.conj(scipy.fft.rfft(window, size))
+        product = scipy.fft.irfft(crossed, size)[: n - width + 1]
         apart = (power + float(window @ window) - 2.0 * product)[a:] / width
         away = np.flatnonzero(apart > (0.02 * span) ** 2)
         if not away.size:
