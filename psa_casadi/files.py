@@ -87,6 +87,16 @@ def why_not_written(path: str | os.PathLike[str]) -> str | None:
     return None
 
 
+def why_not_read(error: Exception) -> str:
+    """Return in words why a file could not be read."""
+    if isinstance(error, FileNotFoundError):
+        return "there is no such file"
+    if isinstance(error, UnicodeDecodeError):
+        return "it is no text in UTF-8"
+    said = error.strerror if isinstance(error, OSError) else None
+    return said.lower() if said else str(error)
+
+
 def replace_durably(temporary: Path, target: Path) -> None:
     """Put a written file in the place of another, so that a power cut leaves one of them whole."""
     with temporary.open("rb+") as file:

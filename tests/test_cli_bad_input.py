@@ -95,7 +95,7 @@ def test_a_record_that_is_not_there(tmp_path: Path) -> None:
         said = refused(command, absent, "-o", out, outputs=tmp_path)
         assert "there is no such file" in said
         assert "is a directory" in refused(command, tmp_path, "-o", out, outputs=tmp_path)
-    assert "--output" in refused("identify", absent, outputs=tmp_path)
+    assert "--output" in refused("simulate", "--input", absent, outputs=tmp_path)
     assert "records" in refused("diagnose", "-o", out, outputs=tmp_path).lower()
 
 

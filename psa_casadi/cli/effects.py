@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.screen import EffectsOption, show, show_table, tell_written, width
 
 if TYPE_CHECKING:
@@ -14,7 +15,9 @@ if TYPE_CHECKING:
 
 
 def effects(
-    name: Annotated[str | None, typer.Argument(help="Name of one effect.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="Name of one effect.", autocompletion=names("effects"))
+    ] = None,
     figure: Annotated[
         Path | None,
         typer.Option(help="PNG picture of the effect's signature to write; needs NAME."),
@@ -22,10 +25,7 @@ def effects(
     modules: EffectsOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print names only.")] = False,
 ) -> None:
-    """List the effects that a diagnosis looks for; show one with equation, signature and source.
-
-    Example: psa effects slow_creep --figure creep.png
-    """
+    """List the effects that a diagnosis looks for; show one with equation, signature and source."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.effects.modal_series import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.screen import Quiet, show, show_table, tell_written, working
 
 if TYPE_CHECKING:
@@ -14,7 +15,10 @@ if TYPE_CHECKING:
 
 
 def examples(
-    name: Annotated[str | None, typer.Argument(help="Name of an example or a recipe.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Name of an example or a recipe.", autocompletion=names("examples")),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Folder for its files; it is created."),

@@ -14,6 +14,7 @@ from psa_casadi.cli.screen import (
     EffectsOption,
     HistoryOption,
     LicenseOption,
+    ModelOption,
     ModelVersionOption,
     PartOption,
     Quiet,
@@ -48,7 +49,7 @@ class Solver(StrEnum):
 
 def fmu(
     output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
+    model: ModelOption = None,
     stack: StackOption = None,
     part: PartOption = None,
     fmi: Annotated[FmiVersion, typer.Option(help="Version of the standard.")] = FmiVersion.TWO,

@@ -3,7 +3,7 @@
 import difflib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -133,10 +133,9 @@ class Given:
         known = known_effects(self.effects)
         for name in dict.fromkeys(left_out):
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-                meant = f"is '{near[0]}' meant? " if near else ""
                 self.add(
-                    f"--leave-out: there is no effect '{name}'; {meant}`psa effects` lists them."
+                    f"--leave-out: there is no effect '{name}'; {meant(name, known)}`psa effects`"
+                    " lists them."
                 )
         return tuple(c for n, c in known.items() if n not in left_out)
 
@@ -147,8 +146,9 @@ class Given:
         *,
         part: str | None = None,
         any_model: bool = False,
+        needed: bool = True,
     ) -> Model | None:
-        """Read a model, or compose a named stack or part; exactly one of them must be given.
+        """Read a model, or compose a named stack or part; one at most, and one where it is needed.
 
         With `any_model` the file need not hold a stack.
         """
@@ -163,7 +163,10 @@ class Given:
         if stack is not None:
             return self.attempt(lambda: stack_model(stack))
         if path is None:
-            self.add("No model is given; add --model MODEL.json, or --stack NAME (`psa stacks`).")
+            if needed:
+                self.add(
+                    "No model is given; add --model MODEL.json, or --stack NAME (`psa stacks`)."
+                )
             return None
         if any_model:
             return self.attempt(lambda: load_model(path, self.effects))
@@ -254,6 +257,12 @@ class Given:
                 f"{path}: cannot write, {path.resolve().parent} may not be written to; choose"
                 " another place."
             )
+
+
+def meant(word: str, known: Iterable[str]) -> str:
+    """Return the question whether the most similar of the known words is meant, or nothing."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"is '{near[0]}' meant? " if near else ""
 
 
 def step_seconds(text: str) -> float:

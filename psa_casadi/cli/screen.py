@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -12,6 +13,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from psa_casadi.characters import visible
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.steps import PLAIN, Course, Told
 
 if TYPE_CHECKING:
@@ -22,9 +24,24 @@ Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress and no summary; errors still show.")
 ]
 
+ModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--model", help="MODEL.json, as `psa identify`, `psa diagnose` and `psa design` write it."
+    ),
+]
+
+StartModelOption = Annotated[
+    Path | None, typer.Option("--model", help="MODEL.json whose values the fits start from.")
+]
+
 StackOption = Annotated[
     str | None,
-    typer.Option("--stack", help="Named stack in place of a model; `psa stacks` lists them."),
+    typer.Option(
+        "--stack",
+        help="Named stack in place of a model; `psa stacks` lists them.",
+        autocompletion=names("stacks"),
+    ),
 ]
 
 PartOption = Annotated[
@@ -33,6 +50,7 @@ PartOption = Annotated[
         "--part",
         help="Part around a stack, in place of a model: flexure_stage,"
         " position_controller, hysteresis_compensator, voltage_amplifier, charge_amplifier.",
+        autocompletion=names("parts"),
     ),
 ]
 
@@ -64,9 +82,7 @@ StillOption = Annotated[
 
 SampleTimeOption = Annotated[
     float | None,
-    typer.Option(
-        "--sample-time", help="Time from sample to sample \\[s], for files without a time."
-    ),
+    typer.Option("--sample-time", help="Time from sample to sample [s], for files without a time."),
 ]
 
 
@@ -100,11 +116,11 @@ SweepOption = Annotated[
     float,
     typer.Option(
         "--sweep",
-        help="Duration of each sweep of the history \\[s]; it matters to delta and creep.",
+        help="Duration of each sweep of the history [s]; it matters to delta and creep.",
     ),
 ]
 
-RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history \\[s].")]
+RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history [s].")]
 
 StartVoltageOption = Annotated[
     float | None,
@@ -152,8 +168,8 @@ OriginOption = Annotated[
 
 
 def width() -> int:
-    """Return the columns to write in: the terminal's up to 110, or 100 where there is none."""
-    return min(110, Console().width) if sys.stdout.isatty() else 100
+    """Return the columns to write in: the terminal's up to 110, or 80 where there is none."""
+    return min(110, Console().width) if sys.stdout.isatty() else 80
 
 
 @contextmanager
@@ -204,11 +220,12 @@ def show_table(table: "Table", quiet: bool = False) -> None:
     if quiet:
         return
     if not sys.stdout.isatty():
-        show(str(table))
+        show(table.fitted(width()))
         return
     drawn = RichTable(show_edge=False)
-    for name in table.head:
-        drawn.add_column(name, overflow="fold")
+    for name, *cells in zip(table.head, *table.rows, strict=True):
+        longest = max(map(len, " ".join((name, *cells)).split()), default=1)
+        drawn.add_column(name, overflow="fold", min_width=longest)
     styles = {"FAIL": "bold red", "pass": "green"}
     for row in table.rows:
         drawn.add_row(*(Text(visible(cell), style=styles.get(cell, "")) for cell in row))

@@ -140,7 +140,7 @@ def identification_text(
     tail += [("next", a.sentence) for a in found.advice]
     tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
     blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
-    blocks.append(str(parameter_table(found.model, found)))
+    blocks.append(parameter_table(found.model, found).fitted(width))
     blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
     return "\n\n".join(blocks)
 
@@ -155,7 +155,7 @@ def effect_page(effect: Component, width: int = 100) -> str:
         ("source", effect.source),
     ]
     body = "\n".join(labelled(label, text, width) for label, text in lines)
-    return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect)}"
+    return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect).fitted(width)}"
 
 
 def check_sentence(report: "CheckReport") -> str:
