@@ -1,8 +1,10 @@
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from build_scripts import copied_pages
 from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import Block, blocks_of, find_blocks, pages, run_blocks
 from psa_casadi.effects import EFFECTS
@@ -114,25 +116,40 @@ def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
     assert re.findall(r"`(\w+)`", row) == own
 
 
-#: Badges lead to pages of the repository's host.
-LINK = re.compile(r"\]\((?!https?:|\.\./\.\./actions/)([^)#]*)(#[^)]*)?\)")
-#: Pages in the menu: the build makes some of them (tutorials, recipes), and checks links to all.
-MENU = {
-    ROOT / "docs" / p for p in re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8"))
-}
+#: Links of Markdown and HTML; badges lead to pages of the repository's host.
+LINK = re.compile(
+    r"(?:\]\(|(?:src|href)=\")(?!\w+:|\.\./\.\./actions/)([^)#\"]*)(?:#([^)\"]*))?[)\"]"
+)
+#: Pages that are looked at on the repository's host, where no site has been built.
+LOOKED_AT = [
+    *pages(), *ROOT.glob("[A-Z]*.md"), *(ROOT / "psa_casadi" / "examples" / "recipes").glob("*.md")
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("page", pages(), ids=lambda p: p.name)
-def test_every_link_within_the_project_leads_somewhere(page: Path) -> None:
+def anchors(page: Path) -> set[str]:
+    """Return where a link may lead to within a page, as the repository's host names it."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    headings = (re.sub(r"\]\([^)]*\)", "", h) for h in re.findall(r"^#+ +(.*)$", text, re.M))
+    return {re.sub(r"[^\w -]", "", h.strip().lower()).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("page", sorted(set(LOOKED_AT)), ids=lambda p: p.name)
+def test_every_link_leads_to_a_file_of_the_repository(page: Path) -> None:
     for target, anchor in LINK.findall(page.read_text(encoding="utf-8")):
         there = (page.parent / target).resolve() if target else page
-        if there in MENU and not there.exists():
-            continue
         assert there.exists(), target
-        if anchor:
-            headings = re.findall(r"^#+ (.*)$", there.read_text(encoding="utf-8"), re.MULTILINE)
-            made = {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}
-            assert anchor[1:] in made, anchor
+        assert there.is_relative_to(ROOT.resolve()), target
+        assert not anchor or anchor in anchors(there), anchor
+
+
+def test_links_to_recipes_and_notebooks_lead_to_their_pages_in_the_site() -> None:
+    linked = "[a](../../psa_casadi/examples/recipes/fmpy.md#x) [b](../tutorials/ci.ipynb) c.ipynb"
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="howto/casadi.md"))
+    made = copied_pages.on_page_markdown(linked, page=page)
+    assert made == "[a](../howto/fmpy.md#x) [b](../tutorials/ci.md) c.ipynb"
+    recipes = {Path(t).stem for p in pages() for t, _ in LINK.findall(p.read_text("utf-8"))
+               if "examples/recipes" in t}  # fmt: skip
+    assert recipes <= set(copied_pages.RECIPES)
 
 
 def test_the_readme_is_short() -> None:
