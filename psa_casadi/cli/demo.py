@@ -111,17 +111,12 @@ def _prepared(named: Path | None, output: Path | None) -> tuple[Path, dict[str, 
     """Create the directory, check that every file can be written, copy the record to it."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.errors import InputError
-    from psa_casadi.files import atomic_write
+    from psa_casadi.files import atomic_write, make_folder
 
     if named is not None and output is not None:
         raise InputError(f"{named} and -o {output} name two directories; leave one of them out.")
     directory = named or output or Path("psa_demo")
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{directory}: cannot be created ({error.strerror}); name another directory."
-        ) from error
+    make_folder(directory)
     paths = {name: directory / name for name in FILES}
     given = Given()
     given.outputs(paths, [])

@@ -130,7 +130,9 @@ def experiment(
         "low": low, "high": high, "duration": duration, "samples": samples,
         "rate": rate, "current": current, "bandwidth": bandwidth,
     }  # fmt: skip
-    limits = given.attempt(lambda: design_given.limits(records, chosen, wanted))
+    limits = None
+    if records or not record:
+        limits = given.attempt(lambda: design_given.limits(records, chosen, wanted))
     given.check()
     if chosen is None or limits is None:
         return

@@ -31,6 +31,7 @@ def examples(
     """List examples and recipes; show one; with -o copy it to a folder and run an example there."""
     from psa_casadi.examples.index import copy_example, run_example
     from psa_casadi.examples.index import examples as known
+    from psa_casadi.files import make_folder
 
     found = _chosen(name, output, copy_only)
     if found is None:
@@ -42,7 +43,7 @@ def examples(
     if output is None:
         show(found.text.rstrip("\n"))
         return
-    _create(output)
+    make_folder(output)
     before = {p.name for p in output.iterdir()}
     written = copy_example(found, output)
     result: object = None
@@ -74,17 +75,6 @@ def _chosen(name: str | None, output: Path | None, copy_only: bool) -> "Example 
             given.add(f"There is no example or recipe named '{name}'; {meant}")
     given.check()
     return found
-
-
-def _create(folder: Path) -> None:
-    from psa_casadi.errors import InputError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be created ({error.strerror}); name another folder."
-        ) from error
 
 
 def _list(found: "Mapping[str, Example]") -> None:
