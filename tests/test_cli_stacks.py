@@ -10,13 +10,15 @@ from typer.testing import CliRunner, Result
 
 import psa_casadi
 from psa_casadi.cli.app import app
+from psa_casadi.cli.screen import show_table
+from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify
 from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.records import read_record, sine, time_grid, write_record
 from psa_casadi.report.page import playground_page
-from psa_casadi.report.words.tables import Table
+from psa_casadi.report.words.tables import Table, effects_table
 from psa_casadi.simulation.simulate import simulate_record
 from tests.record_files import HEADER, ROWS, write
 from tests.report_cases import identification
@@ -178,3 +180,17 @@ def test_a_table_has_the_width_that_there_is(width: int) -> None:
     if width == 80:
         assert str(table).splitlines() == lines
         assert lines[2] == "a_long_name  it goes on and on and on"
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_table_on_a_terminal_is_neither_cut_nor_too_wide(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
+    monkeypatch.setenv("COLUMNS", "80")
+    show_table(effects_table(EFFECTS.values()))
+    lines = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    words = {word for line in lines for word in line.split()}
+    assert set(EFFECTS) <= words
+    assert {w for e in EFFECTS.values() for w in e.looks_like.split()} <= words

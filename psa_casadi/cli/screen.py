@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -219,17 +220,19 @@ def show_table(table: "Table", quiet: bool = False) -> None:
     """Print a table: drawn on a terminal, in plain columns elsewhere."""
     if quiet:
         return
+    table = replace(table, rows=tuple(tuple(map(visible, row)) for row in table.rows))
     if not sys.stdout.isatty():
         show(table.fitted(width()))
         return
-    drawn = RichTable(show_edge=False)
-    for name, *cells in zip(table.head, *table.rows, strict=True):
-        longest = max(map(len, " ".join((name, *cells)).split()), default=1)
-        drawn.add_column(name, overflow="fold", min_width=longest)
+    console, drawn = Console(), RichTable(show_edge=False)
+    # two spaces in a column, a line between two of them
+    widths = table.widths(console.width - 3 * len(table.head) + 1)
+    for name, column in zip(table.head, widths, strict=True):
+        drawn.add_column(name, overflow="fold", width=column)
     styles = {"FAIL": "bold red", "pass": "green"}
     for row in table.rows:
-        drawn.add_row(*(Text(visible(cell), style=styles.get(cell, "")) for cell in row))
-    Console().print(drawn)
+        drawn.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+    console.print(drawn)
 
 
 def tell_written(*paths: object, quiet: bool = False) -> None:

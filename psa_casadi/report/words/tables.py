@@ -50,16 +50,9 @@ class Table:
     def fitted(self, width: float = math.inf) -> str:
         """Return the table in columns of plain text whose lines have `width` characters at most.
 
-        The widest columns are made narrower, and their cells go on in further lines. A word is cut
-        only where its column could not be there otherwise.
+        Cells go on in further lines where their column is narrower.
         """
-        columns = list(zip(self.head, *self.rows, strict=True))
-        widths = [max(map(len, column)) for column in columns]
-        least = [max(map(len, " ".join(column).split()), default=0) for column in columns]
-        while sum(widths) + 2 * (len(widths) - 1) > width and max(widths) > 1:
-            spare = [w if w > n else 0 for w, n in zip(widths, least, strict=True)]
-            widest = spare if any(spare) else widths
-            widths[widest.index(max(widest))] -= 1
+        widths = self.widths(width - 2 * (len(self.head) - 1))
         lines: list[str] = []
         for row in (self.head, tuple("-" * w for w in widths), *self.rows):
             cells = (
@@ -70,6 +63,21 @@ class Table:
                 padded = (part.ljust(w) for part, w in zip(line, widths, strict=True))
                 lines.append("  ".join(padded).rstrip())
         return "\n".join(lines)
+
+    def widths(self, room: float) -> list[int]:
+        """Return the characters of each column, which have `room` together.
+
+        The widest columns are made narrower. One becomes narrower than its longest word only where
+        no other way is left.
+        """
+        columns = list(zip(self.head, *self.rows, strict=True))
+        widths = [max(map(len, column)) for column in columns]
+        least = [max(map(len, " ".join(column).split()), default=0) for column in columns]
+        while sum(widths) > room and max(widths) > 1:
+            spare = [w if w > n else 0 for w, n in zip(widths, least, strict=True)]
+            widest = spare if any(spare) else widths
+            widths[widest.index(max(widest))] -= 1
+        return widths
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
