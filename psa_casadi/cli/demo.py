@@ -84,9 +84,11 @@ def demo(
         beside.submit(make_ready, d.model.plant())  # the check simulates with it
         save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
-        write_report(d, paths["report.html"], origin=_ORIGIN)
+        extended = str(paths["extended.json"])
+        write_report(d, paths["report.html"], origin=_ORIGIN, model_file=extended)
         save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
-    show(f"\n{story(d, origin=_ORIGIN, width=width())}\n\n{HIDDEN}\n", quiet)
+    told = story(d, origin=_ORIGIN, width=width(), model_file=extended)
+    show(f"\n{told}\n\n{HIDDEN}\n", quiet)
     with working("exporting and checking the FMU", quiet):
         exported.result()
         checked = check_fmu(paths["extended.fmu"], d.model)

@@ -170,7 +170,8 @@ def diagnose(
             place = following or _beside(json or report)
             d, unpatched = _finish(d, place, outputs, (origin.value, still), progress)
         with stage("writing"):
-            told = story(d, origin=origin.value, width=width())
+            path = None if output is None else str(output)
+            told = story(d, origin=origin.value, width=width(), model_file=path)
     show(told, quiet)
     _tell_files(d, outputs, unpatched, quiet)
     if timings:

@@ -76,10 +76,13 @@ def write(
     import psa_casadi as psa
     from psa_casadi.files import atomic_write
 
+    extended = None if outputs["--output"] is None else str(outputs["--output"])
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
         "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: psa.write_report(d, path, origin=origin, still=still),
+        "--report": lambda path: psa.write_report(
+            d, path, origin=origin, still=still, model_file=extended
+        ),
         "--figure": lambda path: psa.save_figure(d, path, origin=origin),
     }
     for option, path in outputs.items():

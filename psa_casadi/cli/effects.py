@@ -22,11 +22,16 @@ def effects(
         Path | None,
         typer.Option(help="PNG picture of the effect's signature to write; needs NAME."),
     ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="MODEL.json of the stack for which NAME's size is told."),
+    ] = None,
     modules: EffectsOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print names only.")] = False,
 ) -> None:
-    """List the effects that a diagnosis looks for; show one with equation, signature and source."""
+    """List the effects that a diagnosis looks for; show one: equation, signature, size, remedy."""
     from psa_casadi.cli.inputs import Given
+    from psa_casadi.diagnosis.remedy.size import example
     from psa_casadi.effects.modal_series import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.report.words.tables import effects_table
@@ -35,6 +40,7 @@ def effects(
     given = Given(modules)
     listed = known_effects(given.effects)
     known = {**listed, **{e.name: e for e in MODAL_SERIES.values()}}
+    stack = given.model(model)
     wanted = _known(given, name, list(known), figure)
     if wanted is None:
         if quiet:
@@ -44,7 +50,7 @@ def effects(
         return
     if figure is not None:
         _draw(known[wanted], figure)
-    show(wanted if quiet else effect_page(known[wanted], width()))
+    show(wanted if quiet else effect_page(known[wanted], width(), example(known[wanted], stack)))
     tell_written(figure, quiet=quiet)
 
 

@@ -77,6 +77,12 @@ class Document:
                 f'<div class="warnings" role="alert"><p>{word}</p>{_list(texts)}</div>'
             )
 
+    def advice(self, title: str, texts: Sequence[str], commands: Sequence[str]) -> None:
+        """Add a box that says what to do, and what to type."""
+        typed_text = "\n".join(commands)
+        block = f'<pre tabindex="0">{_text(typed_text)}</pre>' if commands else ""
+        self._parts.append(f'<div class="advice"><p>{_text(title)}</p>{_list(texts)}{block}</div>')
+
     def tiles(self, figures: Iterable[tuple[str, str, str]]) -> None:
         """Add the main figures in a row: label, figure, and a remark that may be empty."""
         cells = "".join(
