@@ -133,7 +133,7 @@ def test_an_undecided_cause_comes_with_its_rivals_remedy_and_the_design_of_a_rec
     assert "offset drift: let the sensor warm up" in rival
     assert RECORDS["record"] in rival
     assert advice.commands[-1].startswith(
-        "psa design experiment --model extended.json --separate slow_creep offset_drift -o"
+        "psa design experiment --model extended.json --record RECORD.csv --separate slow_creep "
     )
     assert "psa.save_model" in advice.beside[-1]
 

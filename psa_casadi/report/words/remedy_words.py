@@ -106,7 +106,9 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
     if open_ones and d.next_experiment.voltage_csv is None:
         first = open_ones[0]
         names = " ".join((first.effect, *first.cannot_be_told_from[:_RIVALS]))
-        commands.append(f"psa design experiment {model} --separate {names} -o NEXT.csv")
+        commands.append(
+            f"psa design experiment {model} --record RECORD.csv --separate {names} -o NEXT.csv"
+        )
     said = []
     if outside:
         names = listing([plain(c.effect) for c in outside])
