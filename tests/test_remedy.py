@@ -131,7 +131,7 @@ def test_an_undecided_cause_comes_with_its_rivals_remedy_and_the_design_of_a_rec
     advice = what_now(diagnosis("ambiguous"))
     (rival,) = [t for t in advice.beside if "does not decide" in t]
     assert "offset drift: let the sensor warm up" in rival
-    assert RECORDS["record"] in rival
+    assert f"{RECORDS['hold']} and {RECORDS['record']}" in rival
     assert advice.commands[-1].startswith(
         "psa design experiment --model extended.json --record RECORD.csv --separate slow_creep "
     )

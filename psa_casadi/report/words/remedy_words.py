@@ -139,7 +139,9 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
         known = [EFFECTS[n] for n in cause.cannot_be_told_from[:_RIVALS] if n in EFFECTS]
         each = [f"{plain(e.name)}: {_lower(DO[e.what_now.code])}" for e in known]
         if each:
-            shown = listing([RECORDS[t] for t in dict.fromkeys(e.what_now.test for e in known)])
+            own = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
+            tests = dict.fromkeys(e.what_now.test for e in (*own, *known))
+            shown = listing([RECORDS[t] for t in tests])
             lines.append(
                 f"The record does not decide; in the place of {plain(cause.effect)} it may be"
                 f" {'; or '.join(each)}. What decides: {shown}."
