@@ -14,6 +14,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import MODAL_SERIES
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Covariance, Evidence, SeenRange
+from psa_casadi.records import Record
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.words.phrases import handy_scale
 from psa_casadi.report.words.remedies import DO, RECORDS
@@ -83,6 +84,16 @@ def test_a_mode_is_heard_at_its_frequency() -> None:
     ratio = np.abs(1.0 + gain / (1.0 - f**2 + 2j * damping * f))
     assert first.value == pytest.approx(np.max(ratio), rel=1e-3)
     assert first.at == pytest.approx(frequency * f[np.argmax(ratio)], rel=2e-3)
+
+
+def test_a_model_without_records_to_play_has_no_size_of_them() -> None:
+    model = stack("offset_drift", drift_rate=1e-8)
+    assert sizes(EFFECTS["offset_drift"], model) == ()
+    t = np.linspace(0.0, 5.0, 501)
+    record = Record(name="r", time=t, voltage=10.0 * np.sin(t), displacement=0.0 * t)
+    largest, rms = sizes(EFFECTS["offset_drift"], model, [record])
+    assert largest.value == pytest.approx(5e-8, rel=1e-3)
+    assert rms.value == pytest.approx(np.std(1e-8 * t), rel=1e-3)
 
 
 def test_a_size_is_as_certain_as_the_parameters_of_the_effect() -> None:

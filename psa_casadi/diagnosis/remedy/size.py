@@ -53,6 +53,8 @@ def sizes(
         interval = _intervals(effect, model, found, lambda changed: test(changed, off, drive))
     except PsaError:
         return ()
+    if not np.isfinite([f.value for f in found]).all():
+        return ()
     return tuple(
         Size(
             f.test, f.value, f.unit or unit, within, f.at, f.at_unit, (drive.low, drive.high),
@@ -89,7 +91,7 @@ def _intervals(
     1.96 of which change them, within their bounds.
     """
     known = None if model.evidence is None else model.evidence.covariance.of(effect.fitted)
-    if known is None or not known.names:
+    if known is None or not known.names or effect.trial_starts:  # its starts share the gain's size
         return [None] * len(found)
     size, directions = np.linalg.eigh(np.array(known.matrix))
     moves = _NORMAL_95 * directions * np.sqrt(np.maximum(size, 0.0))

@@ -78,9 +78,9 @@ def _slew(sizes: Sequence[Size], length: Length) -> str:
     return f"at the fastest slew, {rate}/s, it amounts to {_amount(sizes[0], length)}"
 
 
-def _resonance(sizes: Sequence[Size], _: Length) -> str:
+def _resonance(sizes: Sequence[Size], length: Length) -> str:
     where = listing([number(s.at) for s in sizes])
-    times = listing([number(s.value) for s in sizes])
+    times = listing([_amount(s, length) for s in sizes])
     return f"at {where} Hz it makes the displacement {times} times as large"
 
 
