@@ -14,7 +14,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES
 from psa_casadi.report.page.playground_page import playground
 from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
-from psa_casadi.report.words.remedy_words import effect_advice
+from psa_casadi.report.words.remedy_words import effect_advice, effect_size
 from psa_casadi.report.words.tables import Table, effect_parameter_table
 
 PAGE, PICTURES = "effects.md", "pictures/effects"
@@ -77,7 +77,7 @@ def overview() -> Table:
 
 def section(effect: Component) -> str:
     """Return one effect in Markdown: what it is, equation, signature, what now, parameters."""
-    size, remedy, record = effect_advice(effect, *example(effect))
+    size, (remedy, record) = effect_size(effect, *example(effect)), effect_advice(effect)
     parts = [
         f"### `{effect.name}`",
         f"{_sentence(effect.description)}",

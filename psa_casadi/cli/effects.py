@@ -12,6 +12,8 @@ from psa_casadi.cli.screen import EffectsOption, show, show_table, tell_written,
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
+    from psa_casadi.diagnosis.remedy.size import Size
+    from psa_casadi.model.compose import Model
 
 
 def effects(
@@ -31,7 +33,6 @@ def effects(
 ) -> None:
     """List the effects that a diagnosis looks for; show one: equation, signature, size, remedy."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.diagnosis.remedy.size import example
     from psa_casadi.effects.modal_series import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.report.words.tables import effects_table
@@ -50,7 +51,7 @@ def effects(
         return
     if figure is not None:
         _draw(known[wanted], figure)
-    show(wanted if quiet else effect_page(known[wanted], width(), example(known[wanted], stack)))
+    show(wanted if quiet else effect_page(known[wanted], width(), _seen(known[wanted], stack)))
     tell_written(figure, quiet=quiet)
 
 
@@ -73,6 +74,17 @@ def _known(given: "Given", name: str | None, names: list[str], figure: Path | No
             given.add(f"There is no effect named '{name}'; {meant}")
     given.check()
     return wanted
+
+
+def _seen(effect: "Component", stack: "Model | None") -> "tuple[Model, tuple[Size, ...]] | None":
+    """Return how large an effect is on a stack, None where there is no compiler to simulate it."""
+    from psa_casadi.diagnosis.remedy.size import example
+    from psa_casadi.errors import MachineError
+
+    try:
+        return example(effect, stack)
+    except MachineError:
+        return None
 
 
 def _draw(effect: "Component", path: Path) -> None:

@@ -171,16 +171,19 @@ def _of_own(d: OdeDiagnosis) -> Advice:
     return Advice(lines, tuple(beside))
 
 
-def effect_advice(effect: Component, model: Model, sizes: Sequence[Size]) -> tuple[str, str, str]:
-    """Return how large an effect of a model is, what to do about it, and which record shows it."""
+def effect_size(effect: Component, model: Model, sizes: Sequence[Size]) -> str:
+    """Return how large an effect of a model is, with the size of its gain."""
     name = effect.gain or ""
     unit, display = shown_in(model, name)
     gain = with_unit(number(convert(model.values[name], unit, display), 2), display)
     size = size_text(sizes, handy_scale) or "it changes too little to be seen in its test"
-    remedy = effect.what_now
     stack = next((n for n in STACKS if re.sub(r"\W", "_", n) == model.name), "this model")
-    told = f"on {stack} with {name} = {gain}: {size}"
-    return told, DO[remedy.code], RECORDS[remedy.test]
+    return f"on {stack} with {name} = {gain}: {size}"
+
+
+def effect_advice(effect: Component) -> tuple[str, str]:
+    """Return what to do about an effect, and which record shows it."""
+    return DO[effect.what_now.code], RECORDS[effect.what_now.test]
 
 
 def _lower(text: str) -> str:

@@ -29,7 +29,7 @@ from psa_casadi.report.words.phrases import (
     scale_of,
     strongest_sentence,
 )
-from psa_casadi.report.words.remedy_words import effect_advice, what_now
+from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
 from psa_casadi.report.words.verdict_words import (
     VERDICTS,
@@ -173,9 +173,8 @@ def effect_page(
         ("signature", effect.looks_like),
         ("source", effect.source),
     ]
-    if seen is not None:
-        size, remedy, record = effect_advice(effect, *seen)
-        lines += [("how large", size), ("what now", remedy), ("record", record)]
+    lines += [("how large", effect_size(effect, *seen))] if seen is not None else []
+    lines += zip(("what now", "record"), effect_advice(effect), strict=True)
     body = "\n".join(labelled(label, text, width) for label, text in lines)
     return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect).fitted(width)}"
 
