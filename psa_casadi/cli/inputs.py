@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from psa_casadi.cli.screen import tell
 from psa_casadi.component import Component
 from psa_casadi.errors import InputError
 from psa_casadi.files import why_not_written
@@ -17,7 +18,7 @@ from psa_casadi.model.model_file import load_model
 from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record, read_record
+from psa_casadi.records import Record, read_record, read_records
 from psa_casadi.records.read.column_map import files_named, parse_columns
 from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.simulation.history import settled_at
@@ -70,23 +71,21 @@ class Given:
         if wanted is None:
             return []
         found: list[Record] = []
-        for path in (*paths, *held_out):
-            fitted = path in paths
-            # the loop's values are bound as defaults, whose types a lambda cannot state
-            record = self.attempt(
-                lambda p=path, f=fitted: read_record(  # type: ignore[misc]
-                    p, need_excitation=f, columns=wanted, sample_time=sample_time
-                )
+        for files, fitted in ((paths, True), (held_out, False)):
+            read = partial(
+                read_records, files, need_excitation=fitted, columns=wanted, sample_time=sample_time
             )
-            if record is None:
-                continue
-            twin = next((r for r in found if r.sha256 == record.sha256), None)
-            if twin is not None:
-                self.add(
-                    f"{path}: holds the same data as {twin.source}; a record counts once, and one"
-                    " that is held out cannot be fitted too: remove one of the two."
-                )
-            found.append(record)
+            for record in (self.attempt(read) if files else None) or ():
+                twin = next((r for r in found if r.is_same(record)), None)
+                if twin is not None:
+                    self.add(
+                        f"{record.source}: holds the same data as {twin.source}; a record counts"
+                        " once, and one that is held out cannot be fitted too: remove one of the"
+                        " two."
+                    )
+                found.append(record)
+                for note in record.notes:
+                    tell(f"Note: {note}")
         return found
 
     def voltage(

@@ -70,7 +70,8 @@ ColumnsOption = Annotated[
         "--columns",
         help="Which array of the file is which column, if the names differ:"
         " time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:"
-        " displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms",
+        " displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms; table=2 takes one"
+        " of several tables in a file, table=all each as a record.",
     ),
 ]
 
@@ -83,7 +84,7 @@ StillOption = Annotated[
 
 SampleTimeOption = Annotated[
     float | None,
-    typer.Option("--sample-time", help="Time from sample to sample [s], for files without a time."),
+    typer.Option("--sample-time", help="Time from sample to sample [s]; it goes before a file's."),
 ]
 
 

@@ -97,17 +97,25 @@ def samples_of(path: str, tables: Sequence[Table], request: Request) -> Outcome:
     """
     if not tables:
         raise InputError(f"{path}: holds no header and no data; export the record again.")
-    keys = {key: t for k, t in enumerate(tables, 1) for key in (str(k), t.name) if key}
+    parts = tables[1:] if tables[0].sizes and len(tables) > 1 else tables
+    keys = {key: t for k, t in enumerate(parts, 1) for key in (str(k), t.name) if key}
     wanted, _, segment = request.table.rpartition(".")
     if request.table in keys and (len(tables) > 1 or request.table == tables[0].name):
         return _of_one(keys[request.table], request, "")
     if wanted in keys:
         return _of_one(keys[wanted], request, segment)
     if request.table and len(tables) > 1:
-        names = ", ".join(f"'{_key(t, k)}'" for k, t in enumerate(tables, 1))
+        names = ", ".join(f"'{_key(t, k)}'" for k, t in enumerate(parts, 1))
         raise InputError(f"{path}: there is no table '{request.table}'; there are {names}.")
     whole = _of_one(tables[0], request, request.table)
-    return whole if len(tables) == 1 or whole.tables else _of_several(path, tables, request, whole)
+    if len(tables) == 1 or whole.tables or (parts != tables and (whole.is_read or request.columns)):
+        return whole  # of arrays all together are one record
+    found = {_key(table, k): _of_one(table, request, "") for k, table in enumerate(parts, 1)}
+    return (
+        _of_several(path, found)
+        if parts == tables or any(o.is_read for o in found.values())
+        else whole
+    )
 
 
 def _key(table: Table, number: int) -> str:
@@ -115,13 +123,8 @@ def _key(table: Table, number: int) -> str:
     return table.name if table.name and not MARKS.search(table.name) else str(number)
 
 
-def _of_several(path: str, tables: Sequence[Table], request: Request, first: Outcome) -> Outcome:
+def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
     """Return the samples of the only record among several tables, or list those that can be one."""
-    found = {_key(tables[0], 1): first}
-    if tables[0].sizes and (first.is_read or request.columns):  # all arrays of a file together
-        return first
-    for number, table in enumerate(tables[1:], 2):
-        found[_key(table, number)] = _of_one(table, request, "")
     read = [key for key, outcome in found.items() if outcome.is_read]
     if len(read) == 1:
         outcome = found[read[0]]
