@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
+from psa_casadi.cli.inputs import step_seconds
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
@@ -193,8 +194,30 @@ def test_the_command_writes_two_files_and_tells_the_error(tmp_path: Path) -> Non
     assert "step: 1e-05 s, 1 substep, double precision" in done.output
     assert "left out: sensor" in done.output
     assert f"{errors(base())['jumps']:.1e}" in done.output
-    wrong = CliRunner().invoke(app, [*arguments[:5], "3V", "-o", str(tmp_path / "code")])
-    assert wrong.exit_code != 0
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10us", 1e-5), ("1e-5s", 1e-5), (" 0.02 ms", 2e-5), ("50 ns", 5e-8)]
+)
+def test_a_step_has_its_unit(text: str, seconds: float) -> None:
+    assert step_seconds(text) == pytest.approx(seconds, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("10", r"'10', without a unit; type --step 10s or 10ms or 10us\.$"),
+        ("1e-5", "type --step 1e-5s or 1e-5ms"),
+        ("3V", "a unit of time, such as 10us"),
+        ("us", "a number with a unit"),
+        ("1.2.3us", "a number with a unit"),
+    ],
+)
+def test_the_unit_of_a_step_is_never_guessed(text: str, said: str) -> None:
+    with pytest.raises(psa.InputError, match=said):
+        step_seconds(text)
+    arguments = ["export", "c", "--stack", "P-885.51", "-o", "x", "--step", text]
+    assert CliRunner().invoke(app, arguments).exit_code == 2
 
 
 def limit(name: str) -> float:

@@ -265,7 +265,7 @@ def meant(word: str, known: Iterable[str]) -> str:
 
 
 def step_seconds(text: str) -> float:
-    """Return the time [s] of a step that is given as a number with a unit, s where it has none.
+    """Return the time [s] of a step that is given as a number with its unit; none is guessed.
 
     Raises InputError for anything else.
     """
@@ -274,7 +274,10 @@ def step_seconds(text: str) -> float:
         number = float(found["number"]) if found else 0.0
     except ValueError:
         found = None
-    unit = parse_unit(found["unit"] or "s", "time").name if found else ""
+    if found and not found["unit"].strip():
+        meant = " or ".join(f"{found['number']}{unit}" for unit in ("s", "ms", "us"))
+        raise InputError(f"--step is '{text}', without a unit; type --step {meant}.")
+    unit = parse_unit(found["unit"], "time").name if found else ""
     if unit not in units_of("time"):
         raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
     return float(to_si(number, unit))
