@@ -146,15 +146,22 @@ def test_a_start_voltage_is_at_rest() -> None:
     assert np.max(np.abs(held - first)) <= 1e-6 * first
 
 
-@pytest.mark.parametrize(
-    ("component", "reason"),
-    [(KINK, "kink of their own"), (JUMP, "equations jump"), (FEEDBACK, "voltage_reversal")],
-    ids=["kink", "jump", "feedback"],
-)
-def test_an_effect_that_does_not_fit_is_named(component: Component, reason: str) -> None:
-    model = compose((*BASE, component), stack("P-885.51").values)
-    with pytest.raises(psa.InputError, match=f"'{component.name}' does not fit.*{reason}"):
+def test_an_effect_that_does_not_fit_is_named() -> None:
+    model = compose((*BASE, JUMP), stack("P-885.51").values)
+    with pytest.raises(psa.InputError, match=r"'jump' does not fit.*equations jump"):
         fixed_step(model, name="stack", step=STEP)
+
+
+@pytest.mark.parametrize("component", [KINK, FEEDBACK], ids=lambda c: str(c.name))
+def test_what_kinks_or_feeds_back_to_the_hysteresis_is_stepped_as_a_whole(
+    component: Component,
+) -> None:
+    model = compose((*BASE, component), stack("P-885.51").values).plant()
+    found = fixed_step(model, name="stack", step=STEP, substeps=8)
+    assert all(0.0 < e <= 1e-3 for e in errors(found).values())
+    wave = 60.0 * (1.0 - np.cos(np.arange(901) / 70.0))
+    away = simulate(model.without([component.name]), STEP * np.arange(901), wave)
+    assert error(play(found, wave), away.outputs[OUTPUT][1:]) > 1e-2
 
 
 def test_a_clock_in_single_precision_is_refused() -> None:
@@ -162,9 +169,12 @@ def test_a_clock_in_single_precision_is_refused() -> None:
         fixed_step(with_effect("ageing"), name="stack", step=STEP, precision="single")
 
 
-def test_a_sampled_part_is_refused_as_a_whole() -> None:
-    with pytest.raises(psa.InputError, match=r"'position_controller'.*sampled states"):
-        fixed_step(psa.part_model("position_controller"), name="part", step=STEP)
+def test_a_sampled_part_acts_at_its_period() -> None:
+    part = psa.part_model("position_controller")
+    with pytest.raises(psa.InputError, match=r"sampled every 5e-05 s.*no multiple.*of 2\.5e-05 s"):
+        fixed_step(part, name="part", step=2e-5)
+    with pytest.raises(psa.InputError, match="sample instants; --hold zero"):
+        fixed_step(part, name="part", step=5e-5, hold="zero")
 
 
 @pytest.mark.parametrize(

@@ -152,6 +152,9 @@ def _state_fields(plan: CodePlan) -> list[str]:
         lines += [
             _field(real, f"low_of_{q.name}", f"{q.unit}, what rounding took") for q in s.states
         ]
+    lines += [_field(real, q.name, f"{q.unit}, {q.description}") for q in s.sampled]
+    if plan.every > 1:
+        lines.append("    int steps_to_instant;")
     lines += [
         _field(real, f"port_of_{q}", f"nonlinear part of the rate of {q}")
         for q in plan.expression.port_names
