@@ -6,6 +6,8 @@ the wanted force, `K w` of a wanted displacement w at the stiffness K, is solved
 steps. Every sample takes the same operations.
 """
 
+from dataclasses import replace
+
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.components.hysteresis_step import (
     TRACKED,
@@ -29,7 +31,11 @@ from psa_casadi.scales import voltage_scale
 from psa_casadi.variables import Input, Output, Parameter, State
 
 _LEARNING = ("lag", "memory", "standstill_rate", "noise", "spread")
-_OBSERVING = tuple(p for p in ONLINE_IDENTIFICATION.parameters if p.name not in _LEARNING)
+_OBSERVING = tuple(
+    replace(p, description=p.description.removeprefix("start of the "))
+    for p in ONLINE_IDENTIFICATION.parameters
+    if p.name not in _LEARNING
+)
 _FORCE = Output("hysteresis_force", "N", "estimated hysteresis force", force_scale)
 _VOLTAGE = Output("voltage", "V", "voltage at which the stack is where it is wanted", voltage_scale)
 _WANTED = Input("wanted", "m", "displacement that is wanted", 0.0, stroke, "um")
