@@ -19,13 +19,14 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
+from tests.test_fixed_step import STRICT
 from tests.tiers import slow_but
 
 FloatArray = NDArray[np.float64]
 PERIOD, SAMPLES = 1e-4, 40_000
 #: A machine of double precision adds in another order; one of single has 24 bits.
 ROUNDING = {"double": 1e-9, "single": 1e-5}
-FRAMES = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-Wframe-larger-than=4096")
+FRAMES = (*STRICT, "-Wframe-larger-than=4096")
 
 
 def code_of(model: Model, precision: str) -> FixedStep:

@@ -110,7 +110,7 @@ class Record(Plotted):
         )
 
     @property
-    def columns(self) -> dict[str, FloatArray]:
+    def recorded(self) -> dict[str, FloatArray]:
         """The columns that were recorded beside the time, by name, shape (n,) each."""
         there = {c: getattr(self, c) for c in ("voltage", *_OPTIONAL)}
         return {name: values for name, values in there.items() if values is not None}
@@ -127,7 +127,7 @@ class Record(Plotted):
 
     def to_frame(self) -> Any:
         """Return the columns as a pandas DataFrame, which `record_from` reads: `time [s]`, ..."""
-        return frame(with_units({"time": self.time, **self.columns}, self.units))
+        return frame(with_units({"time": self.time, **self.recorded}, self.units))
 
     @property
     def n(self) -> int:

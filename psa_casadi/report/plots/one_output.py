@@ -49,8 +49,8 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         name = _chosen(output, columns, result.shown)
         _curve(axes, result.time, columns[name], name, result.units.get(name, ""))
     elif isinstance(result, Record):
-        name = _chosen(output, result.columns, result.shown)
-        _curve(axes, result.time, result.columns[name], name, result.units[name])
+        name = _chosen(output, result.recorded, result.shown)
+        _curve(axes, result.time, result.recorded[name], name, result.units[name])
     elif isinstance(result, Posterior):
         by_name = {f.name: f for f in result.figures}
         draw_parameter(axes, result, by_name[_chosen(output, by_name, next(iter(by_name)))])
