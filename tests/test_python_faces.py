@@ -58,7 +58,7 @@ def test_a_missing_reading_of_a_frame_is_missing() -> None:
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"displacement [um]": X[:-1]}, "different lengths"),
+        ({"displacement [um]": X[:-1]}, "has 63 values"),
         ({"displacement [um]": ["a"] * 64}, "not all numbers"),
         ({"displacement [V]": X}, "displacement"),
         ({"time [ms]": T[::-1]}, "time"),

@@ -165,10 +165,6 @@ class Record(Plotted):
             )
         return float(np.nanmax(self.displacement) - np.nanmin(self.displacement))
 
-    def is_same(self, other: "Record") -> bool:
-        """Whether another record is the same samples of the same content."""
-        return self.sha256 == other.sha256 and np.array_equal(self.time, other.time)
-
     def slice(self, start: int, stop: int) -> "Record":
         """Return the samples `start <= k < stop`, counted as Python counts; `sha256` is kept.
 
