@@ -3,7 +3,6 @@
 import importlib
 import sys
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +62,7 @@ def _forget() -> None:
     own_effects.cache_clear()
     place.installed_effects.cache_clear()
     sys.modules.pop("gratings", None)
+    sys.modules.pop("rulings", None)
     importlib.invalidate_caches()
 
 
@@ -136,14 +136,57 @@ def test_its_fmu_carries_it_and_passes_the_check(ripple: Component, tmp_path: Pa
     assert report.passed, report.rows
 
 
-def test_installed_packages_announce_theirs(
-    ripple: Component, monkeypatch: pytest.MonkeyPatch
+def install(site: Path, text: str) -> None:
+    """Lay a package down as pip does, with the entry point that announces its effects."""
+    (site / "gratings-1.dist-info").mkdir(parents=True)
+    (site / "gratings.py").write_text(text)
+    (site / "gratings-1.dist-info" / "METADATA").write_text("Name: gratings\nVersion: 1\n")
+    (site / "gratings-1.dist-info" / "entry_points.txt").write_text(
+        f"[{place.GROUP}]\ngratings = gratings\n"
+    )
+
+
+@pytest.fixture
+def neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A current folder with files of the names of what is imported; each tells that it ran."""
+    here = tmp_path / "here"
+    here.mkdir()
+    tells = "from pathlib import Path; Path(__file__).with_suffix('.ran').touch()\n"
+    install(tmp_path / "site", "import rulings\n" + RIPPLE)
+    (tmp_path / "site" / "rulings.py").touch()
+    install(here, tells + RIPPLE)
+    (here / "rulings.py").write_text(tells)
+    monkeypatch.chdir(here)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    _forget()
+    yield here
+    _forget()
+
+
+@pytest.mark.parametrize("first", ["", "here", None])
+def test_installed_packages_announce_theirs_and_no_neighbour_stands_for_one(
+    first: str | None, neighbours: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry = EntryPoint("gratings", "gratings", place.GROUP)
-    monkeypatch.setattr(place, "entry_points", lambda group: [entry])
-    place.installed_effects.cache_clear()
-    assert known_effects()["encoder_ripple"] is ripple
+    if first is not None:  # as `python -m`, `python` and notebooks have it
+        monkeypatch.syspath_prepend(str(neighbours) if first else "")
+    before = list(sys.path)
+    assert "encoder_ripple" in known_effects()
     assert len(known_effects()) == len(EFFECTS) + 1
+    assert own_effects("gratings").keys() == {"encoder_ripple"}
+    assert not list(neighbours.glob("*.ran"))
+    assert sys.path == before
+
+
+def test_a_neighbour_stands_for_nothing_that_is_missing(
+    neighbours: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "site" / "gratings.py").unlink()
+    monkeypatch.syspath_prepend("")
+    with pytest.raises(psa.InputError, match=r"No module named 'gratings'"):
+        known_effects()
+    assert not list(neighbours.glob("*.ran"))
+    assert "encoder_ripple" in own_effects("gratings")  # it is asked for
+    assert (neighbours / "gratings.ran").is_file()
 
 
 @pytest.mark.parametrize(

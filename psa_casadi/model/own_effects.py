@@ -11,11 +11,13 @@ from, and whoever reads it must have named or installed that module.
 import hashlib
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from types import ModuleType
 
 import casadi as ca
@@ -33,13 +35,19 @@ GROUP = "psa_casadi.effects"
 
 @cache
 def own_effects(module: str) -> Mapping[str, Component]:
-    """Return the effects that a module holds, by name; the current folder is searched first.
+    """Return the effects that a named module holds, by name.
 
-    They are its variables that are a `Component` with a gain, or those of its mapping or sequence
-    `EFFECTS` where it has one. Raises InputError where the module cannot be imported, holds none,
+    It is an installed one, else one of the current folder. They are its variables that are a
+    `Component` with a gain, or those of its mapping or sequence `EFFECTS` where it has one. Raises InputError where the module cannot be imported, holds none,
     or holds one that does not fit beside the base model.
     """
-    found = _held_by(_imported(module), module)
+    return _effects_of(_imported(module, here=True))
+
+
+@cache
+def _effects_of(source: ModuleType) -> Mapping[str, Component]:
+    module = source.__name__
+    found = _held_by(source, module)
     problems, series = Problems(), {c.name: c for c in MODAL_SERIES.values()}
     for component in found:
         if component.name in {**COMPONENTS, **EFFECTS, **series}:
@@ -57,8 +65,10 @@ def own_effects(module: str) -> Mapping[str, Component]:
 @cache
 def installed_effects() -> Mapping[str, Component]:
     """Return the effects of installed packages that have the entry point; raises InputError."""
-    modules = sorted({e.value.partition(":")[0] for e in entry_points(group=GROUP)})
-    return {name: c for module in modules for name, c in own_effects(module).items()}
+    with _installed_only():
+        modules = sorted({e.value.partition(":")[0] for e in entry_points(group=GROUP)})
+    found = (_effects_of(_imported(module)) for module in modules)
+    return {name: c for effects in found for name, c in effects.items()}
 
 
 def known_effects(own: Iterable[Component] = ()) -> dict[str, Component]:
@@ -80,20 +90,37 @@ def declaration_hash(component: Component) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _imported(module: str) -> ModuleType:
-    here = os.getcwd()
-    sys.path.insert(0, here)
+@contextmanager
+def _installed_only() -> Iterator[None]:
+    """Leave the current folder out of where modules come from, as `python -P` does.
+
+    A file that lies there by chance, or that somebody else has put there, stands for no module.
+    """
+    before, here = list(sys.path), os.getcwd()
+    first = before[0] if before and not sys.flags.safe_path else None
+    sys.path[:] = [p for k, p in enumerate(before) if p and not (k == 0 and first == here)]
+    kept = list(sys.path)
     try:
-        return import_module(module)
-    except Exception as error:  # the user's own code may raise anything
-        raise InputError(
-            f"The module '{module}' with own effects cannot be imported"
-            f" ({type(error).__name__}: {error}); name it as in `import {module or 'effects'}`,"
-            " from the folder that holds it."
-        ) from error
+        yield
     finally:
-        if here in sys.path:
-            sys.path.remove(here)
+        sys.path[:] = [*before, *(p for p in sys.path if p not in (*kept, here))]
+
+
+def _imported(module: str, *, here: bool = False) -> ModuleType:
+    """Return an installed module; where there is none and `here`, one of the current folder."""
+    with _installed_only():
+        try:
+            top = module.partition(".")[0]
+            spec = None if top in sys.modules else find_spec(top)
+            if here and (spec is None or spec.origin is None):  # nothing, or a mere folder
+                sys.path.append(os.getcwd())
+            return import_module(module)
+        except Exception as error:  # the user's own code may raise anything
+            raise InputError(
+                f"The module '{module}' with own effects cannot be imported"
+                f" ({type(error).__name__}: {error}); name it as in `import {module or 'effects'}`,"
+                " from the folder that holds it."
+            ) from error
 
 
 def _held_by(module: ModuleType, name: str) -> list[Component]:
@@ -103,7 +130,12 @@ def _held_by(module: ModuleType, name: str) -> list[Component]:
     found = [c for c in candidates if isinstance(c, Component) and c.gain is not None]
     if not found:
         raise InputError(
-            f"The module '{name}' holds no effect: a variable that is a `Component` with a gain,"
+            f"The module '{name}'{_place(module)} holds no effect: a variable that is a `Component` with a gain,"
             " or a mapping EFFECTS of them."
         )
     return list(dict.fromkeys(found))
+
+
+def _place(module: ModuleType) -> str:
+    path = getattr(module, "__file__", None)
+    return f" ({path})" if path else ""
