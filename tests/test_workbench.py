@@ -1,7 +1,10 @@
 """The local page's rules: who may ask, how much is taken, one run at a time, an end for all."""
 
 import http.client
+import io
 import json
+import re
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,10 +13,13 @@ from urllib.parse import quote
 
 import pytest
 
+from psa_casadi.errors import InputError
 from psa_casadi.workbench.desk import Desk
+from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
 from psa_casadi.workbench.uploads import Limits, stored_name
 from tests.test_ended_commands import runs
+from tests.test_own_effects import RIPPLE, install
 
 SMALL = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k % 50) for k in range(100))
 
@@ -25,12 +31,14 @@ class Tab:
         self.server, self.port = server, server.gate.port
         self.cookie = ""
 
+    def headers(self, method: str) -> dict[str, str]:
+        own = {"Host": f"127.0.0.1:{self.port}", "Cookie": self.cookie}
+        return own | ({"Origin": f"http://127.0.0.1:{self.port}"} if method == "POST" else {})
+
     def ask(
         self, method: str, path: str, body: Any = None, **headers: str
     ) -> tuple[int, dict[str, str], bytes]:
-        own = {"Host": f"127.0.0.1:{self.port}", "Cookie": self.cookie}
-        if method == "POST":
-            own["Origin"] = f"http://127.0.0.1:{self.port}"
+        own = self.headers(method)
         named = {n.replace("_", "-"): v for n, v in headers.items()}
         data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
         line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
@@ -170,7 +178,7 @@ def test_a_second_tab_sees_the_same_run_and_starts_no_other(tab: Tab) -> None:
         time.sleep(0.02)
     assert run["number"] == 1
     assert run["events"][0]["causes"] == []
-    assert "--holdout b.csv --hysteresis=best --leave-out=slow_creep -o" in run["command"]
+    assert "--holdout records/b.csv --hysteresis=best --leave-out=slow_creep -o" in run["command"]
     (tab.server.desk.folder / "let_go").touch()
     state = other.until("done")
     assert state["result"]["verdict"] == "adequate"
@@ -234,4 +242,98 @@ def test_a_run_ends_with_the_server(tmp_path: Path) -> None:
     ],
 )
 def test_a_stored_name_has_no_path_and_no_mark(name: str, stored: str) -> None:
-    assert stored_name(name, lambda n: n == "taken.csv") == stored
+    assert stored_name(name, ["Taken.csv"]) == stored
+
+
+@pytest.mark.parametrize("name", ["extended_run.csv", "extended.json", "records", "report.html"])
+def test_no_name_of_a_file_is_one_of_a_result(name: str, tab: Tab) -> None:
+    desk = tab.server.desk
+    if name != "records":
+        (desk.folder / name).write_text("a result")
+    assert tab.give(name, SMALL) == 200
+    assert tab.give(name, SMALL) == 200
+    stem, dot, ending = name.partition(".")
+    assert [i["stored"] for i in tab.state()["items"]] == [name, f"{stem}_2{dot}{ending}"]
+    if name != "records":
+        assert (desk.folder / name).read_text() == "a result"
+
+
+def test_what_is_promised_and_does_not_come_takes_no_room(tab: Tab) -> None:
+    silent = []
+    for _ in range(3):  # as many files as there may be, and more bytes
+        line = http.client.HTTPConnection("127.0.0.1", tab.port, timeout=20)
+        line.putrequest("POST", "/files", skip_host=True)
+        for name, text in tab.headers("POST").items():
+            line.putheader(name, text)
+        line.putheader("Content-Length", "5000")
+        line.endheaders()
+        silent.append(line)
+    time.sleep(0.2)
+    assert tab.give("a.csv", b"x" * 4000) == 200
+    for line in silent:
+        line.close()
+
+
+def test_what_arrives_takes_room(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, [], limits=Limits(one=5000, together=8000))
+
+    class Slow(io.BytesIO):
+        def read(self, size: int | None = -1, /) -> bytes:
+            if self.tell():
+                with pytest.raises(InputError, match="with the other files"):
+                    desk.add("second.csv", io.BytesIO(b"x" * 4000), 4000)
+            return super().read(4500)
+
+    desk.add("first.csv", Slow(b"x" * 5000), 5000)
+    assert [p.name for p in (tmp_path / "records").iterdir()] == ["first.csv"]
+
+
+@pytest.mark.parametrize(
+    ("line", "body", "headers"),
+    [
+        ("GET http://[ HTTP/1.1", b"", {}),
+        ("POST http://[ HTTP/1.1", b"", {}),
+        ("GET /state HTTP/1.1", b"GET / HTTP/1.1\r\n\r\n", {"Host": "127.0.0.1"}),
+        ("POST /start HTTP/1.1", b"", {"Content-Length": "9" * 5000}),
+        ("POST /settings HTTP/1.1", b'{"leave_out": [[], 1]}', {}),
+        ("POST /settings HTTP/1.1", b'{"columns": {"a": "\xff\xfe"}}', {}),
+        ("POST /settings HTTP/1.1", b"5\r\nhello\r\n0\r\n\r\n", {"Content-Length": ""}),
+        ("POST /hold HTTP/1.1", b"null", {}),
+        ("PUT / HTTP/1.1", b"", {}),
+        ("nonsense", b"", {}),
+    ],
+)
+def test_every_request_is_answered(
+    line: str, body: bytes, headers: dict[str, str], tab: Tab
+) -> None:
+    all_ = {**tab.headers("POST"), "Content-Length": str(len(body)), **headers}
+    told = "".join(f"{n}: {t}\r\n" for n, t in all_.items())
+    with socket.create_connection(("127.0.0.1", tab.port), timeout=20) as way:
+        way.sendall(f"{line}\r\n{told}\r\n".encode() + body)
+        answers = b"".join(iter(lambda: way.recv(65536), b""))
+    assert len(re.findall(rb"HTTP/1.1 (4|501)|Error code: 400", answers)) == 1, answers
+    assert tab.ask("GET", "/state")[0] == 200
+
+
+def test_a_fault_of_the_page_is_an_answer(tab: Tab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tab.server.desk, "state", lambda *_: 1 / 0)
+    assert tab.ask("GET", "/state")[0] == 400
+    monkeypatch.setattr(tab.server.desk, "start", lambda: 1 / 0)
+    assert tab.post("/start") == 400
+
+
+def test_what_is_given_runs_in_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "desk"
+    folder.mkdir()
+    install(tmp_path / "site", "try:\n    import ruled\nexcept ImportError: pass\n" + RIPPLE)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    ran = tmp_path / "ran"
+    desk = Desk(folder, [])
+    for name in ("gratings", "ruled", "numpy", "matplotlibrc"):
+        data = f"open({str(ran)!r}, 'w')".encode()
+        desk.add(f"{name}.py", io.BytesIO(data), len(data))
+    told = Run(["effects", "encoder_ripple", "--effects=gratings"], folder, lambda: None)
+    while told.job.status == "running":
+        time.sleep(0.05)
+    assert (told.job.status, ran.exists()) == ("done", False), told.told()
+    assert sorted(p.name for p in folder.iterdir()) == ["records"]

@@ -37,9 +37,10 @@ GROUP = "psa_casadi.effects"
 def own_effects(module: str) -> Mapping[str, Component]:
     """Return the effects that a named module holds, by name.
 
-    It is an installed one, else one of the current folder. They are its variables that are a
-    `Component` with a gain, or those of its mapping or sequence `EFFECTS` where it has one. Raises InputError where the module cannot be imported, holds none,
-    or holds one that does not fit beside the base model.
+    It is an installed one, else one of the current folder. The effects are its variables that are a
+    `Component` with a gain, or those of its mapping or sequence `EFFECTS` where it has one. Raises
+    InputError where the module cannot be imported, holds none, or holds one that does not fit
+    beside the base model.
     """
     return _effects_of(_imported(module, here=True))
 
@@ -130,8 +131,8 @@ def _held_by(module: ModuleType, name: str) -> list[Component]:
     found = [c for c in candidates if isinstance(c, Component) and c.gain is not None]
     if not found:
         raise InputError(
-            f"The module '{name}'{_place(module)} holds no effect: a variable that is a `Component` with a gain,"
-            " or a mapping EFFECTS of them."
+            f"The module '{name}'{_place(module)} holds no effect: a variable that is a `Component`"
+            " with a gain, or a mapping EFFECTS of them."
         )
     return list(dict.fromkeys(found))
 

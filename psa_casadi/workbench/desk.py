@@ -20,7 +20,7 @@ from psa_casadi.workbench.uploads import (
     stored_name,
 )
 
-#: What begins the sentence that refuses what a run forbids.
+#: What is said of what a run forbids.
 BUSY = "A diagnosis runs; stop it first, or wait until it has ended."
 
 
@@ -45,6 +45,7 @@ class Item:
 class Desk:
     """Files, settings and the run in a folder; any thread may ask. `close` ends what runs.
 
+    What is given lies in a folder of its own, where nothing runs; runs leave theirs beside it.
     `effects` are the names that may be left out, `modules` those of a user's own effects.
     """
 
@@ -57,11 +58,13 @@ class Desk:
         module: str = runs.PSA,
     ) -> None:
         self.folder, self.effects, self.limits = folder, tuple(effects), limits or Limits()
+        self._records = folder / runs.RECORDS
+        self._records.mkdir()
         self._options = [word for name in modules for word in ("--effects", name)]
         self._module = module
         self._lock = threading.RLock()
         self._items: dict[int, Item] = {}
-        self._coming: dict[int, int] = {}
+        self._arrived: dict[int, int] = {}
         self._settings = Settings()
         self._run: Run | None = None
         self._export: Run | None = None
@@ -74,26 +77,41 @@ class Desk:
         with self._lock:
             self._idle()
             key, self._next = self._next, self._next + 1
-            together = sum(i.file.size for i in self._items.values()) + sum(self._coming.values())
-            if len(self._items) + len(self._coming) >= self.limits.files:
-                raise InputError(f"There are {self.limits.files} files already; remove one first.")
-            if size > self.limits.one or together + size > self.limits.together:
-                raise InputError(f"{shown_name(name)} is larger than may be.")
-            path = self.folder / stored_name(name, self._taken)
-            path_coming = path.with_name(f".{key}")
-            self._coming[key] = size
+            self._admit(key, name, size)
+        coming = self._records / f".{key}"
+
+        def arrive(count: int) -> None:
+            with self._lock:
+                self._admit(key, name, count)
+                self._arrived[key] = count  # what is promised takes no room from others
+
         try:
-            received(stream, size, path_coming)
+            received(stream, size, coming, arrive)
             with self._lock:
                 self._idle()
-                path = self.folder / stored_name(name, self._taken)
-                path_coming.rename(path)
+                self._admit(key, name, size)
+                taken = [i.file.path.name for i in self._items.values()]
+                path = self._records / stored_name(name, taken)
+                coming.rename(path)
                 self._items[key] = Item(Upload(key, shown_name(name), path, size))
                 self._changed()
         finally:
-            removed(path_coming)
-            self._coming.pop(key, None)
+            removed(coming)
+            with self._lock:
+                self._arrived.pop(key, None)
         self._look([key])
+
+    def _admit(self, key: int, name: str, size: int) -> None:
+        """Refuse a file of so many bytes that finds no room beside what is there and arrives."""
+        with self._lock:
+            there = sum(i.file.size for i in self._items.values())
+            there += sum(n for k, n in self._arrived.items() if k != key)
+            if len(self._items) >= self.limits.files:
+                raise InputError(f"There are {self.limits.files} files already; remove one first.")
+            if size > self.limits.one or there + size > self.limits.together:
+                raise InputError(
+                    f"{shown_name(name)} is larger than may be, by itself or with the other files."
+                )
 
     def remove(self, key: int) -> None:
         """Remove a file."""
@@ -203,8 +221,9 @@ class Desk:
             if item is None or item.is_model:
                 continue
             seen = preview(
-                item.file.path, settings.columns or None, settings.seconds, held=item.held
-            )
+                self.folder, item.file.path, settings.columns or None, settings.seconds,
+                held=item.held,
+            )  # fmt: skip
             with self._lock:
                 if self._items.get(key) == item and settings == self._settings:
                     self._items[key] = replace(item, seen=seen)
@@ -213,14 +232,6 @@ class Desk:
     def _idle(self) -> None:
         if self.running():
             raise BusyError
-
-    def _taken(self, name: str) -> bool:
-        lower = name.lower()
-        return (
-            lower in runs.RESERVED
-            or lower.startswith("extended_")
-            or any(i.file.path.name.lower() == lower for i in self._items.values())
-        )
 
     def _changed(self) -> None:
         with self._lock:

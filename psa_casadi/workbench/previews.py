@@ -26,16 +26,18 @@ _MODULE = "psa_casadi.workbench.previews"
 
 
 def preview(
-    path: Path, columns: str | None, sample_time: float | None, *, held: bool
+    folder: Path, path: Path, columns: str | None, sample_time: float | None, *, held: bool
 ) -> dict[str, Any]:
     """Return the head of a file, the problems that it is read with, and the record as a curve.
 
-    `columns` is the text of --columns, `sample_time` [s] that of --sample-time; a file that is
-    `held` out needs no voltage that changes.
+    `folder` is where the process runs that reads it: none that holds files of others. `columns` is
+    the text of --columns, `sample_time` [s] that of --sample-time; a file that is `held` out needs
+    no voltage that changes.
     """
-    asked = {"file": path.name, "columns": columns, "sample_time": sample_time, "held": held}
+    file = path.relative_to(folder).as_posix()
+    asked = {"file": file, "columns": columns, "sample_time": sample_time, "held": held}
     try:
-        with started_python(_MODULE, json.dumps(asked), directory=path.parent) as child:
+        with started_python(_MODULE, json.dumps(asked), directory=folder) as child:
             done = heard(child, limit=_LIMIT_S)
     except subprocess.TimeoutExpired:
         return _problem(f"{path.name}: reading it comes to no end; save it again.")

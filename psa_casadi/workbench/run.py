@@ -14,13 +14,14 @@ from psa_casadi.workbench.uploads import removed
 
 #: The module that is the command `psa` in a child.
 PSA = "psa_casadi.cli.child"
+#: The folder of the records, beside what a run leaves.
+RECORDS = "records"
 #: The files of a diagnosis, and of an export of its model.
 MODEL, JSON, REPORT, EVENTS, FMU = (
     "extended.json", "diagnosis.json", "report.html", "events.jsonl", "extended.fmu",
 )  # fmt: skip
 #: Names that what a diagnosis leaves may have beside these.
 _MORE = ("extended_*_for_*.json", "diagnosis_next.csv")
-RESERVED = (MODEL, JSON, REPORT, EVENTS, FMU, "diagnosis_next.csv")
 #: Letters of a text: of --columns for all files that may be given.
 _LONGEST = 8000
 _FORMS = ("", "bouc-wen", "spectrum", "best")
@@ -75,7 +76,7 @@ class Settings:
 
 
 class Run:
-    """A command that runs or has run in the folder of the files."""
+    """A command that runs or has run in the folder of its results, beside that of the records."""
 
     def __init__(
         self,
@@ -121,10 +122,11 @@ def diagnosis(
     records: Sequence[str], held: Sequence[str], model: str | None, settings: Settings
 ) -> list[str]:
     """Return the arguments of the command that diagnoses records by their names."""
-    kept = [word for name in held for word in ("--holdout", name)]
-    start = ["--model", model] if model else []
+    fitted = [f"{RECORDS}/{name}" for name in records]
+    kept = [word for name in held for word in ("--holdout", f"{RECORDS}/{name}")]
+    start = ["--model", f"{RECORDS}/{model}"] if model else []
     outputs = ["-o", MODEL, "--json", JSON, "--report", REPORT]
-    return ["diagnose", *records, *kept, *start, *settings.options(), *outputs]
+    return ["diagnose", *fitted, *kept, *start, *settings.options(), *outputs]
 
 
 def found(folder: Path) -> dict[str, Any] | None:

@@ -77,6 +77,31 @@ class _Handler(BaseHTTPRequestHandler):
         """Write no log: addresses have the token."""
 
     def do_GET(self) -> None:
+        self._guarded(self._get)
+
+    def do_POST(self) -> None:
+        self._guarded(self._post)
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Answer a request, also one that nobody has thought of."""
+        if "Transfer-Encoding" in self.headers or (
+            self.command == "GET" and "Content-Length" in self.headers
+        ):
+            self.close_connection = True  # a body that nobody reads is no request
+        try:
+            work()
+        except BusyError:
+            self._refuse(HTTPStatus.CONFLICT, BUSY)
+        except InputError as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+        except MachineError as error:
+            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        except TimeoutError:
+            self._refuse(HTTPStatus.REQUEST_TIMEOUT, "The request did not arrive whole.")
+        except Exception:  # noqa: BLE001 - whatever it holds, it is not what the page asks
+            self._refuse(HTTPStatus.BAD_REQUEST, "The request is not understood.")
+
+    def _get(self) -> None:
         parts = urlsplit(self.path)
         asked = {name: values[-1] for name, values in parse_qs(parts.query).items()}
         refused = self.server.gate.refused("GET", dict(self.headers))
@@ -103,7 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "There is nothing here.")
 
-    def do_POST(self) -> None:
+    def _post(self) -> None:
         gate, size = self.server.gate, self.headers.get("Content-Length", "")
         refused = gate.refused("POST", dict(self.headers))
         if refused is None and not gate.knows(dict(self.headers)):
@@ -113,14 +138,7 @@ class _Handler(BaseHTTPRequestHandler):
         if refused is not None:
             self._refuse(*refused)
             return
-        try:
-            self._do(urlsplit(self.path).path, int(size))
-        except BusyError:
-            self._refuse(HTTPStatus.CONFLICT, BUSY)
-        except InputError as error:
-            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
-        except MachineError as error:
-            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        self._do(urlsplit(self.path).path, int(size))
 
     def _do(self, path: str, size: int) -> None:
         desk = self.server.desk

@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
@@ -39,8 +39,8 @@ class Upload:
     size: int
 
 
-def stored_name(name: str, taken: Callable[[str], bool]) -> str:
-    """Return a name to store a file by: without paths and marks, and not taken yet.
+def stored_name(name: str, taken: Collection[str]) -> str:
+    """Return a name to store a file by: without paths and marks, and unlike those that are taken.
 
     The ending is kept, as it says how a file is read.
     """
@@ -49,11 +49,9 @@ def stored_name(name: str, taken: Callable[[str], bool]) -> str:
     stem, dot, ending = clean.rpartition(".")
     stem, ending = (stem, dot + ending) if dot else (ending, "")
     stem, ending = stem[:_LONGEST].rstrip(" ."), ending[:16]
-    found, k = f"{stem}{ending}", 1
-    while taken(found):
-        k += 1
-        found = f"{stem}_{k}{ending}"
-    return found
+    there = {n.casefold() for n in taken}
+    names = (f"{stem}{f'_{k + 1}' if k else ''}{ending}" for k in range(len(there) + 1))
+    return next(n for n in names if n.casefold() not in there)  # there is one more than are taken
 
 
 def shown_name(name: str) -> str:
@@ -61,23 +59,22 @@ def shown_name(name: str) -> str:
     return plain(visible(name))[: 2 * _LONGEST] or "record"
 
 
-def received(stream: BufferedIOBase, size: int, target: Path) -> None:
-    """Write so many bytes of a stream to a new file.
+def received(stream: BufferedIOBase, size: int, target: Path, admit: Callable[[int], None]) -> None:
+    """Write so many bytes of a stream to a new file; `admit` is asked with how many there are.
 
     Raises:
-        InputError: the stream ends before, or the file cannot be written; it is removed then.
+        InputError: the stream ends before, or the file cannot be written.
     """
     left = size
     try:
         with target.open("xb") as file:
             while left and (block := stream.read(min(left, _BLOCK))):
-                file.write(block)
                 left -= len(block)
+                admit(size - left)
+                file.write(block)
     except OSError as error:
-        target.unlink(missing_ok=True)
         raise InputError(f"The file cannot be kept ({error.strerror or error}).") from error
     if left:
-        target.unlink(missing_ok=True)
         raise InputError("The file did not arrive whole; give it again.")
 
 
