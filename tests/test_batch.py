@@ -33,8 +33,11 @@ from psa_casadi.model.model_file import load_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import write_record
 from psa_casadi.report.documents.findings import read_findings
+from psa_casadi.report.documents.identification_file import identification_file
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.strict_json import json_text
+from tests.report_cases import identification
 from tests.test_schemas import shipped
 from tests.tiers import slow
 
@@ -98,15 +101,15 @@ def test_two_devices_are_identified_and_the_third_does_not_stop_them(
 
 
 def stand_in(
-    monkeypatch: pytest.MonkeyPatch, work: Callable[[DeviceTask], None] = lambda task: None
+    monkeypatch: pytest.MonkeyPatch,
+    work: Callable[[DeviceTask], DeviceOutcome | None] = lambda task: None,
 ) -> list[str]:
     """Let the work on a device be something short in this process; return who was worked on."""
     seen: list[str] = []
 
     def worked(task: DeviceTask, began: float) -> DeviceOutcome:
         seen.append(task.job.device)
-        work(task)
-        return DeviceOutcome(task.job.device, "done", 0.0)
+        return work(task) or DeviceOutcome(task.job.device, "done", 0.0)
 
     monkeypatch.setattr(device, "_worked", worked)
     return seen
@@ -214,14 +217,31 @@ def test_what_failed_is_tried_again_and_what_was_refused_is_not(
     assert sorted(seen) == ["d0", "d1", "d1", "d2"]
 
 
-def test_a_damaged_result_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = stand_in(monkeypatch)
-    jobs = [t.job for t in tasks(tmp_path, 2)]
+def found(task: DeviceTask) -> DeviceOutcome:
+    text = json_text(identification_file(identification()))
+    return DeviceOutcome(task.job.device, "done", 0.0, files=(("identification.json", text),))
+
+
+@pytest.mark.parametrize("name", ["device.json", "identification.json"])
+@pytest.mark.parametrize("length", [0, 300, None])
+def test_a_damaged_result_is_named_and_made_again(
+    name: str, length: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, seen = tmp_path / "out", stand_in(monkeypatch, found)
+    jobs = [t.job for t in tasks(tmp_path, 5)]
     with ThreadPoolExecutor(1) as pool:
-        batch(jobs, tmp_path / "out", executor=pool)
-        (tmp_path / "out" / "d1" / "device.json").write_text("{")
-        assert batch(jobs, tmp_path / "out", executor=pool).kept == 1
-    assert seen == ["d0", "d1", "d1"]
+        assert len(batch(jobs, out, executor=pool).findings) == 5
+        whole = (out / "d1" / name).read_bytes()
+        # cut, or a digit is another one: still a file that can be read
+        other = whole.replace(b"1", b"2", 1) if name != "device.json" else b"{}"
+        (out / "d1" / name).write_bytes(other if length is None else whole[:length])
+        told = CliRunner().invoke(app, ["compare", str(out), "-o", str(tmp_path / "p.html")])
+        assert f"d1: failed: {out / 'd1' / name}: is damaged" in told.stdout
+        assert "d1" in (tmp_path / "p.html").read_text("utf-8")
+        again = batch(jobs, out, executor=pool)
+    assert (again.kept, again.counts, len(again.findings)) == (4, {"done": 5}, 5)
+    assert seen[5:] == ["d1"]
+    assert (out / "d1" / "identification.json").stat().st_size > 300
 
 
 def test_the_key_is_of_files_and_options(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """`psa batch`: many devices, each identified or diagnosed, results one by one."""
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
@@ -139,8 +140,13 @@ def _tell(done: "BatchRun", quiet: bool) -> None:
     counts = ", ".join(f"{n} {status}" for status, n in done.counts.items())
     kept = f"; {done.kept} of them were there before" if done.kept else ""
     show(f"{len(done.devices)} devices: {counts}{kept}.", quiet)
-    lost = [d for d in done.devices if d.status != "done"]
-    for d in lost[:_MOST_TOLD]:
-        show(f"  {d.device}: {d.status}: {' '.join(d.problems)}", quiet)
+    lost = [(d.device, d.status, " ".join(d.problems)) for d in done.devices if d.status != "done"]
+    tell_lost(lost, done.files[0], quiet)
+
+
+def tell_lost(lost: Sequence[tuple[str, str, str]], where: Path, quiet: bool) -> None:
+    """Name devices without a result: how their work ended, and why; `where` has them all."""
+    for device, status, why in lost[:_MOST_TOLD]:
+        show(f"  {device}: {status}: {why}", quiet)
     if len(lost) > _MOST_TOLD:
-        show(f"  ... and {len(lost) - _MOST_TOLD} more; {done.files[0]} has them all.", quiet)
+        show(f"  ... and {len(lost) - _MOST_TOLD} more; {where} has them all.", quiet)

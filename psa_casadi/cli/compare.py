@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from psa_casadi.cli.batch import tell_lost
 from psa_casadi.cli.screen import EffectsOption, Quiet, show, tell_written, working
 
 
@@ -42,6 +43,7 @@ def compare(
     with working("comparing", quiet):
         if len(files) == 1 and files[0].is_dir():
             found, lost = read_results(files[0], given.effects)
+            tell_lost(lost, output, quiet)
             shown = population(found)
             write_population(shown, output, without=lost)
             told = population_sentences(shown)

@@ -106,10 +106,10 @@ def batch(
             " on where it stopped."
         ) from None
     progress("writing the tables")
-    devices = tuple(ended[job.device] for job in given)
-    rows = list(results.findings(devices, effects))
+    rows = list(results.findings([ended[job.device] for job in given], effects))
     files = write_summary(results.folder, rows)
     found = tuple(f for _, f in rows if f is not None)
+    devices = tuple(told for told, _ in rows)
     return BatchRun(results.folder, devices, found, kept, time.monotonic() - began, files)
 
 

@@ -19,7 +19,13 @@ from psa_casadi.devices.task import DeviceOutcome, Options
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.population.finding import Finding
-from psa_casadi.report.documents.device_file import FORMAT, DeviceFile, DeviceRecord
+from psa_casadi.report.documents.device_file import (
+    FORMAT,
+    DeviceFile,
+    DeviceRecord,
+    damage,
+    hash_of,
+)
 from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding
 from psa_casadi.report.documents.read_document import read_document
 from psa_casadi.strict_json import json_text, parse_json, read_json_text
@@ -42,8 +48,8 @@ class Results:
         told = self.told(job.device)
         if told is None or told.key != key or told.status == "failed":
             return None
-        here = self.folder / job.device
-        return told if all((here / name).is_file() for name in told.files) else None
+        whole = len(told.sha256) == len(told.files) and not damage(self.folder / job.device, told)
+        return told if whole else None
 
     def told(self, device: str) -> DeviceFile | None:
         """Return how a device ended, None where that is not known."""
@@ -78,6 +84,7 @@ class Results:
             __version__,
             tuple(DeviceRecord(name, sha) for name, sha in outcome.records),
             tuple(name for name, _ in outcome.files),
+            tuple(hash_of(text.encode()) for _, text in outcome.files),
         )
         atomic_write(here / DEVICE_FILE, json_text(asdict(told)))
         return told
@@ -94,13 +101,19 @@ class Results:
     def findings(
         self, devices: Sequence[DeviceFile], effects: Sequence[Component] = ()
     ) -> Iterator[tuple[DeviceFile, Finding | None]]:
-        """Yield devices with what was found, None where nothing was or its files are damaged."""
+        """Yield devices with what was found, None where nothing was.
+
+        A device whose files are damaged has failed, with what is wrong among its problems.
+        """
         for told in devices:
-            try:
-                found = device_finding(self.folder / told.device, told, effects)
-            except (InputError, ValueError):
-                found = None
-            yield told, found if told.status == "done" else None
+            found = None
+            if told.status == "done":
+                try:
+                    found = device_finding(self.folder / told.device, told, effects)
+                except ValueError as error:
+                    yield replace(told, status="failed", problems=(str(error),)), None
+                    continue
+            yield told, found
 
 
 def read_results(
@@ -113,15 +126,20 @@ def read_results(
     """
     results = Results(folder)
     names = sorted(d.name for d in folder.iterdir() if (d / DEVICE_FILE).is_file())
-    devices = [told for name in names if (told := results.told(name)) is not None]
+    devices = {name: results.told(name) for name in names}
     if not devices:
         raise InputError(
             f"{folder}: holds no results of devices; give the folder that `psa batch` wrote to, or"
             " two files or more."
         )
-    rows = list(results.findings(devices, effects))
-    lost = ((d.device, d.status, " ".join(d.problems)) for d, f in rows if f is None)
-    return tuple(f for _, f in rows if f is not None), tuple(lost)
+    rows = list(results.findings([d for d in devices.values() if d is not None], effects))
+    unknown = [
+        (n, "failed", f"{folder / n / DEVICE_FILE}: is damaged; run `psa batch` again.")
+        for n, d in devices.items()
+        if d is None
+    ]
+    lost = [(d.device, d.status, " ".join(d.problems)) for d, f in rows if f is None]
+    return tuple(f for _, f in rows if f is not None), tuple(sorted(lost + unknown))
 
 
 def _make(folder: Path) -> None:

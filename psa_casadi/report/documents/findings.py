@@ -22,7 +22,7 @@ from psa_casadi.population.finding import (
 )
 from psa_casadi.population.replay import replayed
 from psa_casadi.report.documents.device_file import FORMAT as DEVICE
-from psa_casadi.report.documents.device_file import DeviceFile
+from psa_casadi.report.documents.device_file import DeviceFile, damage
 from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
 from psa_casadi.report.documents.identification_file import FORMAT as IDENTIFICATION
 from psa_casadi.report.documents.identification_file import IdentificationFile
@@ -75,7 +75,10 @@ def read_findings(
 def device_finding(
     folder: Path, told: DeviceFile, effects: Sequence[Component] = (), *, traces: bool = False
 ) -> Finding:
-    """Return the finding in a device's folder of `psa batch`."""
+    """Return the finding in a device's folder of `psa batch`; damage is an InputError."""
+    damaged = damage(folder, told)
+    if damaged:
+        raise InputError(damaged)
     (found,) = _joined([r for name in told.files for r in _read(folder / name, effects, traces)])
     day = date.fromisoformat(told.date) if told.date else None
     return replace(found.finding, device=told.device, batch=told.batch, day=day)
