@@ -294,6 +294,75 @@ def test_an_executor_that_takes_no_more_is_told(tmp_path: Path) -> None:
         list(outcomes(tasks(tmp_path, 1), pool, 1))
 
 
+def test_an_executor_that_is_lost_is_no_result_of_a_device(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(monkeypatch)
+    jobs = [t.job for t in tasks(tmp_path, 3)]
+
+    class Lost(ThreadPoolExecutor):
+        def submit(self, *given: Any, **more: Any) -> Future[Any]:
+            if given[1].job.device == "d0":
+                return super().submit(*given, **more)
+            future: Future[Any] = Future()
+            future.cancel()  # as a client of Dask does when its scheduler is gone
+            future.set_running_or_notify_cancel()
+            return future
+
+    out = tmp_path / "out"
+    with Lost(1) as pool, pytest.raises(MachineError, match="executor was lost"):
+        batch(jobs, out, executor=pool, at_once=1)
+    assert [p.name for p in out.iterdir()] == ["d0"]
+    with ThreadPoolExecutor(1) as other:
+        assert batch(jobs, out, executor=other).kept == 1
+
+
+@slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals cannot be sent to one process")
+def test_a_scheduler_that_is_lost_is_told_in_a_sentence(records: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    python = [sys.executable, "-m"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    there = tmp_path / "scheduler.json"
+    given = ["--scheduler-file", str(there), "--no-dashboard"]
+    parts = [
+        subprocess.Popen([*python, f"distributed.cli.dask_{part}", *given, *more], **quiet)  # type: ignore[call-overload]
+        for part, more in (("scheduler", ["--port", "0"]), ("worker", ["--nthreads", "1"]))
+    ]
+    try:
+        while not there.is_file():
+            time.sleep(0.1)
+        address = json.loads(there.read_text())["address"]
+        process = command(records, tmp_path / "out", "--dask", address)
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "done)" in line or "refused)" in line:
+                parts[0].kill()
+                break
+        _, told = process.communicate(timeout=60)
+    finally:
+        for part in parts:
+            part.kill()
+            part.wait()
+    assert process.returncode == 1
+    said = [row for row in told.splitlines() if row and not row.startswith("  batch,")]
+    assert len(said) == 1, told
+    assert said[0].startswith("Failed: The executor was lost (")
+
+
+@slow
+@pytest.mark.parametrize("address", ["junk", "tls://127.0.0.1:1"])
+def test_an_address_of_no_scheduler_is_told_in_a_sentence(
+    address: str, records: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed")
+    process = command(records, tmp_path / "out", "--dask", address)
+    _, told = process.communicate(timeout=35)
+    assert process.returncode == 1
+    assert told.splitlines()[1:] == [told.splitlines()[-1]]
+    assert f"The scheduler at {address} cannot be reached" in told
+
+
 def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
         raise ImportError(name)
@@ -349,10 +418,10 @@ def test_devices_are_diagnosed(records: Path, tmp_path: Path) -> None:
     assert 2e-9 < np.nanstd(error) < 5e-9  # 3 nm were put in
 
 
-def command(folder: Path, out: Path) -> "subprocess.Popen[str]":
+def command(folder: Path, out: Path, *more: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-m", "psa_casadi.cli", "batch", str(folder), "-o", str(out),
-         "--workers", "1"],
+         "--workers", "1", *more],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip

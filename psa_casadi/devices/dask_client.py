@@ -1,6 +1,8 @@
 """A client of Dask as an executor, loaded where it is asked for."""
 
+import asyncio
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -22,6 +24,8 @@ _OURS = {
     },
     "distributed.worker.profile.enabled": False,
 }
+#: What Dask logs, with tracebacks, of a scheduler that is lost; the work that is lost tells it.
+_SILENT = dict.fromkeys(("distributed", "distributed.client", "tornado.application"), "critical")
 
 
 @contextmanager
@@ -35,7 +39,9 @@ def dask_client(address: str, workers: int | None = None) -> Iterator[Any]:
         MachineError: the scheduler does not answer.
     """
     try:
-        distributed, config = import_module("distributed"), import_module("dask.config")
+        config = import_module("dask.config")
+        with config.set({"logging": _SILENT}):
+            distributed = import_module("distributed")
     except ImportError as error:
         raise InputError(
             "--dask needs Dask, which is not installed; run `pip install 'psa-casadi[dask]'`, or"
@@ -49,8 +55,10 @@ def dask_client(address: str, workers: int | None = None) -> Iterator[Any]:
                 )
         else:
             where = address
+            with ThreadPoolExecutor(1) as pool:  # a notebook has a loop of its own in this thread
+                pool.submit(asyncio.run, _reach(distributed, address)).result()
         client = distributed.Client(where, timeout=_PATIENCE, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise MachineError(
             f"The scheduler at {address} cannot be reached ({type(error).__name__}: {error}); see"
             " that `dask scheduler` runs there, and give its address, such as tcp://HOST:8786."
@@ -61,3 +69,10 @@ def dask_client(address: str, workers: int | None = None) -> Iterator[Any]:
         finally:
             if address == LOCAL:
                 where.close()
+
+
+async def _reach(distributed: Any, address: str) -> None:
+    """Raise what prevents a connection; a client that has not come about raises for 40 s more."""
+    security = distributed.Security().get_connection_args("client")
+    way = await distributed.comm.connect(address, timeout=_PATIENCE, **security)
+    await way.close()

@@ -8,7 +8,7 @@ mpi4py's.
 import queue
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, CancelledError
 from typing import Any, Protocol
 
 from psa_casadi.devices.device import stop, work_on
@@ -36,7 +36,7 @@ def outcomes(
     and what runs in this process stopped.
 
     Raises:
-        MachineError: the executor takes no more work.
+        MachineError: the executor takes no more work, or has lost what it had.
     """
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
     pending: dict[Any, tuple[DeviceTask, float]] = {}
@@ -84,10 +84,11 @@ def _outcome(future: Any, task: DeviceTask, began: float) -> DeviceOutcome:
     """Return how a device ended; a worker that was lost is the outcome of its device."""
     try:
         found = future.result()
-    except BrokenExecutor as error:
+    except (BrokenExecutor, CancelledError) as error:  # nobody here has cancelled it
+        why = (str(error) or type(error).__name__).partition("\n")[0].rstrip(".")
         raise MachineError(
-            f"A process of the executor died ({error}), and it takes no more work; what is done is"
-            " kept. Run the same again with a new one."
+            f"The executor was lost ({why}); what is done is kept, the same command goes on with"
+            " a new one."
         ) from error
     except Exception as error:  # noqa: BLE001 - a cluster may raise anything for a lost worker
         told = str(error) if isinstance(error, MachineError) else f"{type(error).__name__}: {error}"
