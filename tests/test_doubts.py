@@ -11,7 +11,6 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.start.doubts import (
     doubtful_sign,
-    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
     refuse_unusable,
@@ -19,6 +18,7 @@ from psa_casadi.identification.start.doubts import (
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
 from psa_casadi.identification.start.readings import refuse_few
+from psa_casadi.identification.start.time_unit import doubtful_time
 from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
@@ -57,7 +57,13 @@ def scaled(
         ({"v": 1e6}, "reaches 6e[+]07 V.* voltage is in uV, not V .*--columns voltage=NAME:uV"),
         ({"v": 1e-310}, "changes by 6e-309 V only: that drives no stack"),
         ({"v": 1e95}, "The voltage reaches 6e[+]96: that is no reading"),
-        ({"t": 1e12}, "Samples are 5e[+]09 s apart: the unit of time is probably another"),
+        ({"t": 1e12}, "takes .* s for its range .*in ns, not s .*--columns time=NAME:ns"),
+        ({"t": 1e9}, "takes .* s for its range .*in ns, not s .*--columns time=NAME:ns"),
+        ({"t": 1e6}, "takes .* s for its range .*in us, not s .*--columns time=NAME:us"),
+        ({"t": 1e-6}, "a stack that follows would move at .*in s, not us .*--columns time=NAME:s"),
+        ({"t": 1e-9}, "none can at more than 2 m/s.*in s, not ns .*--columns time=NAME:s"),
+        ({"t": 1e-20}, "none can at more than 2 m/s"),
+        ({"t": 1e-6, "y": 1e6}, "none can at more than 2 m/s"),
     ],
 )
 @pytest.mark.parametrize("command", [identify, diagnose])

@@ -25,6 +25,7 @@ from psa_casadi.identification.start.form import Hysteresis, forms_of
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.identification.start.other_quantities import refuse_wrapped
 from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
+from psa_casadi.identification.start.time_unit import refuse_other_time
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
@@ -139,6 +140,7 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]
     """
     refuse_still(records)
     refuse_wrapped(records)
+    refuse_other_time(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
     said = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]

@@ -19,7 +19,6 @@ from psa_casadi.identification.search.refitting import Progress, record_rms, ref
 from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.doubts import (
     doubtful_sign,
-    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
 )
@@ -29,6 +28,7 @@ from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
 from psa_casadi.identification.start.readings import refuse_few, refuse_still
+from psa_casadi.identification.start.time_unit import doubtful_time, refuse_other_time
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
@@ -118,6 +118,7 @@ def identify(
     given_records = records_given(records)
     refuse_still(given_records)
     refuse_wrapped(given_records)
+    refuse_other_time(given_records)
     parts, cut = without_gaps(given_records)
     ready = [prepared(r) for r in parts]
     fitted = [r for r, _ in ready]

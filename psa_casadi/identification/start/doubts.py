@@ -17,11 +17,8 @@ from psa_casadi.units import FloatArray
 ORDINARY_STROKE = (1e-9, 1e-4)
 #: Ordinary ranges of displacement [m] and voltage [V]: what a suggested unit must lead to.
 _STROKES, _SPANS = (2e-7, 2e-3), (5.0, 2000.0)
-#: Displacements [m] and voltages [V] that a model can start from; time between samples [s].
+#: Displacements [m] and voltages [V] that a model can start from.
 _USABLE_STROKES, _USABLE_SPANS = (1e-13, 0.1), (1e-3, 1e5)
-_SAMPLE_TIMES = (1e-8, 3600.0)
-#: Longest record [s].
-_LONGEST = 1e9
 #: So few samples are stray where all others are this much closer together.
 _STRAY, _APART = 3, 30.0
 #: A voltage this many times as large as its changes is an offset, whatever its unit.
@@ -47,8 +44,6 @@ def refuse_unusable(records: Sequence[Record]) -> None:
     if span == 0.0:
         raise InputError([_CONSTANT.format(records[0].voltage[0])])
     refuse_stuck(records)
-    if max(r.duration for r in records) > _LONGEST:
-        raise InputError([doubtful_time(records)])
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     stroke = max(r.range_m for r in records)
     counts = any(r.displacement_unit == "counts" for r in records)
@@ -162,18 +157,6 @@ def doubtful_voltage(records: Sequence[Record]) -> str:
         " probably is in millivolts, or holds the counts of a converter or an offset. Give it in"
         " volts, or its unit (--columns voltage=NAME:mV); what depends on the level of the voltage"
         " cannot be told so."
-    )
-
-
-def doubtful_time(records: Sequence[Record]) -> str:
-    """Say that samples are further apart, or closer together, than records of stacks have them."""
-    low, high = _SAMPLE_TIMES
-    step = next((r.sample_time for r in records if not low <= r.sample_time <= high), None)
-    if step is None:
-        return ""
-    return (
-        f"Samples are {step:.2g} s apart: the unit of time is probably another; correct it in the"
-        " header, or say which it is (--columns time=NAME:ms)."
     )
 
 

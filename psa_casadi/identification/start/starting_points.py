@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.loop import loop_start
@@ -27,7 +29,8 @@ def starting_points(
     shapes = _shapes(model, records, fewer=bool(linear))
     if not linear:
         return shapes
-    dynamics = _dynamics(model, linear, min(r.sample_time for r in records))
+    found = _dynamics(model, linear, min(r.sample_time for r in records))
+    dynamics = [_within_bounds(model, values) for values in found]
     named = [(name, _moved(model, shape, dynamics[0])) for name, shape in shapes]
     return named + [
         (f"dynamics {k}", _moved(model, shapes[0][1], other))
@@ -83,6 +86,12 @@ def _dynamics(
         slow_first.append(pair[0])
         turned.append(pair[1])
     return [*slow_first[:_DYNAMICS], turned[0]]
+
+
+def _within_bounds(model: Model, values: Mapping[str, float]) -> dict[str, float]:
+    """Return values within the bounds of the model's parameters: slow records have slow lags."""
+    bounds = {p.name: p.bounds for p in model.structure.parameters}
+    return {n: float(np.clip(v, *bounds[n])) for n, v in values.items()}
 
 
 def _creep_slowest(model: Model, values: Mapping[str, float]) -> dict[str, float]:
