@@ -17,7 +17,7 @@ from psa_casadi.export.check.task import Task
 class Here:
     """Runs a task in this process; it gets there as it gets to the other one."""
 
-    def rows(self, task: Task) -> list[CheckRow]:
+    def rows(self, task: Task, end: float) -> list[CheckRow]:
         """Return the rows of a task."""
         there = pickle.loads(pickle.dumps(task))
         with warnings.catch_warnings():

@@ -1,13 +1,16 @@
 """FMUs broken in one way each: the check must find every one, and name it."""
 
+import time
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from fmpy.validation import _validate_variable_names
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.check import agreement
+from psa_casadi.export.check import agreement, check, description
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.check import CheckReport, check_fmu
 from psa_casadi.export.check.description import misplaced_binaries
@@ -326,3 +329,48 @@ def test_no_fmu(tmp_path: Path) -> None:
         )
     with pytest.raises(InputError, match="export it again"):
         check_fmu(path)
+
+
+NAMES = [
+    "a", "_b1", "a.b[3].c", "a[1,2]", "der(a.b)", "der(a,2)", "'x y'.z", "'a b'[1]", "'?-~'", "",
+    "1a", "a b", "a.", "a[]", "a[1", "der(a", "der()", "ä", "a\n", "'", "''", "a..b", "a[b]", "'ä'",
+]  # fmt: skip
+
+
+def test_names_are_judged_as_by_the_grammar_of_fmpy() -> None:
+    made = SimpleNamespace(
+        variableNamingConvention="structured",
+        modelVariables=[SimpleNamespace(name=n, sourceline=1) for n in NAMES],
+    )
+    found = " ".join(_validate_variable_names(made))
+    assert [n for n in NAMES if not description._NAMES["structured"].fullmatch(n)] == [
+        n for n in NAMES if f'"{n}" (line 1) is not a legal' in found
+    ]
+
+
+def test_many_variables_take_little_time_each(tmp_path: Path) -> None:
+    """The grammar of fmpy took half a minute for them."""
+    kind = '" valueReference="9" variability="tunable" causality="parameter"><Real start="1"/>'
+    more = "".join(f'<ScalarVariable name="e_{k}{kind}</ScalarVariable>' for k in range(20_000))
+    more += f'<ScalarVariable name="no name{kind}</ScalarVariable>'
+    end = "</ModelVariables>"
+    path = rewritten(exported(STACK, 2), tmp_path / "m.fmu", {XML: _edit(end, more + end)})
+    with Archive(path) as archive:
+        begun = time.process_time()
+        found = list(description.invalid(archive))
+        assert time.process_time() - begun < 10.0
+    assert len(found) == 1
+    assert found[0].startswith("'no name' (line ")
+
+
+def test_the_time_of_a_check_is_that_of_all_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slowly(archive: Archive) -> tuple[str, ...]:
+        time.sleep(0.2)
+        return ()
+
+    monkeypatch.setitem(check._DESCRIBED, "functions present", slowly)
+    monkeypatch.setitem(check._DESCRIBED, "no other symbols", slowly)
+    report = check_fmu(exported(STACK, 2), timeout=0.3)
+    assert not report.passed
+    assert report.rows[-1].name == "time"
+    assert "time limit of 0.3 s of the whole check (--timeout sets it)" in report.rows[-1].remark

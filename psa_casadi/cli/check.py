@@ -41,9 +41,8 @@ def check(
     junit: JunitOption = None,
     effects: EffectsOption = None,
     timeout: Annotated[
-        float,
-        typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1, max=1e6),
-    ] = 300.0,
+        float, typer.Option(help="Seconds that the whole check may take.", min=0.1, max=1e6)
+    ] = 600.0,
     memory: Annotated[
         int,
         typer.Option(

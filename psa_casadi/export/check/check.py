@@ -2,11 +2,10 @@
 
 import os
 import secrets
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-from fmpy.validation import validate_fmu
 
 from psa_casadi.component import Component
 from psa_casadi.components.validity import OUTPUT as VALIDITY
@@ -14,6 +13,7 @@ from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import (
     inconsistent_units,
+    invalid,
     misplaced_binaries,
     missing_functions,
     missing_notices,
@@ -30,8 +30,8 @@ from psa_casadi.export.check.origin import (
     wrong_dependencies,
     wrong_start_values,
 )
-from psa_casadi.export.check.process import started
-from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, CheckRow, count
+from psa_casadi.export.check.process import OVERTIME, started
+from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, CheckRow, count, stopped
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
@@ -92,11 +92,11 @@ def check_fmu(
     With `evidence` the run of the model's evidence is played again, and so are those of `records`
     that stand behind it: is the error what the model states?
 
-    This runs the code of the FMU, in a process of its own: `timeout` [s] is what each check
-    may take, `memory` [bytes] what it may take beside Python's own, on Linux. However it ends,
-    its rows are kept, and the check that ran did not pass. It is no sandbox: files and network are
-    open to the code. An archive that would leave its folder, has links, is damaged or a bomb is not
-    unpacked, and nothing of it runs.
+    This runs the code of the FMU, in a process of its own: `timeout` [s] is what all checks
+    together may take, `memory` [bytes] what the code may take beside Python's own, on Linux.
+    However it ends, its rows are kept, and the check that ran did not pass. It is no sandbox: files
+    and network are open to the code. An archive that would leave its folder, has links, is damaged
+    or a bomb is not unpacked, and nothing of it runs.
 
     Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
     checks that mean nothing there.
@@ -108,6 +108,7 @@ def check_fmu(
     if not all(row.passed for row in rows):
         return CheckReport(path, tuple(rows), compared=False)
     chosen: list[Model] = [model] if model else []
+    end = time.monotonic() + timeout
     with requests_to_end_answered(), Archive(path) as archive:
         stated = stated_step(archive.directory)
         if stated is not None and (evidence or records):
@@ -117,7 +118,11 @@ def check_fmu(
             )
         carried = (archive.directory / MODEL_ENTRY).is_file()
         with started(_INTEGRATOR if model or carried else ()) as process:
-            rows += _described(archive, chosen, tuple(effects))
+            for row in _described(archive, chosen, tuple(effects)):
+                rows.append(row)
+                if time.monotonic() > end:
+                    rows.append(stopped("time", OVERTIME.format(timeout)))
+                    return CheckReport(path, tuple(rows), compared=False)
             truth = _truth(chosen[0], archive.version, stated) if chosen else None
             again = Repeated((), ())
             if evidence or records:
@@ -125,7 +130,7 @@ def check_fmu(
             rows += again.rows
             key, limits = secrets.token_bytes(32), Limits(timeout, memory)
             task = Task(path, archive.directory, truth, key, limits, again.playbacks)
-            rows += process.rows(task)
+            rows += process.rows(task, end)
     last = "start of a run" if stated else "equations"
     compared = any(row.name == last for row in rows)
     left_out = LEFT_OUT + (LEFT_OUT3 if archive.version == 3 else ())
@@ -160,7 +165,7 @@ def _described(
     archive: Archive, chosen: list[Model], effects: tuple[Component, ...]
 ) -> Iterator[CheckRow]:
     """Yield what the files say; `chosen` has the model, or gets the one inside, as exported."""
-    yield count("description valid", _invalid, archive)
+    yield count("description valid", invalid, archive)
     for name, check in _DESCRIBED.items():
         yield count(name, check, archive)
     if not chosen and (archive.directory / MODEL_ENTRY).is_file():
@@ -178,12 +183,6 @@ def _reproducible(archive: Archive, model: Model) -> CheckRow:
     """Return the row of the export made again; one that passes says what it did not compare."""
     row = count("reproducible", unreproducible_parts, archive, model)
     return replace(row, remark=not_compared(archive)) if row.passed else row
-
-
-def _invalid(archive: Archive) -> list[str]:
-    """Return what fmpy finds wrong with the description."""
-    found = validate_fmu(str(archive.directory))
-    return [" ".join(str(problem).split()) for problem in found]
 
 
 def _read_model(

@@ -25,8 +25,10 @@ _CHILD = "psa_casadi.export.check.child"
 OUTSIDE = "process ends"
 #: How often its memory is looked at [s], and from which share of the limit it counts as reached.
 _LOOK, _FULL = 0.02, 0.9
-#: How long a process may take to start [s].
-_START = 60.0
+#: What is said of checks that do not come to an end.
+OVERTIME = (
+    "did not come back within the time limit of {:g} s of the whole check (--timeout sets it)"
+)
 #: How long a process may live that cannot tell anything any more, and its pipes after its end [s].
 _LAST_WORDS = 2.0
 _CHUNK, _MOST_BYTES, _KEPT = 1 << 16, 1 << 24, 2048
@@ -42,8 +44,10 @@ class Process:
     _threads: list[threading.Thread] = field(default_factory=list)
     _group_ended: bool = False
 
-    def rows(self, task: Task) -> list[CheckRow]:
+    def rows(self, task: Task, end: float) -> list[CheckRow]:
         """Give it the task; return the rows it finished, and how it ended unless that was well.
+
+        `end` is when it ends at the latest, as `time.monotonic` tells it.
 
         Raises PsaError if it did not come as far as the code of the FMU.
         """
@@ -54,7 +58,7 @@ class Process:
         for thread in self._threads:
             thread.start()
         self._give(task)
-        problem = self._watched(reader, task)
+        problem = self._watched(reader, task, end)
         self.end()
         if not problem:
             return reader.rows
@@ -73,36 +77,31 @@ class Process:
         with suppress(OSError):
             pipe.close()
 
-    def _watched(self, reader: Reader, task: Task) -> str:
+    def _watched(self, reader: Reader, task: Task, end: float) -> str:
         """Read records until the process ends; return what was wrong, "" if nothing was."""
         try:
-            closed, full = self._followed(reader, task)
+            closed, full = self._followed(reader, end)
             reader.close()
         except SpoiltError as error:
             return f"the FMU disturbed the channel of the results: {error}"
         if self.process.poll() is None and closed:
             return "the FMU disturbed the channel of the results: it was closed"
         if self.process.poll() is None:
-            return (
-                f"the FMU did not come back within the time limit of {task.limits.timeout:g} s of a"
-                " check (--timeout sets it)"
-            )
+            return f"the FMU {OVERTIME.format(task.limits.timeout)}"
         full = full or reader.without_memory
         return self._ended(reader, f"{task.limits.memory / 2**20:.0f} MiB" if full else "")
 
-    def _followed(self, reader: Reader, task: Task) -> tuple[bool, bool]:
+    def _followed(self, reader: Reader, end: float) -> tuple[bool, bool]:
         """Read records up to the end of the process, of the pipe or of the time.
 
-        Return whether the pipe was closed, and whether the memory was full. Time counts from the
-        record before, and that of the first check from the one that comes before it.
+        Return whether the pipe was closed, and whether the memory was full.
         """
-        end, closed, full = time.monotonic() + _START, False, False
+        closed, full = False, False
         while time.monotonic() < end and not (closed and self.process.poll() is not None):
             full = full or nearly_full(self.process.pid, _FULL)
             chunk = self._chunk()
             if chunk:
                 reader.feed(chunk)
-                end = time.monotonic() + task.limits.timeout
             if self.process.poll() is not None:
                 self._end_group()
             if (chunk == b"" and not closed) or self.process.poll() is not None:

@@ -6,13 +6,13 @@ from pathlib import Path
 from psa_casadi.export.check.playback import Playback
 from psa_casadi.export.check.truth import Truth
 
-#: What foreign code may take unless told otherwise [s], [bytes].
-TIMEOUT, MEMORY = 300.0, 4 << 30
+#: What a whole check, and the foreign code in it, may take unless told otherwise [s], [bytes].
+TIMEOUT, MEMORY = 600.0, 4 << 30
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How long a check of the foreign code may take [s], and how much memory all of them [bytes].
+    """How long all checks may take [s], and how much memory the foreign code [bytes].
 
     Memory is limited on Linux only, and counts from what Python itself has when it starts.
     """
