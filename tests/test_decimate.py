@@ -1,16 +1,30 @@
 """Block averages keep what a fit could use, and are not taken where they would not."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
+from psa_casadi.identification import prepare
+from psa_casadi.identification.identify import identify
+from psa_casadi.identification.prepare import averaged
 from psa_casadi.records import Record, hold, read_record, sine, steps, time_grid, triangle
+from psa_casadi.records import excerpts as long_records
 from psa_casadi.records.decimate import decimated
+from psa_casadi.records.excerpts import MOST, PARTS, excerpts
 from psa_casadi.records.quality.fast_noise import fast_noise
+from tests.plants.base import simulate_base
+from tests.plants.stack import draw_stack
+from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
 SLOPE, NOISE = 1e-7, 1e-8
@@ -186,3 +200,71 @@ def test_fast_noise_is_the_white_part() -> None:
     assert fast_noise(np.sin(2 * np.pi * 500 * t)) == 0.0
     assert fast_noise(np.asarray(lfilter([1], [1, -0.9], white(13, t.size)))) < 1.0
     assert fast_noise(np.repeat([1.0, 2.0], 3)) == 0.0
+
+
+def night(n: int, rate: float = 100.0) -> Record:
+    """Slow loops with one minute of fast ones, and one of steps, late in a record."""
+    t = np.arange(n) / rate
+    v = 50.0 - 50.0 * np.cos(2.0 * np.pi * 0.05 * t)
+    fast, stepped = (t > 0.63 * t[-1]) & (t < 0.65 * t[-1]), (t > 0.83 * t[-1]) & (t < 0.85 * t[-1])
+    v[fast] = 50.0 - 30.0 * np.cos(2.0 * np.pi * 5.0 * t[fast])
+    v[stepped] = np.where(t[stepped] % 4.0 < 2.0, 20.0, 80.0)
+    return Record(name="night", time=t, voltage=v, displacement=curve(v) + NOISE * white(3, n))
+
+
+def test_parts_of_a_long_record_show_every_motion() -> None:
+    record = night(1_000_000)
+    parts, said = excerpts([record])
+    assert [p.n for p in parts] == [MOST // PARTS] * PARTS
+    assert parts[0].time[0] == record.time[0]
+    assert all(p.time[-1] < q.time[0] for p, q in pairwise(parts))
+    rates = [np.max(np.abs(np.diff(p.voltage) / np.diff(p.time))) for p in parts]
+    assert np.sum(np.array(rates) > 3000.0) == 1  # the steps
+    assert np.sum((np.array(rates) > 500.0) & (np.array(rates) < 3000.0)) == 1  # the fast loops
+    assert {p.sha256 for p in parts} == {record.sha256}
+    assert "of 1000000 samples 4 parts of 50000 are used" in said[0]
+    assert f"{parts[1].time[0]:.4g} s" in said[0]
+
+
+def test_short_records_stay_whole_beside_a_long_one() -> None:
+    short, long = night(30_000), night(500_000)
+    parts, said = excerpts([long, short])
+    assert parts[-1] is short
+    assert sum(p.n for p in parts) <= MOST
+    assert sum(p.n for p in parts[:-1]) > MOST - short.n - PARTS
+    assert len(said) == 1
+    assert excerpts([short]) == ([short], [])
+
+
+def test_a_long_record_that_is_oversampled_is_averaged_and_stays_whole() -> None:
+    record = loop(time_grid(100.0, 1e-4))
+    (small,), said = averaged([record])
+    assert small.n < MOST
+    assert small.duration == pytest.approx(record.duration, rel=1e-2)
+    assert "averaged in blocks" in said[0]
+
+
+@slow
+@pytest.mark.parametrize("command", [identify, partial(diagnose, effects=[EFFECTS["slow_creep"]])])
+def test_parts_give_the_answer_of_the_whole_record(
+    command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What all samples say lies within the interval that the parts state."""
+    n, rng = 24_000, np.random.default_rng(5)
+    t = np.arange(n) / 100.0
+    v = np.interp(t, np.linspace(0, t[-1], 40), rng.uniform(20, 50, 40)) * (1 - np.cos(1.3 * t))
+    stack = draw_stack(rng)
+    v *= 0.9 * stack.u_rated / np.max(v)
+    y = simulate_base(stack, t, v).displacement
+    y += 5e-4 * np.ptp(y) * rng.standard_normal(n)
+    record = Record(name="night", time=t, voltage=v, displacement=y)
+    whole = command([record])
+    monkeypatch.setattr(long_records, "MOST", 6_000)
+    monkeypatch.setattr(prepare, "MOST", 6_000)
+    parts = command([record])
+    said = parts.sentences if command is identify else parts.notes
+    assert any("parts of 1500 are used" in s for s in said)
+    told = parts.model.provenance.intervals
+    assert {"k_L", "A", "n"} <= set(told)
+    for name in ("k_L", "A", "beta", "n"):
+        assert told[name].low <= whole.model.values[name] <= told[name].high, name

@@ -16,6 +16,7 @@ from psa_casadi.diagnosis.thresholds import using
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished
+from psa_casadi.identification.prepare import averaged
 from psa_casadi.identification.search.forms import search_forms
 from psa_casadi.identification.search.measured_load import LOAD, is_measured, loads_as_curves
 from psa_casadi.identification.search.multistart import fit_base
@@ -30,6 +31,7 @@ from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
+from psa_casadi.records.excerpts import excerpts
 from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
@@ -90,8 +92,11 @@ def diagnose(
             judged = [cleaned(r) for r in apart]
             if "one clock" not in method.without:
                 clean, judged = _on_one_clock(clean, said), _on_one_clock(judged, said)
-            experiments = divided(clean, judged)
+            (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
             start, scale_given = chosen_start(clean, model, stiffness)
+            (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
+            said += [*means, *means_too, *long, *long_too]
+            experiments = divided(clean, judged)
             columns = columns_of(start, [e.record for e in experiments])
             experiments = with_levels(experiments, columns.fitted)
             start, preferred = _in_form(columns.model, hysteresis, experiments, progress)

@@ -32,6 +32,7 @@ from psa_casadi.identification.start.time_unit import doubtful_time, refuse_othe
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
+from psa_casadi.records.excerpts import excerpts
 from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
@@ -121,10 +122,12 @@ def identify(
     refuse_other_time(given_records)
     parts, cut = without_gaps(given_records)
     ready = [prepared(r) for r in parts]
-    fitted = [r for r, _ in ready]
-    said = [*cut, *(s for _, own in ready for s in own)]
+    every = [r for r, _ in ready]
+    fitted, long = excerpts(every)
+    known = {r.sha256: r for r in parts}
+    said = [*cut, *(s for _, own in ready for s in own), *long]
     refuse_few(given_records, fitted, said)
-    start, given = chosen_start(fitted, model, stiffness)
+    start, given = chosen_start(every, model, stiffness)
     columns = columns_of(start, fitted)
     forms = forms_of(columns.model, hysteresis)
     start = forms[0]
@@ -159,7 +162,7 @@ def identify(
                 experiments,
                 best.predicted(experiments),
                 by="psa identify",
-                sampled=parts,
+                sampled=[known[r.sha256] for r in fitted],
             )
             progress("what further records would tell")
             advised = advice(best, experiments, determined, force_scale_given=given)
