@@ -20,7 +20,7 @@ from psa_casadi.identification.prepare import averaged
 from psa_casadi.records import Record, hold, read_record, sine, steps, time_grid, triangle
 from psa_casadi.records import excerpts as long_records
 from psa_casadi.records.decimate import decimated
-from psa_casadi.records.excerpts import MOST, PARTS, excerpts
+from psa_casadi.records.excerpts import LEAST, MOST, PARTS, excerpts
 from psa_casadi.records.quality.fast_noise import fast_noise
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
@@ -234,6 +234,8 @@ def test_short_records_stay_whole_beside_a_long_one() -> None:
     assert sum(p.n for p in parts[:-1]) > MOST - short.n - PARTS
     assert len(said) == 1
     assert excerpts([short]) == ([short], [])
+    many = [night(LEAST + k) for k in range(12)]
+    assert [p.n for p in excerpts(many)[0][:2]] == [LEAST, LEAST // PARTS]
 
 
 def test_a_long_record_that_is_oversampled_is_averaged_and_stays_whole() -> None:
@@ -260,6 +262,7 @@ def test_parts_give_the_answer_of_the_whole_record(
     record = Record(name="night", time=t, voltage=v, displacement=y)
     whole = command([record])
     monkeypatch.setattr(long_records, "MOST", 6_000)
+    monkeypatch.setattr(long_records, "LEAST", 0)
     monkeypatch.setattr(prepare, "MOST", 6_000)
     parts = command([record])
     said = parts.sentences if command is identify else parts.notes

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import socket
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from urllib.parse import quote
 
 import pytest
 
+from psa_casadi.cli import web
 from psa_casadi.errors import InputError
 from psa_casadi.workbench.desk import Desk
 from psa_casadi.workbench.run import Run
@@ -337,3 +339,24 @@ def test_what_is_given_runs_in_no_command(tmp_path: Path, monkeypatch: pytest.Mo
         time.sleep(0.05)
     assert (told.job.status, ran.exists()) == ("done", False), told.told()
     assert sorted(p.name for p in folder.iterdir()) == ["records"]
+
+
+def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    there: list[list[str]] = []
+
+    def no_server(port: int, desk: Desk) -> None:
+        there.append([*sys.path])
+        raise InputError("no server")
+
+    monkeypatch.setattr("psa_casadi.workbench.server.served", no_server)
+    (tmp_path / "gratings.py").write_text(RIPPLE)
+    for first in ("", str(tmp_path)):
+        for modules in ([], ["gratings"]):
+            monkeypatch.setattr(sys, "path", [first, *sys.path])
+            with pytest.raises(InputError, match="no server"):
+                web._serve(0, True, modules)
+            here = [k for k, p in enumerate(there[-1], 1) if p in ("", str(tmp_path))]
+            assert here == ([len(there[-1])] if modules else [])

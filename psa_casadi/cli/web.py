@@ -98,8 +98,8 @@ def _serve(port: int, no_browser: bool, modules: list[str]) -> None:
 
     given = Given(modules)
     given.check()
-    if modules:
-        sys.path.append(str(Path.cwd()))  # where children look for them too
+    here = str(Path.cwd())  # children look for named modules there, and for nothing else
+    sys.path[:] = [p for p in sys.path if p not in ("", here)] + ([here] if modules else [])
     with temporary_folder() as place:
         folder = place / "files"
         folder.mkdir()

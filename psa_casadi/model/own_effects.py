@@ -98,8 +98,7 @@ def _installed_only() -> Iterator[None]:
     A file that lies there by chance, or that somebody else has put there, stands for no module.
     """
     before, here = list(sys.path), os.getcwd()
-    first = before[0] if before and not sys.flags.safe_path else None
-    sys.path[:] = [p for k, p in enumerate(before) if p and not (k == 0 and first == here)]
+    sys.path[:] = [p for k, p in enumerate(before) if p and not (k == 0 and p == here)]
     kept = list(sys.path)
     try:
         yield

@@ -12,8 +12,8 @@ from psa_casadi.records.stretches import stretches
 #: diagnosis 0.1 ms and 6 kB; with so many the intervals are a few parts in ten thousand, and what
 #: the model lacks is larger.
 MOST = 200_000
-#: Parts that stand for one record.
-PARTS = 4
+#: Parts that stand for one record, and the samples that it may have however many records there are.
+PARTS, LEAST = 4, 20_000
 #: What comes this close to the highest or the lowest voltage, over its range, reaches it.
 _REACHED = 2e-3
 
@@ -21,11 +21,11 @@ _REACHED = 2e-3
 def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     """Return the records with parts in place of those that are too long, and sentences on these.
 
-    All together have `MOST` samples at most, and every record its fair share of them. The parts of
-    a record are of equal length: its beginning, then in turn what shows the most kinds of stretch
-    (rises, falls and holds, see `stretches`) and ends of the voltage's range that the parts so far
-    do not, as far from these as it can be. A part begins as a record does, with a state that nobody
-    knows.
+    All together have `MOST` samples at most, and every record its fair share of them, at least
+    `LEAST`. The parts of a record are of equal length: its beginning, then in turn what shows the
+    most kinds of stretch (rises, falls and holds, see `stretches`) and ends of the voltage's range
+    that the parts so far do not, as far from these as it can be. A part begins as a record does,
+    with a state that nobody knows.
     """
     shares = _shares([r.n for r in records])
     found: list[Record] = []
@@ -52,7 +52,7 @@ def _shares(counts: Sequence[int]) -> list[int]:
     """Return how many samples each record may have: what short ones leave is the others'."""
     shares, left = [0] * len(counts), MOST
     for done, k in enumerate(sorted(range(len(counts)), key=lambda k: counts[k])):
-        shares[k] = min(counts[k], left // (len(counts) - done))
+        shares[k] = min(counts[k], max(LEAST, left // (len(counts) - done)))
         left -= shares[k]
     return shares
 
