@@ -99,6 +99,8 @@ def test_sign_and_time_are_doubted(given: tuple[FloatArray, FloatArray, FloatArr
     assert "the other way round" in doubtful_sign([scaled(given, y=-1.0)])
     assert not doubtful_time([scaled(given)])
     assert "(--columns time=NAME:ms)" in doubtful_time([scaled(given, t=1e6)])
+    fast = doubtful_time([scaled(given, t=1e-4)])
+    assert "few tests are above 0.1 m/s. The time is probably in s, not ms" in fast
     found = identify([scaled(given, y=-1.0)])
     assert "the other way round" in found.warnings[0]
 
