@@ -41,8 +41,8 @@ def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
         lasts = record.time[length] - record.time[0]
         said.append(
             f"{record.name}: of {record.n} samples {PARTS} parts of {length} are used, which begin"
-            f" at {places}: they have each kind of rise, fall and hold that fits into them. What is"
-            f" slower than a part, {lasts:.3g} s, is not told; give a record with fewer samples a"
+            f" at {places}: they have each kind of rise, fall and hold that fits into them, and"
+            f" tell nothing slower than a part, {lasts:.3g} s; give a record with fewer samples a"
             " second for that."
         )
     return found, said
