@@ -74,7 +74,8 @@ def started_python(
         MachineError: it cannot be started.
     """
     root = str(Path(__file__).resolve().parents[1])
-    paths = os.pathsep.join(os.path.abspath(p) for p in (*sys.path, root))
+    # without "", the current folder: a file that lies there stands for no module
+    paths = os.pathsep.join(os.path.abspath(p) for p in (*sys.path, root) if p)
     command = [sys.executable, "-P", "-m", module, *arguments]
     environment = {**os.environ, "PYTHONPATH": paths, **variables}
     with contextlib.ExitStack() as held:

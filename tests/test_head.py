@@ -100,6 +100,14 @@ def test_workbooks_and_parquet_files_have_the_same_head(tmp_path: Path) -> None:
         assert head.guess["voltage"] == Field(1, "V")
 
 
+def test_the_head_of_one_of_several_tables(tmp_path: Path) -> None:
+    path, two = text(tmp_path / "a.csv", "time [s],U [V],x [um]"), "Clock [ms],Drive [V],Probe [nm]"
+    path.write_text("\n".join([path.read_text(), "run 2", two, *ROWS, ""]))
+    assert head_of(path).tables == ("1", "2")
+    assert head_of(path).names == ("time", "U", "x")
+    assert head_of(path, table="2").units == ("ms", "V", "nm")
+
+
 @pytest.mark.parametrize("name", ["a.csv", "a.mat", "a.xlsx", "a.parquet", "a.npz"])
 def test_a_file_that_is_none_is_refused(name: str, tmp_path: Path) -> None:
     path = tmp_path / name

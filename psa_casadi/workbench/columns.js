@@ -11,6 +11,7 @@ desk.columns = (function () {
   function wanted(text, stored) {
     var found = {}, all = parts(text), own = all.filter(function (p) { return file(p) === stored; });
     (own.length ? own : all.filter(function (p) { return !file(p); })).forEach(function (part) {
+      if (/^\s*(?:[^=]*@)?table\s*=/.test(part)) { found['table='] = {column: '', table: part.split('=')[1].trim()}; return; }
       var m = /^\s*(?:[^=]*@)?([^=@]+)=([^:\[\]]+)(?::\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)?\s*(.*))?$/.exec(part);
       if (m) { found[m[2].trim()] = {column: m[1].trim(), scale: m[3] || '', unit: m[4] || ''}; }
     });
@@ -42,7 +43,7 @@ desk.columns = (function () {
 
   // Files of one layout share what is said; of several layouts, each part names its file.
   function apply(layout, chosen) {
-    var own = line(layout.head, chosen), all = own;
+    var own = (layout.table ? ['table=' + layout.table] : []).concat(line(layout.head, chosen)), all = own;
     if (layout.others) {
       all = parts(layout.text).filter(function (p) { return layout.stored.indexOf(file(p)) < 0; });
       layout.stored.forEach(function (name) { all = all.concat(own.map(function (p) { return name + '@' + p; })); });
@@ -74,7 +75,19 @@ desk.columns = (function () {
     return make('td', {}, what, unit, scale);
   }
 
+  // Which of several tables of the files is read; another one has other columns.
+  function which(layout, id) {
+    var one = make('select', {id: id + 'table', ariaLabel: 'Table of ' + layout.names.join(', ')});
+    [''].concat(layout.head.tables, ['all']).forEach(function (name) {
+      one.append(option(name, name === 'all' ? 'all, each a record' : name || 'which table?', name === layout.table));
+    });
+    one.onchange = function () { layout.table = one.value; apply(layout, []); };
+    return one;
+  }
+
   function table(layout, id) {
+    var said = wanted(layout.text, layout.stored[0])['table='];
+    layout.table = said ? said.table : '';
     var head = layout.head, chosen = choices(head, layout.text, layout.stored[0]), row = make('tr'), top = make('tr'), body = make('tbody');
     head.names.forEach(function (name, k) {
       top.append(make('th', {scope: 'col'}, (name || 'a name with a mark of --columns') + (head.units[k] ? ' [' + head.units[k] + ']' : '')));
@@ -88,7 +101,7 @@ desk.columns = (function () {
     });
     var use = make('button', {type: 'button', id: id + 'use'}, 'Read with these columns');
     use.onclick = function () { apply(layout, chosen); };
-    return make('div', {}, make('p', {className: 'note'}, layout.names.join(', ')),
+    return make('div', {}, make('p', {className: 'note'}, layout.names.join(', ') + ' ', head.tables.length ? which(layout, id) : ''),
       make('div', {className: 'scroll', tabIndex: 0, role: 'region', ariaLabel: 'First rows'},
         make('table', {className: 'mapping'}, make('thead', {}, top), body)), use);
   }
@@ -111,7 +124,7 @@ desk.columns = (function () {
   return function (items, text) {
     var layouts = {}, seen = items.filter(function (i) { return i.seen && i.seen.head; });
     seen.forEach(function (i) {
-      var key = JSON.stringify([i.seen.head.names, i.seen.head.units]);
+      var key = JSON.stringify([i.seen.head.names, i.seen.head.units, i.seen.head.tables]);
       layouts[key] = layouts[key] || {head: i.seen.head, names: [], stored: [], text: text};
       layouts[key].names.push(i.name);
       layouts[key].stored.push(i.stored);

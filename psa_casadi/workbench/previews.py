@@ -16,8 +16,9 @@ import numpy as np
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.records.read.apart import head_of
+from psa_casadi.records.read.column_map import TABLE, columns_of, parse_columns
 from psa_casadi.records.read.head import Head
-from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.read.reading import read_records
 from psa_casadi.records.record import Record
 
 #: Time [s] that a file may take, and the stretches a curve is drawn in.
@@ -57,9 +58,11 @@ def looked_at(
     """Return what `preview` returns of a file in this folder, read in this process."""
     head, problems, record = None, [], None
     try:
-        head = head_of(file)
-        record = read_record(
-            file, columns=columns, sample_time=sample_time, need_excitation=not held
+        wanted = parse_columns(columns) if columns else {}
+        chosen = columns_of(wanted, Path(file).name).get(TABLE)
+        head = head_of(file, table=chosen.array if chosen else "")
+        record, *_ = read_records(
+            [file], columns=wanted, sample_time=sample_time, need_excitation=not held
         )
     except InputError as error:
         problems = list(error.problems)
@@ -80,6 +83,7 @@ def _head(head: Head) -> dict[str, Any]:
         "units": head.units,
         "rows": head.rows,
         "guess": {name: [f.index, f.unit] for name, f in head.guess.items()},
+        "tables": head.tables,
     }
 
 

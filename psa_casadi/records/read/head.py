@@ -10,7 +10,7 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.choose import choose
 from psa_casadi.records.read.columns import Field
 from psa_casadi.records.read.names import stated_unit
-from psa_casadi.records.read.table import Cells, Table
+from psa_casadi.records.read.table import Cells, Table, parts_of_file
 
 #: The columns that a diagnosis needs; a cell that may be one of them is a guess worth showing.
 NEEDED = ("time", "voltage", "displacement")
@@ -49,8 +49,8 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -
     """Return the head of one of the tables of a file, of the first where none is named."""
     if not tables:
         raise InputError(f"{path}: holds no header and no data; export the record again.")
-    keys = tuple(t.name or str(k) for k, t in enumerate(tables, 1))
-    one = tables[keys.index(table)] if table in keys else tables[0]
+    parts = parts_of_file(tables)
+    one = parts.get(table, tables[0])
     choice = choose(one, NEEDED, {}, Problems())
     guess = dict(choice.fields)
     labels = list(one.labels)
@@ -62,7 +62,7 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -
     columns = [_texts(cells, count) for cells in one.glance]
     longest = max(map(len, columns), default=0)
     rows = tuple(tuple(c[k] if k < len(c) else "" for c in columns) for k in range(longest))
-    return Head(names, units, rows, guess, keys if len(keys) > 1 else ())
+    return Head(names, units, rows, guess, tuple(parts) if len(parts) > 1 else ())
 
 
 def _texts(cells: Cells, count: int) -> list[str]:

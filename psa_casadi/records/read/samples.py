@@ -18,10 +18,10 @@ from psa_casadi.records.checks import (
 )
 from psa_casadi.records.read import clock, words
 from psa_casadi.records.read.choose import Choice, choose
-from psa_casadi.records.read.column_map import ALL, MARKS
+from psa_casadi.records.read.column_map import ALL
 from psa_casadi.records.read.columns import ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.table import Cells, Columns, Table
+from psa_casadi.records.read.table import Cells, Columns, Table, parts_of_file
 from psa_casadi.units import FloatArray
 
 #: A sample time [s] to show where a file has no time.
@@ -97,30 +97,22 @@ def samples_of(path: str, tables: Sequence[Table], request: Request) -> Outcome:
     """
     if not tables:
         raise InputError(f"{path}: holds no header and no data; export the record again.")
-    parts = tables[1:] if tables[0].sizes and len(tables) > 1 else tables
-    keys = {key: t for k, t in enumerate(parts, 1) for key in (str(k), t.name) if key}
+    parts = parts_of_file(tables)
+    keys = {**{str(k): t for k, t in enumerate(parts.values(), 1)}, **parts}
     wanted, _, segment = request.table.rpartition(".")
     if request.table in keys and (len(tables) > 1 or request.table == tables[0].name):
         return _of_one(keys[request.table], request, "")
     if wanted in keys:
         return _of_one(keys[wanted], request, segment)
     if request.table and len(tables) > 1:
-        names = ", ".join(f"'{_key(t, k)}'" for k, t in enumerate(parts, 1))
+        names = ", ".join(f"'{key}'" for key in parts)
         raise InputError(f"{path}: there is no table '{request.table}'; there are {names}.")
     whole = _of_one(tables[0], request, request.table)
-    if len(tables) == 1 or whole.tables or (parts != tables and (whole.is_read or request.columns)):
+    is_part = tables[0] in parts.values()
+    if len(tables) == 1 or whole.tables or (not is_part and (whole.is_read or request.columns)):
         return whole  # of arrays all together are one record
-    found = {_key(table, k): _of_one(table, request, "") for k, table in enumerate(parts, 1)}
-    return (
-        _of_several(path, found)
-        if parts == tables or any(o.is_read for o in found.values())
-        else whole
-    )
-
-
-def _key(table: Table, number: int) -> str:
-    """Return what a table is called where it is chosen: its name, if `--columns` can say it."""
-    return table.name if table.name and not MARKS.search(table.name) else str(number)
+    found = {key: _of_one(table, request, "") for key, table in parts.items()}
+    return _of_several(path, found) if is_part or any(o.is_read for o in found.values()) else whole
 
 
 def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import Problems
+from psa_casadi.records.read.column_map import MARKS
 
 #: The cells of one column: numbers or instants (n,), or texts.
 Cells = NDArray[Any] | Sequence[str]
@@ -56,3 +57,13 @@ class Table:
         """The first rows of all columns."""
         found = self.load(range(len(self.header)), GLANCE, Problems())
         return [cells[:GLANCE] for cells in found.cells]
+
+
+def parts_of_file(tables: Sequence[Table]) -> dict[str, Table]:
+    """Return the tables of a file by what chooses them: the name, if `--columns` can say it.
+
+    All arrays of a file together, which come first, are no part of it.
+    """
+    parts = tables[1:] if tables[0].sizes and len(tables) > 1 else tables
+    names = [t.name if t.name and not MARKS.search(t.name) else "" for t in parts]
+    return {name or str(k): t for k, (name, t) in enumerate(zip(names, parts, strict=True), 1)}
