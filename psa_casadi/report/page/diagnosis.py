@@ -53,7 +53,7 @@ def write_report(
 
     `origin`, "measured" or "synthetic", is what the page calls the records. Unless it is to be
     `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
-    page is below 1.5 MB; where scripts are off it has one still picture. That of a model of one's
+    page is below 3 MB; where scripts are off it has one still picture. That of a model of one's
     own holds no model that runs.
 
     Raises InputError when `path` cannot be written to.
