@@ -72,11 +72,10 @@ def test_the_errors_of_a_page_have_one_unit(tmp_path: Path) -> None:
     )
     d.report(tmp_path / "a.html", still=True)
     text = Page((tmp_path / "a.html").read_text("utf-8")).text.replace("\u00a0", " ")
-    start = text.index("base model, held-out rms")
-    tiles = text[start : start + 400]
-    assert "2.50 µm" in tiles
-    assert "0.0500 µm" in tiles
-    assert " nm" not in tiles
+    start = text.index("Error on held-out samples")
+    bars = text[start : text.index("Dashed: the noise")]
+    assert "base model 2.50 µm extended model 0.0500 µm noise 0.00500 µm" in bars
+    assert " nm" not in bars
 
 
 def test_a_unit_of_a_page_ends_with_it() -> None:

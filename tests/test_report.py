@@ -29,7 +29,7 @@ from tests.tiers import slow
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 SENTENCES = {
     "adequate": "Nothing beyond the noise is missing",
-    "cause_named": "The cause is slow creep (plant, confidence 97 %)",
+    "cause_named": "The cause is slow creep (plant, confidence 97 %: extremely likely)",
     "partly_explained": "The closest known cause is slow creep",
     "ambiguous": "do not decide whether it is slow creep or offset drift",
     "unexplained": "no effect in the table explains",
@@ -115,7 +115,8 @@ def test_the_verdict_names_the_rival_of_a_later_cause_and_weights_as_what_they_a
     second = Cause(memory.name, "plant", 0.6, {"memory_threshold": size} |
                    dict.fromkeys(memory.linear, size), ("backlash",), 0.2)  # fmt: skip
     d = replace(d, causes=(*d.causes, second), model=d.model.with_effect(memory))
-    assert "hysteresis memory (plant, confidence 60 %; or backlash)" in verdict_sentence(d)
+    said = "hysteresis memory (plant, confidence 60 %: more likely than not; or backlash)"
+    assert said in verdict_sentence(d)
     said = cause_size(d, second)
     assert "memory_threshold = 0.100" in said
     assert said.endswith("9 weights, which shape its loop together")

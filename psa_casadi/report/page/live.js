@@ -215,7 +215,7 @@ psaLive.report = function (box, told, run) {
   [
     make('div', {className: 'bar'}, choice.concat(buttons, [status])), legend,
     make('div', {className: 'large'}, [figure(0)]), make('div', {className: 'pair'}, [figure(1), figure(2)]), output, budget, note
-  ].concat(knobs.nodes(function (p) { return p.free || p.interval; }, switches)).forEach(function (n) { box.appendChild(n); });
+  ].concat(knobs.nodes(function (p) { return p.determined; }, switches)).forEach(function (n) { box.appendChild(n); });
   choose();
   window.addEventListener('resize', later);
   window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', later);
