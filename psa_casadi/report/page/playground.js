@@ -18,7 +18,7 @@ psaLive.playground = function (box, told, run) {
   }
 
   // --- what is seen
-  var CAPTIONS = ['Voltage', 'Displacement', 'Loop: displacement over voltage', 'What the effects add', 'Current', 'Answer to a small step: gain over frequency'];
+  var CAPTIONS = ['Voltage', 'Displacement', 'Loop: displacement over voltage', 'What the effects add', 'Current', 'Gain over frequency, small steps'];
   var plots = CAPTIONS.map(function (caption) { return make('canvas', {role: 'img', 'aria-label': caption}); });
   var figures = plots.map(function (canvas, k) { return make('figure', {}, [make('figcaption', {text: CAPTIONS[k]}), canvas]); });
   var output = make('output', {}), status = make('span', {role: 'status'}), beyond = make('p', {className: 'warnings', role: 'alert', hidden: true});
@@ -228,8 +228,10 @@ psaLive.playground = function (box, told, run) {
     })] : [], [status]))
   ];
   bars.concat([about, make('p', {className: 'note', text: 'Draw over the voltage to change it.'}), beyond, legend,
-    make('div', {className: 'pair'}, figures.slice(0, 2)), make('div', {className: 'pair'}, figures.slice(2, 4)),
-    make('div', {className: 'pair'}, figures.slice(4)), output]).concat(nodes).forEach(function (n) { box.appendChild(n); });
+    psaLive.board([
+      make('div', {className: 'pair'}, figures.slice(0, 2)), make('div', {className: 'pair'}, figures.slice(2, 4)),
+      make('div', {className: 'pair'}, figures.slice(4)), output
+    ], plots[2], nodes)]).forEach(function (n) { box.appendChild(n); });
   setStack(0);
   told.effects.forEach(function (e, k) { // page.html#slow_creep begins with that effect
     if (decodeURIComponent(location.hash.slice(1)) !== e.name) { return; }
