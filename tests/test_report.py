@@ -16,7 +16,8 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport, CheckRow
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.plots.figure import save_figure
-from psa_casadi.report.words.phrases import length_scale, listing, number, share_text
+from psa_casadi.report.plots.finding_plots import evidence_plot
+from psa_casadi.report.words.phrases import length_scale, listing, number, plain, share_text
 from psa_casadi.report.words.residuals import noise_density, spectrum
 from psa_casadi.report.words.series import series_of, telling_window
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
@@ -134,6 +135,17 @@ def test_the_share_of_a_named_cause_among_several_is_told_beside_that_of_it_alon
     d = replace(d, budget=spent, causes=(*d.causes, hum))
     assert share_text(first, d) == "93 %; with others 60 %"
     assert share_text(d.candidates[2], d) == "0 % (screened)"
+
+
+def test_the_bars_of_named_causes_come_first_with_their_confidence() -> None:
+    d = diagnosis("partly_explained")
+    last = d.candidates[-1].effect
+    d = replace(d, causes=(*d.causes, replace(d.causes[0], effect=last, confidence=0.5)))
+    bars, figures_ = evidence_plot(d, 2).data
+    assert list(bars.y)[::-1] == [plain(n) for n in (d.candidates[0].effect, last)]
+    assert [t.split("; ")[1] for t in figures_.text][::-1] == ["named, 97 %", "named, 50 %"]
+    shares = evidence_plot(diagnosis("unexplained"), 2).data[1].text
+    assert not any("named" in t for t in shares)
 
 
 def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:
