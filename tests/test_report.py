@@ -77,6 +77,9 @@ def test_the_picture_has_its_size_and_shows_something(tmp_path: Path, verdict: V
     save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic")
     assert png_size(path) == (1600, 1000)
     assert path.stat().st_size > 50_000
+    save_figure(diagnosis(verdict, ("a", "b")), tmp_path / "n.png", origin="synthetic", narrow=True)
+    assert png_size(tmp_path / "n.png") == (720, 880)
+    (tmp_path / "n.png").unlink()
     assert [p.name for p in tmp_path.iterdir()] == ["d.png"]
 
 
