@@ -96,7 +96,8 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
         "The cause is hysteresis of x in v (the rate of v, confidence 99 %: virtually certain):"
         f" it removes {d.budget.together.percents[0]} % of the base" in page.text
     )
-    assert f"position: held-out rms {rms:.2f} µm" in page.text
+    assert "position: error on held-out samples, rms base model 160 µm" in page.text
+    assert f"extended model {rms:.2f} µm" in page.text
     rival = replace(d.causes[0], confidence=0.6, cannot_be_told_from=("stop_of_x",))
     said = "(the rate of v, confidence 60 %: more likely than not; or stop of x)"
     assert said in own_verdict_sentence(replace(d, causes=(rival,)))

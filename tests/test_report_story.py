@@ -256,7 +256,7 @@ def test_probabilities_are_in_table_and_bars_where_a_cause_is_named(tmp_path: Pa
     assert [row[-1] for row in table.rows] == ["91 %", "8 %", "< 1 %"]
     assert len(candidate_table(diagnosis("unexplained")).head) == 3
     text, page = page_of(diagnosis("cause_named"), tmp_path)
-    assert "1,250; 91 %" in text
+    assert "1,250; named, 97 %" in text
     assert "the probability that it is the cause" in page.text
     assert "1,250; 93 %" in page_of(diagnosis("unexplained"), tmp_path)[0]
     assert probability_text(1.0) == "> 99 %"

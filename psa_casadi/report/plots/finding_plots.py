@@ -157,7 +157,7 @@ def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Plo
         title_text="evidence [ln units], compressed",
         showticklabels=False,
         ticks="",
-        range=[min([0.0, *values]) * 1.1, 1.75 * largest],
+        range=[min([0.0, *values]) * 1.1, (2.3 if causes else 1.75) * largest],
     )
     plot.update_layout(showlegend=False)
     return plot.update_yaxes(showgrid=False, ticks="", automargin=True)
