@@ -13,7 +13,7 @@ PAGE = "commands.md"
 
 #: What is shortened with dots stands below in full.
 _SHORTENED = re.compile(r"^\*\*Commands\*\*:\n\n(?:\* .*\n)+\n?", re.MULTILINE)
-_EXAMPLE = re.compile(r"^Example: (psa .*)$", re.MULTILINE)
+_EXAMPLE = re.compile(r"^(?:\x08\n)?Example: (psa .*)$", re.MULTILINE)
 _TITLE = re.compile(r"\A# .*\n+")
 
 

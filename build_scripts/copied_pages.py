@@ -14,6 +14,9 @@ CHECKOUT = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"
 
 _NAMED_BLOCK = re.compile(r"^```(\w+) +(\S+)$", re.MULTILINE)
 _TITLE = re.compile(r"\A# .*\n")
+#: Links that lead to files of the checkout, which the site has as pages.
+_RECIPE_LINK = re.compile(r"\]\((?:\.\./)+psa_casadi/examples/recipes/(\w+\.md)")
+_NOTEBOOK_LINK = re.compile(r"(\]\([\w./]+)\.ipynb\b")
 
 
 def on_files(files: Files, *, config: Any, **_: Any) -> Files:
@@ -24,6 +27,12 @@ def on_files(files: Files, *, config: Any, **_: Any) -> Files:
         text = (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](")
         files.append(File.generated(config, page, content=text))
     return files
+
+
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Return the text of a page with its links to recipes and notebooks leading to their pages."""
+    up = "../" * page.file.src_uri.count("/")
+    return _NOTEBOOK_LINK.sub(r"\1.md", _RECIPE_LINK.sub(rf"]({up}howto/\1", markdown))
 
 
 def recipe_page(name: str) -> str:

@@ -8,11 +8,13 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.remedy.size import example
 from psa_casadi.diagnosis.residual.signature import signature
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES
 from psa_casadi.report.page.playground_page import playground
 from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
+from psa_casadi.report.words.remedy_words import effect_advice, effect_size
 from psa_casadi.report.words.tables import Table, effect_parameter_table
 
 PAGE, PICTURES = "effects.md", "pictures/effects"
@@ -74,12 +76,16 @@ def overview() -> Table:
 
 
 def section(effect: Component) -> str:
-    """Return one effect in Markdown: what it is, equation, signature, source, parameters."""
+    """Return one effect in Markdown: what it is, equation, signature, what now, parameters."""
+    size, (remedy, record) = effect_size(effect, *example(effect)), effect_advice(effect)
     parts = [
         f"### `{effect.name}`",
         f"{_sentence(effect.description)}",
         "```text\n" + effect.equation_text.replace(",  ", "\n") + "\n```",
         f"*What it looks like*: {_sentence(effect.looks_like)}",
+        f"*How large*: {_sentence(size)}",
+        f"*What now*: {_sentence(remedy)}",
+        f"*Record that shows it*: {_sentence(record)}",
         f"*Source*: {_sentence(effect.source)}",
         markdown_table(effect_parameter_table(effect)),
     ]

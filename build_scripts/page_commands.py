@@ -1,16 +1,18 @@
-r"""Run the commands that README.md and the pages in `docs/` show: what a reader sees is executed.
+r"""Run the code that README.md and the pages in `docs/` show: what a reader sees is executed.
 
-Executable are the lines that begin with `$ ` in a fenced block marked `console`. Lines that end in
-a backslash go on in the next one; all other lines are output and are left alone. Each block runs
-in an empty directory of its own, with the checkout's environment first in PATH, two blocks side by
-side; what a command says is shown when it has ended. A comment on its own line before a block
-changes that:
+Executable are fenced blocks marked `console` (their lines that begin with `$ `; those that end in a
+backslash go on in the next one, all others are output and are left alone), `python` (a program) and
+`c` (statements of a program that is compiled with the C files of the folder). Each block runs in an
+empty directory of its own, with the checkout's environment first in PATH, two blocks side by side;
+what a command says is shown when it has ended. A comment on its own line before a block changes
+that:
 
-    <!-- run: skip -->        the block is not run (installation, for example)
+    <!-- run: skip, WHY -->   the block is not run (it installs something, it never ends)
     <!-- run: in-tests -->    the block is run by a test, which looks at what it leaves besides
     <!-- run: needs-data -->  the block runs where the measured records are, in $PSA_CASADI_DATA
     <!-- run: continue -->    the block runs in the directory of the block before it
-    <!-- run: python -->      the block is marked `python` and runs as a program
+    <!-- before: COMMAND -->  runs first, to make files that the block takes for granted, as a
+                              reader's own record: $DEMO_RECORD is that of the demonstration
 """
 
 import os
@@ -27,18 +29,26 @@ from pathlib import Path
 
 from build_scripts.measured_data import ROOT, measured_data_directory, must_be_present
 
-MARKS = ("skip", "in-tests", "needs-data", "continue", "python")
+MARKS = ("skip", "in-tests", "needs-data", "continue")
 LIMIT_S = 900
 #: Blocks that run side by side; those that need the measured records are the longest by far.
 AT_ONCE = 2
 
 _FENCE = re.compile(r"^```(?P<language>\w*)\s*$")
-_MARK = re.compile(r"^<!--\s*run:\s*(?P<mark>[\w-]+)\s*-->\s*$")
+_NOTE = re.compile(r"^<!--\s*(?P<kind>run|before):\s*(?P<text>.+?)\s*-->\s*$")
+#: How the text of a block in a language runs.
+_PROGRAMS = {
+    "python": "python - <<'END_OF_PROGRAM'\n{}\nEND_OF_PROGRAM",
+    "c": "tee block.txt <<'END_OF_PROGRAM'\n{}\nEND_OF_PROGRAM\n"
+    "{{ grep '^#' block.txt; echo 'int main(void) {{'; grep -v '^#' block.txt; echo '}}'; }}"
+    " >main.c\n"
+    "${{CC:-cc}} -std=c99 -Wall -Werror -I code main.c code/*.c -lm -o program && ./program",
+}
 
 
 @dataclass(frozen=True)
 class Block:
-    """The commands of one fenced block, its page, the line it begins in, and its marks."""
+    """What runs for one fenced block, its page, the line it begins in, and its marks."""
 
     line: int
     commands: tuple[str, ...]
@@ -52,19 +62,21 @@ class Block:
 
 
 def find_blocks(text: str, page: str = "README.md") -> tuple[Block, ...]:
-    """Return the console blocks and the marked programs of a text, also those to be skipped.
+    """Return the blocks of commands and programs of a text, also those to be skipped.
 
     Raises:
-        ValueError: a mark is unknown, or a block has no end.
+        ValueError: a mark is unknown, a block is skipped for no reason, or has no end.
     """
     blocks: list[Block] = []
     marks: set[str] = set()
+    before: list[str] = []
     lines = iter(enumerate(text.splitlines(), 1))
     for number, line in lines:
-        if mark := _MARK.match(line):
-            if mark["mark"] not in MARKS:
-                raise ValueError(f"line {number}: '{mark['mark']}' is no mark; there are {MARKS}.")
-            marks.add(mark["mark"])
+        if note := _NOTE.match(line):
+            if note["kind"] == "before":
+                before.append(note["text"])
+            else:
+                marks.add(_mark(number, note["text"]))
         elif fence := _FENCE.match(line):
             content: list[str] = []
             for _, inner in lines:
@@ -73,15 +85,28 @@ def find_blocks(text: str, page: str = "README.md") -> tuple[Block, ...]:
                 content.append(inner)
             else:
                 raise ValueError(f"line {number}: this block has no end; close it with ```.")
-            if fence["language"] == "console":
-                blocks.append(Block(number, find_commands(content), frozenset(marks), page))
-            elif fence["language"] == "python" and "python" in marks:
-                program = "\n".join(("python - <<'END_OF_PROGRAM'", *content, "END_OF_PROGRAM"))
-                blocks.append(Block(number, (program,), frozenset(marks), page))
-            marks = set()
+            if found := commands_of(fence["language"], content):
+                blocks.append(Block(number, (*before, *found), frozenset(marks), page))
+            marks, before = set(), []
         elif line.strip():
-            marks = set()
+            marks, before = set(), []
     return tuple(blocks)
+
+
+def _mark(line: int, text: str) -> str:
+    mark, _, why = (part.strip() for part in text.partition(","))
+    if mark not in MARKS:
+        raise ValueError(f"line {line}: '{mark}' is no mark; there are {MARKS}.")
+    if mark == "skip" and not why:
+        raise ValueError(f"line {line}: say why this is skipped: <!-- run: skip, WHY -->")
+    return mark
+
+
+def commands_of(language: str, lines: Sequence[str]) -> tuple[str, ...]:
+    """Return what runs a block, nothing where its language is none that runs."""
+    if language == "console":
+        return find_commands(lines)
+    return (_PROGRAMS[language].format("\n".join(lines)),) if language in _PROGRAMS else ()
 
 
 def find_commands(lines: Sequence[str]) -> tuple[str, ...]:
@@ -105,6 +130,7 @@ def run_block(block: Block, directory: Path) -> str | None:
     environment = os.environ | {
         "PATH": os.pathsep.join((binaries, os.environ.get("PATH", os.defpath))),
         "PSA_CASADI_DATA": str(measured_data_directory()),
+        "DEMO_RECORD": str(ROOT / "psa_casadi" / "data" / "demo.csv"),
     }
     for command in block.commands:
         started = time.monotonic()

@@ -73,6 +73,26 @@ class Equations:
     next: Mapping[str, Expression] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Remedy:
+    """What to do about an effect, as a code, and the test that shows how large the effect is.
+
+    The words of a code are in `report.words.remedies`, the tests in `diagnosis.remedy.trials`.
+    """
+
+    code: str
+    test: str
+
+
+#: The remedies of effects that declare none, by what they belong to.
+_PLACES = {
+    "plant": Remedy("extended_model", "record"),
+    "drive": Remedy("better_drive", "record"),
+    "sensor": Remedy("calibrate_sensor", "record"),
+    "environment": Remedy("steady_surroundings", "record"),
+}
+
+
 class Symbols:
     """Read access to every symbol of a model by attribute: `s.k_L`, `s.f_H`, `s.displacement`.
 
@@ -114,7 +134,8 @@ class Component:
     `tone` names a parameter that is the frequency of a tone: among the harmonics of a periodic
     drive it cannot be told from distortion. `belongs_to` is plant, drive, sensor or environment;
     the last two stay out of exported plants. `needs` names components without which this one
-    means nothing. `trial_starts` are starts of its memory states at which it is looked for, where
+    means nothing. `remedy` is what can be done about it, where that is more than its place says.
+    `trial_starts` are starts of its memory states at which it is looked for, where
     it does nothing at their ordinary start. `curve` names the quantity over which an effect bends
     a static curve, in a form of its own: effects with the same one differ, below the resonances,
     by these forms only. `measured_by` names the input whose measured column holds what it adds:
@@ -148,6 +169,7 @@ class Component:
     looks_like: str = ""
     equation_text: str = ""
     belongs_to: str = "plant"
+    remedy: Remedy | None = None
     needs: tuple[str, ...] = ()
     trial_starts: tuple[Mapping[str, float], ...] = ()
     curve: str | None = None
@@ -165,6 +187,11 @@ class Component:
     def from_residual(self) -> bool:
         """Whether trial values are read off a residual, so that another one has other ones."""
         return any(grid in READ_OFF for grid in self.probe.values())
+
+    @property
+    def what_now(self) -> Remedy:
+        """The declared remedy, else the one of its place."""
+        return self.remedy or _PLACES[self.belongs_to]
 
     @property
     def in_plant(self) -> bool:

@@ -87,6 +87,30 @@ def why_not_written(path: str | os.PathLike[str]) -> str | None:
     return None
 
 
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Make a folder and those above it, where they are not there; InputError where that fails."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError(
+            f"{path}: cannot be created, there is a file of that name; name another folder."
+        ) from None
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be created ({error.strerror}); name another folder."
+        ) from error
+
+
+def why_not_read(error: Exception) -> str:
+    """Return in words why a file could not be read."""
+    if isinstance(error, FileNotFoundError):
+        return "there is no such file"
+    if isinstance(error, UnicodeDecodeError):
+        return "it is no text in UTF-8"
+    said = error.strerror if isinstance(error, OSError) else None
+    return said.lower() if said else str(error)
+
+
 def replace_durably(temporary: Path, target: Path) -> None:
     """Put a written file in the place of another, so that a power cut leaves one of them whole."""
     with temporary.open("rb+") as file:

@@ -2,6 +2,8 @@
 
 A unit string is written as FMI writes it: symbols joined by `.`, at most one `/`, exponents after
 the symbol, a denominator of several symbols in parentheses: `N.s/m`, `N/(V.s)`, `kg.m/s2`, `1/A`.
+`N*m`, `m/s^2` and `m/s²`, as laboratories write them, are read too. The table holds the units of
+the house; any other symbol (rpm, bar, psi, inch, L, T) is looked up in pint.
 
 Source: FMI 2.0.5, section 2.2.2, and FMI 3.0.2, section 2.4.3 (definition of units).
 """
@@ -11,7 +13,8 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import overload
+from functools import cache
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +26,8 @@ FloatArray = NDArray[np.float64]
 #: The base units in FMI's order; `Unit.exponents` follows it.
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
-Exponents = tuple[int, int, int, int, int, int, int, int]
+Power = int | Fraction
+Exponents = tuple[Power, Power, Power, Power, Power, Power, Power, Power]
 NO_DIMENSION: Exponents = (0, 0, 0, 0, 0, 0, 0, 0)
 
 
@@ -54,8 +58,8 @@ class Unit:
         return self.exponents, self.counts
 
     @property
-    def base_exponents(self) -> dict[str, int]:
-        """The exponents that are not zero by the name of the base unit, as FMI's BaseUnit wants."""
+    def base_exponents(self) -> dict[str, Power]:
+        """The exponents that are not zero, by the name of the base unit."""
         return {b: e for b, e in zip(BASE_UNITS, self.exponents, strict=True) if e}
 
 
@@ -117,12 +121,23 @@ def _table() -> Iterator[Unit]:
 UNITS: dict[str, Unit] = {unit.name: unit for unit in _table()}
 
 _ALIASES = str.maketrans(
-    {"\u00b5": "u", "\u03bc": "u", "\u03a9": "Ohm", "\u2126": "Ohm", "°": "deg", "·": "."}
-)
-_FACTOR = re.compile(r"(?P<symbol>1|%|[A-Za-z]+)(?P<exponent>[+-]?[0-9]{1,2})?")
+    {"\u00b5": "u", "\u03bc": "u", "\u03a9": "Ohm", "\u2126": "Ohm", "°": "deg", "·": ".",
+     "\u00d7": ".", "*": ".", "^": "", "²": "2", "³": "3", "\u212b": "angstrom", "Å": "angstrom"}
+)  # fmt: skip
+_FACTOR = re.compile(r"(?P<symbol>1|%|[A-Za-z]+)(?P<exponent>[+-]?[0-9]{1,2}(?:\.[0-9])?)?")
+#: Between factors: a point or a space before a letter; in `m2.5` it belongs to the exponent.
+_TIMES = re.compile(r"\s*[.\s]\s*(?=[A-Za-z%1])")
 #: A unit's size in SI base units lies between this and its inverse, so that both are floats.
 _SMALLEST = Fraction(1, 10**150)
-_FORM = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<group>[^/()]+)\)|(?P<one>[^/().]+)))?")
+_FORM = re.compile(r"(?P<above>[^/()]+)(?:/(?:\((?P<group>[^/()]+)\)|(?P<one>[^/().]+(?:\.\d)?)))?")
+#: Pint's names of the base units, in their order, and of a sensor's count.
+_PINT_BASE = (
+    "kilogram", "meter", "second", "ampere", "kelvin", "mole", "candela", "radian", "count",
+)  # fmt: skip
+#: What engineers mean where pint has another unit of the name: an inch's thousandth, not an angle.
+_ENGINEERS = {"mil": "thou", "mils": "thou"}
+#: The longest symbol that is looked up in pint.
+_LONGEST_SYMBOL = 24
 
 
 def units_of(quantity: str) -> tuple[str, ...]:
@@ -131,41 +146,81 @@ def units_of(quantity: str) -> tuple[str, ...]:
     return tuple(unit.name for unit in sorted(found, key=lambda unit: -unit.ratio))
 
 
-def parse_unit(text: str, quantity: str = "") -> Unit:
+def parse_unit(text: str, quantity: str = "", *, common: bool = False) -> Unit:
     """Return the unit that an FMI-style unit string names.
 
     In a compound a temperature is a difference: `V/degC` has no offset. `quantity` says what the
     unit is meant to measure ("voltage"), so that the message on an unknown unit lists the right
-    ones; it does not restrict the result.
+    ones; it does not restrict the result. `common` restricts it to the symbols of the table.
 
     Raises:
         InputError: a symbol is unknown (the sentence lists units that exist), or the string is not
             a unit string.
     """
-    name = text.strip().translate(_ALIASES)
+    name = _TIMES.sub(".", text.strip().replace("**", "").translate(_ALIASES))
     if name in UNITS:
         return UNITS[name]
     form = _FORM.fullmatch(name)
     if form is None:
         raise InputError(_not_a_unit(text))
-    ratio, exponents, counts = Fraction(1), list(NO_DIMENSION), 0
+    if not common and name.isalpha() and (whole := _from_pint(name)):
+        return whole
+    ratio, exponents, counts = Fraction(1), list(NO_DIMENSION), Fraction(0)
     below = form["group"] or form["one"]
     for part, sign in ((form["above"], 1), (below, -1)):
-        for factor in part.split(".") if part else ():
+        for factor in _TIMES.split(part.strip()) if part else ():
             match = _FACTOR.fullmatch(factor)
             if match is None:
                 raise InputError(_not_a_unit(text))
-            unit = UNITS.get(match["symbol"])
+            symbol = match["symbol"]
+            unit = UNITS.get(symbol) or (None if common else _from_pint(symbol))
             if unit is None:
-                raise InputError(_unknown_symbol(match["symbol"], text, quantity))
-            power = sign * int(match["exponent"] or 1)
-            ratio *= unit.ratio**power
+                raise InputError(_unknown_symbol(symbol, text, quantity))
+            power = sign * Fraction(match["exponent"] or 1)
+            ratio *= Fraction(unit.ratio**power)
             if not _SMALLEST < ratio < 1 / _SMALLEST:
                 raise InputError(_not_a_unit(text))
             counts += power * unit.counts
             exponents = [e + power * own for e, own in zip(exponents, unit.exponents, strict=True)]
-    kg, m, s, A, K, mol, cd, rad = exponents
-    return Unit(name, ratio, 0.0, (kg, m, s, A, K, mol, cd, rad), counts)
+    if counts.denominator != 1:
+        raise InputError(_not_a_unit(text))
+    kg, m, s, A, K, mol, cd, rad = map(_whole, exponents)
+    return Unit(name, ratio, 0.0, (kg, m, s, A, K, mol, cd, rad), int(counts))
+
+
+def _whole(power: Power) -> Power:
+    return int(power) if power == int(power) else power
+
+
+@cache
+def _registry() -> Any:
+    import pint  # noqa: PLC0415 - a second to load, for symbols that are not in the table
+
+    return pint.UnitRegistry(non_int_type=Fraction)
+
+
+@cache
+def _from_pint(symbol: str) -> Unit | None:
+    """Return the unit of a symbol or a name that pint knows; None where it is none of ours."""
+    if not 1 < len(symbol) <= _LONGEST_SYMBOL and symbol not in "TGLlhd":
+        return None
+    registry = _registry()
+    try:
+        unit = registry.parse_units(_ENGINEERS.get(symbol, symbol))
+        factor, base = registry.get_base_units(unit, check_nonmult=False)
+        offset = registry.Quantity(Fraction(0), unit).to(base).magnitude
+    except Exception:  # noqa: BLE001 - pint may raise anything on a word that is no unit
+        return None
+    powers = dict(base._units)
+    exponents = [powers.pop(name, 0) for name in _PINT_BASE]
+    if powers or any(p != int(p) for p in exponents) or not factor > 0:  # bits, gauss of 1881
+        return None
+    ratio = Fraction(factor).limit_denominator(10**40)
+    kg, m, s, A, K, mol, cd, rad, count = map(int, exponents)
+    found = Unit(symbol, ratio, float(offset), (kg, m, s, A, K, mol, cd, rad), count)
+    alike = [unit for unit in UNITS.values() if unit.dimension == found.dimension]
+    same = [u for u in alike if (u.ratio, u.offset) == (found.ratio, found.offset)]
+    return next(iter(same), replace(found, quantity=alike[0].quantity if alike else ""))
 
 
 def _not_a_unit(text: str) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.held_out.errors import Errors, Gain
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor
+from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.diagnosis.residual.misfit import Misfit, misfit
 from psa_casadi.diagnosis.result import (
     BlindSpot,
@@ -115,7 +116,10 @@ def diagnosis(
     cause = Cause("slow_creep", "plant", 0.97,
                   {"creep_gain": Estimate(0.04, "1", (0.037, 0.043)),
                    "creep_time": Estimate(0.3, "s", (0.2, 0.45))},
-                  ("offset_drift",) if verdict == "ambiguous" else (), 0.9)  # fmt: skip
+                  ("offset_drift",) if verdict == "ambiguous" else (), 0.9,
+                  "wait_or_feed_forward",
+                  (Size("hold", 4e-8, "m", (3.7e-8, 4.3e-8), 10.0, "s", (0.0, 100.0)),
+                   Size("hold", 9e-8, "m", None, 600.0, "s", (0.0, 100.0), True)))  # fmt: skip
     errors = Errors(4e-8, 5e-8, 1.5e-7, 0.31)
     seen = [misfits(n, samples) for n in names]
     return Diagnosis(

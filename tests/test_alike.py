@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.cli import diagnose as command
+from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.components import BASE
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
@@ -78,4 +78,4 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(
     assert len(told) == 1
     with pytest.raises(InputError, match="bend the same curve"):
         resolving_experiment(found)
-    assert command._with_next(found, tmp_path / "next.csv", lambda _: None) is found
+    assert files.with_next(found, tmp_path / "next.csv", lambda _: None) is found

@@ -112,7 +112,15 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert path.stat().st_size < 3_000_000
     told = psa.story(d, width=300).splitlines()
     assert told[0].startswith("verdict    cause named. The cause is hysteresis of x in v")
-    assert f"error      position: held-out rms 160 µm of the base, {rms:.2f} µm of the e" in told[2]
+    assert f"error      position: held-out rms 160 µm of the base, {rms:.2f} µm of the e" in told[3]
+    linear = psa.run(
+        d.model.with_values({"hysteresis_of_x_in_v_size": 0.0}), run.time, run.inputs,
+        np.zeros(len(d.model.state_names)), hold="linear",
+    ).y[:, 0]  # fmt: skip
+    size = f"it moves the position by up to {1e3 * np.ptp(d.extended[0][:, 0] - linear):.3g} mm"
+    assert size in told[1]
+    assert size in page.text
+    assert "Against it: approach from the same side" in page.text
     document = valid("own_model", d.to_json())
     assert document["causes"][0]["port"] == "the rate of v"
     low, high = document["budget"]["causes"][0]["interval"]

@@ -67,7 +67,7 @@ def done(*arguments: str | Path) -> Result:
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     directory = tmp_path_factory.mktemp("demo") / "new" / "psa_demo"
-    result = done("demo", directory)
+    result = done("demo", "-o", directory)
     return Demo(directory, result.stdout, result.stderr)
 
 
@@ -282,10 +282,14 @@ def test_a_short_option_asks_for_help() -> None:
 
 
 def test_effects_are_listed_and_shown() -> None:
-    listed = done("effects").stdout
-    for name, effect in EFFECTS.items():
-        assert name in listed
-        assert effect.looks_like in listed
+    listed = done("effects").stdout.strip()
+    head, _, *rows = re.split(r"\n(?=\S)", listed)
+    looks = head.index("what it looks like")
+    for row, (name, effect) in zip(rows, EFFECTS.items(), strict=True):
+        assert row.split()[0] == name
+        told = " ".join(line[looks:] for line in row.splitlines())
+        assert told.split() == effect.looks_like.split()
+    assert max(map(len, listed.splitlines())) <= 80
     assert done("effects", "--quiet").stdout.split() == list(EFFECTS)
     shown = done("effects", "slow-creep").stdout
     assert "equation" in shown

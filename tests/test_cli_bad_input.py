@@ -95,7 +95,7 @@ def test_a_record_that_is_not_there(tmp_path: Path) -> None:
         said = refused(command, absent, "-o", out, outputs=tmp_path)
         assert "there is no such file" in said
         assert "is a directory" in refused(command, tmp_path, "-o", out, outputs=tmp_path)
-    assert "--output" in refused("identify", absent, outputs=tmp_path)
+    assert "--output" in refused("simulate", "--input", absent, outputs=tmp_path)
     assert "records" in refused("diagnose", "-o", out, outputs=tmp_path).lower()
 
 
@@ -263,3 +263,36 @@ def test_the_command_itself_prints_no_traceback(tmp_path: Path) -> None:
         " directory it is in.\n"
     )
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("compare", "absent.json", "b.json"), "absent.json: cannot be read (there is no such"),
+        (
+            ("simulate", "--model", "bytes", "--input", "x"),
+            "bytes cannot be read (it is no text in",
+        ),
+        (("export", "c", "--step", "10us", "--stack", "demo", "-o", "bytes"), "there is a file of"),
+        (("examples", "ci", "-o", "bytes"), "bytes: cannot be created, there is a file of that"),
+        (("datasets", "micromanipulator", "-o", "bytes"), "bytes: cannot be created"),
+        (("check", "bytes", "--timeout", "inf"), "'--timeout'"),
+        (
+            ("design", "experiment", "--stack", "demo", "--duration", "1", "--samples", "0"),
+            "0 samples hold no experiment",
+        ),
+        (
+            ("design", "mechanism", "--stack", "demo", "--damping", "0.5", "--max-force", "inf"),
+            "The largest force is inf N; give a positive one",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_told_in_words(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bytes").write_bytes(bytes(range(256)))
+    output = () if "-o" in words or words[0] == "check" else ("-o", "out")
+    told = refused(*words, *output, outputs=tmp_path)
+    assert said in " ".join(told.split())
+    assert "Errno" not in told

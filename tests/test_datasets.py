@@ -225,7 +225,7 @@ def test_mistakes_of_the_command(
         (["micromanipulater"], "There is no dataset named 'micromanipulater'; did you mean micro"),
         (["zzz"], "There is no dataset named 'zzz'; there are micromanipulator"),
         (["-o", tmp_path], "--output needs the name of a dataset"),
-        (["small", "-o", tmp_path / "file"], "cannot be made a folder"),
+        (["small", "-o", tmp_path / "file"], "cannot be created"),
     ):
         code, out, err = psa(*arguments)
         assert (code, out) == (2, "")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.cli.diagnose import _write_patch
+from psa_casadi.cli.diagnosis_files import write_patch
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.driven import filtered
 from psa_casadi.diagnosis.thresholds import thresholds
@@ -181,6 +181,6 @@ def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) 
 
 
 def test_without_a_correction_nothing_is_written_and_it_says_so(tmp_path: Path) -> None:
-    said = _write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
+    said = write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
     assert "No unnamed correction" in said
     assert not (tmp_path / "p.json").exists()

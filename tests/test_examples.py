@@ -1,5 +1,6 @@
 """Every example runs and finds what it says; the command shows, copies and runs them."""
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -141,9 +142,12 @@ def _run(*words: str) -> Any:
 def test_the_list_names_all() -> None:
     shown = _run()
     assert shown.exit_code == 0
-    for name, example in examples().items():
-        assert name in shown.output
-        assert example.title in shown.output
+    table, _, _ = shown.output.rpartition("\n\n")
+    head, _, *rows = re.split(r"\n(?=\S)", table)
+    title = head.index("what it shows")
+    for row, (name, example) in zip(rows, examples().items(), strict=True):
+        assert row.split()[:2] == [name, example.kind]
+        assert " ".join(line[title:] for line in row.splitlines()).split() == example.title.split()
     assert _run("--quiet").output.split() == list(examples())
 
 

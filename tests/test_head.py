@@ -9,8 +9,8 @@ import pytest
 from pyarrow import parquet
 
 from psa_casadi.errors import InputError
+from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import Field
-from psa_casadi.records.read.head import head_of
 from tests.laboratory_bytes import Cell, xlsx
 
 T = np.arange(20) * 1e-3

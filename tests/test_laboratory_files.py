@@ -233,13 +233,14 @@ def test_a_damaged_gzip_file_is_refused(spoil: Callable[[bytes], bytes], tmp_pat
 
 def test_a_sample_time_stands_for_a_column(tmp_path: Path) -> None:
     path = kept(tmp_path, "a.npz", npz({"voltage": V, "displacement_um": X}))
-    with pytest.raises(InputError, match="Or give --sample-time"):
+    with pytest.raises(InputError, match=r"give the time between samples: --sample-time 0\.001"):
         read_record(path)
     record = read_record(path, sample_time=1e-3)
     np.testing.assert_allclose(record.time, T, rtol=1e-12)
     path.write_bytes(npz(NAMED))
-    with pytest.raises(InputError, match="has a column 'time' of its own; leave --sample-time"):
-        read_record(path, sample_time=1e-3)
+    record = read_record(path, sample_time=2e-3)
+    np.testing.assert_allclose(record.time, 2 * T, rtol=1e-12)
+    assert "the times of the file are left out" in record.notes[0]
     table = {"voltage [V]": V, "displacement [um]": X}
     np.testing.assert_allclose(record_from(table, sample_time=0.5).time, 500 * T, rtol=1e-12)
     with pytest.raises(InputError, match=r"the sample time -1\.0 s is no time"):
@@ -257,7 +258,7 @@ def test_a_mistake_in_a_workbook_is_told_with_its_row(tmp_path: Path) -> None:
     rows: list[list[float | str]] = [[*row] for row in ROWS]
     rows[4][1] = "off"
     path = kept(tmp_path, "a.xlsx", xlsx([["t [s]", "V [V]", "x [um]"], *rows]))
-    with pytest.raises(InputError, match="line 6, column 'voltage': found 'off'"):
+    with pytest.raises(InputError, match="row 6, column 'voltage': found 'off'"):
         read_record(path)
 
 
@@ -290,7 +291,10 @@ def test_a_scale_that_leaves_nothing_is_refused(scale: str) -> None:
 
 def test_a_sensors_volts_are_told_to_need_a_scale(tmp_path: Path) -> None:
     path = kept(tmp_path, "a", text("time [s],voltage [V],displacement [V]"))
-    with pytest.raises(InputError, match=r"does not measure length.*displacement=NAME:10um"):
+    with pytest.raises(
+        InputError,
+        match=r"does not measure length.* is: --columns displacement=displacement:1um",
+    ):
         read_record(path)
     assert_read(path, "displacement=displacement:1um")
 

@@ -3,20 +3,24 @@
 import json
 import re
 
+import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from build_scripts import copied_pages
+import psa_casadi as psa
+from build_scripts import copied_pages, ports_page
 from build_scripts.commands_page import commands
 from build_scripts.effects_page import PICTURES, overview, section
 from build_scripts.measured_data import ROOT
 from build_scripts.schemas_page import WRITTEN_BY, kind
 from build_scripts.schemas_page import section as schema_section
 from psa_casadi.cli.app import app
+from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
+from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.report.documents.schemas import FILES, schema_texts
 
 
@@ -112,3 +116,32 @@ def test_the_page_of_json_files_holds_every_member_of_every_schema() -> None:
 )
 def test_what_a_value_may_be_is_told_in_words(schema: dict[str, object], words: str) -> None:
     assert kind("f", schema) == words
+
+
+def test_the_page_of_ports_has_every_port_with_its_sign() -> None:
+    text = "\n".join(ports_page.sections())
+    for name in PARTS:
+        rows = text.split(f"### `{name}`\n")[1].split("\n#")[0]
+        for port in (*part_model(name).input_names, *part_model(name).output_names):
+            assert f"| `{port}` |" in rows
+    for effect in EFFECTS.values():
+        assert all(f"| `{i.name}` | in | {i.unit} |" in text for i in effect.inputs)
+    assert "| `load_force` | in | N | 0 |" in text
+    names = {i.name for c in COMPONENTS.values() for i in c.inputs}
+    names |= {o.name for c in COMPONENTS.values() for o in c.outputs}
+    assert names <= {*re.findall(r"^\|.*?`(\w+)` \| (?:in|out) \|", text, re.MULTILINE)}
+
+
+def test_the_signs_of_the_page_are_those_of_the_models() -> None:
+    model = psa.stack_model("P-885.51").plant()
+    t = np.linspace(0.0, 0.02, 201)
+    rising = psa.simulate(model, t, 5000.0 * t).outputs
+    for name in ("displacement", "velocity", "current", "charge", "blocked_force"):
+        assert rising[name][100] > 0, name
+    pulled = psa.simulate(model, t, 0 * t, load_force=np.minimum(1e4 * t, 50.0)).outputs
+    assert pulled["displacement"][-1] > 0
+    stage = part_model("flexure_stage")
+    x0 = np.zeros(len(stage.state_names))
+    pushed = psa.run(stage, t, np.column_stack([1e-3 * t, 1e-3 + 0 * t]), x0, hold="linear").y
+    force, position = pushed[-1]
+    assert force < 0 < position

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.cli import diagnose as command
+from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.design.experiment import experiment
 from psa_casadi.design.experiment.designs import Separated
 from psa_casadi.design.experiment.experiment import resolving_experiment
@@ -120,15 +121,15 @@ def test_the_command_writes_the_record_and_says_so(
     monkeypatch.setattr(experiment, "resolving_experiment", lambda d, **_: loop.design)
     path = command._beside(tmp_path / "diagnosis.json")
     assert path == tmp_path / "diagnosis_next.csv"
-    d = command._with_next(loop.ambiguous, path, lambda _: None)
+    d = files.with_next(loop.ambiguous, path, lambda _: None)
     said = json.loads(d.to_json())["next_experiment"]
     assert said["voltage_csv"] == str(path)
     assert set(said["separates"]) == set(said["chance"]) == {HIDDEN, RIVAL}
     assert str(path) in " ".join(story(d, width=400).split())
     record = read_record(path, need_displacement=False)
     np.testing.assert_array_equal(record.voltage, loop.design.record.voltage)
-    assert command._with_next(loop.named, path, lambda _: None) is loop.named
-    assert command._with_next(loop.ambiguous, None, lambda _: None) is loop.ambiguous
+    assert files.with_next(loop.named, path, lambda _: None) is loop.named
+    assert files.with_next(loop.ambiguous, None, lambda _: None) is loop.ambiguous
 
 
 @pytest.mark.parametrize("name", ["offset_drift", "self_heating"])

@@ -26,7 +26,7 @@ def with_row(row: int, text: str) -> list[str]:
         ("time [s],displacement [um]", r"line 1: the column 'voltage' is missing \(found: time, d"),
         ("time [s],voltge [V],displacement [um]", r"'voltge' is unknown; if 'voltage' is meant"),
         (f"{HEADER},load_fource [N]", r"'load_fource' is unknown; if 'load_force' is meant"),
-        ("time [s],voltage [volt],displacement [um]", r"'volt' is unknown; units of voltage .*kV"),
+        ("time [s],voltage [vlot],displacement [um]", r"'vlot' is unknown; units of voltage .*kV"),
         ("time [s],voltage,displacement [um]", r"'voltage' has no unit .*'voltage \[V\]'"),
         ("time [s],voltage [],displacement [um]", r"column 'voltage': has no unit"),
         ("time [V],voltage [V],displacement [um]", r"'time': the unit 'V' does not measure time"),

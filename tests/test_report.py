@@ -66,7 +66,7 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
     shown = story(d, origin="synthetic")
     assert SENTENCES[verdict] in " ".join(shown.split())
     assert ("extended" in shown) == (verdict in ADDED)
-    assert 8 <= len(shown.splitlines()) <= 15
+    assert 8 <= len(shown.splitlines()) <= 20
     assert max(map(len, shown.splitlines())) <= 100
     json.loads(d.to_json())
 

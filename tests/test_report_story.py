@@ -196,8 +196,8 @@ def test_the_terminal_tells_what_is_wrong_and_how_sure_the_cause_is() -> None:
     d = diagnosis("cause_named")
     lines = told(d)
     assert list(lines) == [
-        "verdict", "wrong", "records", "noise", "base", "extended", "cause", "rivals",
-        "remains", "blind to", "next", "note",
+        "verdict", "what now", "then", "wrong", "records", "noise", "base", "extended", "cause",
+        "rivals", "remains", "blind to", "next", "note",
     ]  # fmt: skip
     seen, share = d.misfit[0].sentences[1].split("; this view explains ")
     assert lines["wrong"] == f"{seen} ({share.rstrip('.')[:4]} of the excess)."

@@ -132,10 +132,10 @@ def test_a_child_that_is_not_waited_for_dies_with_its_children(tmp_path: Path) -
 READS = """
 import sys
 from psa_casadi.cli.surroundings import prepare
-from psa_casadi.records.read.hdf5_process import arrays_apart
+from psa_casadi.records import read_record
 prepare()
 sys.executable = sys.argv[1]
-arrays_apart("f.mat", b"nothing")
+read_record(sys.argv[2])
 """
 
 
@@ -146,15 +146,17 @@ def test_a_request_to_end_ends_the_python_that_reads_a_file_too(tmp_path: Path) 
         f"#!/bin/sh\nsleep 60 & echo $! > {note}.new; mv {note}.new {note}; wait\n"
     )
     interpreter.chmod(0o755)
+    (tmp_path / "f.mat").write_bytes(b"nothing")
     reading = subprocess.Popen(
-        [sys.executable, "-c", READS, str(interpreter)], env={**os.environ, "TMPDIR": str(tmp_path)}
+        [sys.executable, "-c", READS, str(interpreter), str(tmp_path / "f.mat")],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
     )
     while reading.poll() is None and not note.exists():
         time.sleep(0.01)
     reading.terminate()
     assert reading.wait(10) == 128 + signal.SIGTERM
     assert ended(int(note.read_text()))
-    assert sorted(os.listdir(tmp_path)) == ["pid", "python"]
+    assert sorted(os.listdir(tmp_path)) == ["f.mat", "pid", "python"]
 
 
 #: Is told to end when its child runs, and `Popen` has not come back with it yet.

@@ -11,6 +11,7 @@ from psa_casadi.units import (
     BASE_UNITS,
     NO_DIMENSION,
     UNITS,
+    Power,
     Unit,
     convert,
     parse_unit,
@@ -99,7 +100,7 @@ def test_base_units_stand_in_the_order_of_fmi() -> None:
     assert BASE_UNITS == ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
     for position, name in enumerate(BASE_UNITS):
         assert UNITS[name].exponents[position] == 1
-        assert sum(map(abs, UNITS[name].exponents)) == 1
+        assert sum(abs(float(power)) for power in UNITS[name].exponents) == 1
     assert UNITS["1"].exponents == NO_DIMENSION
 
 
@@ -126,10 +127,10 @@ def test_conversion_there_and_back_returns_the_value(
 
 @given(st.sampled_from(sorted(UNITS)), st.sampled_from(sorted(UNITS)), st.integers(1, 3))
 def test_a_product_and_a_quotient_add_and_subtract_exponents(a: str, b: str, power: int) -> None:
-    def raised(unit: Unit, n: int) -> tuple[int, ...]:
+    def raised(unit: Unit, n: int) -> tuple[Power, ...]:
         return (*(n * e for e in unit.exponents), n * unit.counts)
 
-    def of(text: str) -> tuple[int, ...]:
+    def of(text: str) -> tuple[Power, ...]:
         return raised(parse_unit(text), 1)
 
     one, two = UNITS[a], UNITS[b]
@@ -174,15 +175,15 @@ def test_converting_between_quantities_is_an_error_that_names_both() -> None:
 
 
 def test_an_unknown_unit_is_named_and_the_existing_ones_are_listed() -> None:
-    with pytest.raises(InputError, match=r"unit 'micron' is unknown; units of length .*um, nm"):
-        parse_unit("micron", "length")
+    with pytest.raises(InputError, match=r"unit 'micorn' is unknown; units of length .*um, nm"):
+        parse_unit("micorn", "length")
     with pytest.raises(InputError, match=r"unit 'KV' is unknown; units of voltage .*kV, V, mV"):
         parse_unit("KV")
-    with pytest.raises(InputError, match=r"unit 'furlong' in 'N/furlong' .*Ohm"):
-        parse_unit("N/furlong")
+    with pytest.raises(InputError, match=r"unit 'furlang' in 'N/furlang' .*Ohm"):
+        parse_unit("N/furlang")
 
 
-@pytest.mark.parametrize("text", ["", "N/m/s", "N//m", "N.(m", "m*s", "V s", "N/m.s", "2m", "m^2"])
+@pytest.mark.parametrize("text", ["", "N/m/s", "N//m", "N.(m", "N/m.s", "2m", "m/"])
 def test_what_is_no_unit_string_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(InputError, match=r"is not a unit string; .*N\.s/m or N/\(V\.s\)"):
         parse_unit(text)

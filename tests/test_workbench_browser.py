@@ -23,7 +23,7 @@ _FROM_THE_SEARCH = """
   var away = 'main > :not(section), section:has(#h-files, #h-columns), #h-run ~ :not(#search),'
     + ' #h-run, #said, #downloads, #result .bar';
   document.querySelectorAll(away).forEach(n => { n.style.display = 'none'; });
-  document.querySelector('#report').style.height = '345px';
+  document.querySelector('#report').style.height = '740px';
   scrollTo(0, 0);
 """
 PICTURES = os.environ.get("PSA_CASADI_PICTURES", "")
@@ -57,9 +57,10 @@ def pictures_of_the_result(tab: Steered) -> None:
     picture(tab, "phone", 390, 2600)
     picture(tab, "night", height=2200, dark=True)
     if PICTURES:
+        tab.call("Emulation.setScrollbarsHidden", hidden=True)
         tab.run(_FROM_THE_SEARCH)
         for _ in range(3):  # the report is drawn again for another width, which takes a second
-            picture(tab, "web_diagnose_result", 500, 955)
+            picture(tab, "web_diagnose_result", 500, 1350)
 
 
 def drop(tab: Steered, path: Path) -> None:

@@ -10,6 +10,7 @@ from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
 from psa_casadi.any_model.identify import with_told
 from psa_casadi.any_model.levels import noise_left, noise_told
+from psa_casadi.any_model.remedy import changes
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
 from psa_casadi.any_model.runs import Run, missed_rms
 from psa_casadi.any_model.search import Known, Names, with_cause, without
@@ -129,6 +130,8 @@ def _diagnosis(
             },
             cannot_be_told_from=rivals(told[c.name], c.name),
             explained_share=shares[c.name].shown[0],
+            remedy=c.what_now.code,
+            sizes=changes(c, named.fit, known.runs),
         )
         for c in named.causes
         if c.name not in small

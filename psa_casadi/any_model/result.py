@@ -11,6 +11,7 @@ import numpy.typing as npt
 from psa_casadi.any_model.budget import OdeBudget
 from psa_casadi.any_model.fit import OdeFit
 from psa_casadi.any_model.runs import Run
+from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.model.compose import Model
 from psa_casadi.shown import StillReported, frame
@@ -32,6 +33,7 @@ class PortCause:
     """A named cause: the effect, the port where it sits, how sure, how large, what else it may be.
 
     `explained_share` is what it removes of the held-out error above the noise, beside the others.
+    `remedy` is a code, `sizes` what the cause changes of every output within a record.
     """
 
     effect: str
@@ -42,6 +44,8 @@ class PortCause:
     parameters: Mapping[str, Estimate]
     cannot_be_told_from: tuple[str, ...]
     explained_share: float
+    remedy: str = ""
+    sizes: tuple[Size, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
 """The table of subcommands."""
 
+import inspect
 import shlex
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -37,12 +39,18 @@ app = typer.Typer(
     epilog="Start with: psa demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-export = typer.Typer(help="Write a model in a format that other tools read.", no_args_is_help=True)
-design = typer.Typer(
-    help="Design the next experiment, a voltage that follows a path, or a mounting.",
+export = typer.Typer(
+    help="Write a model in a format that other tools read.",
     no_args_is_help=True,
+    rich_markup_mode=None,
+)
+design = typer.Typer(
+    help="Design an experiment, a voltage for a path, or a mounting.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
 )
 
 
@@ -64,47 +72,52 @@ def _main(
     """Models of piezoelectric stack actuators: identify, diagnose what is missing, export."""
 
 
-app.command(epilog="Example: psa demo my_demo")(guarded(demo))
-app.command(epilog="Example: psa identify slow.csv fast.csv -o model.json --report fit.html")(
-    guarded(identify)
-)
-app.command(
-    epilog="Example: psa sample model.json record.csv -o posterior.nc --figure posterior.png"
-)(guarded(sample))
-app.command(epilog="Example: psa simulate --model model.json --input planned.csv -o motion.csv")(
-    guarded(simulate)
-)
-app.command(
-    epilog="Example: psa diagnose a.csv --holdout b.csv -o extended.json --report report.html"
-)(guarded(diagnose))
-app.command(epilog="Example: psa batch records -o results --report population.html")(guarded(batch))
-app.command(epilog="Example: psa compare before.json after.json -o compare.html")(guarded(compare))
-app.command(epilog="Example: psa effects slow_creep")(guarded(effects))
-app.command(epilog="Example: psa stacks P-885.51")(guarded(stacks))
+def _add(
+    group: typer.Typer,
+    command: Callable[..., None],
+    example: str,
+    name: str | None = None,
+    **settings: bool,
+) -> None:
+    """Add a command; its first sentence stands whole in the list, its example on one line."""
+    first = (inspect.getdoc(command) or "").partition("\n\n")[0]
+    group.command(
+        name, short_help=first, epilog=f"\b\nExample: {example}", context_settings=settings
+    )(guarded(command))
+
+
+_add(app, demo, "psa demo my_demo")
+_add(app, identify, "psa identify slow.csv fast.csv -o model.json --report fit.html")
+_add(app, sample, "psa sample record.csv --model model.json -o posterior.nc --figure posterior.png")
+_add(app, simulate, "psa simulate --stack P-885.51 --input voltage.csv --history 120,0 -o out.csv")
+_add(app, diagnose, "psa diagnose a.csv --holdout b.csv -o extended.json --report report.html")
+_add(app, batch, "psa batch records -o results --report population.html")
+_add(app, compare, "psa compare before.json after.json -o compare.html")
+_add(app, effects, "psa effects slow_creep --figure creep.png")
+_add(app, stacks, "psa stacks P-885.51")
 app.add_typer(export, name="export")
-export.command(epilog="Example: psa export fmu --model extended.json -o stack.fmu")(guarded(fmu))
-export.command(epilog="Example: psa export modelica --model extended.json -o PiezoStack.mo")(
-    guarded(modelica)
-)
-export.command(epilog="Example: psa export c --stack P-885.51 --step 10us -o code")(guarded(c))
-export.command(epilog="Example: psa export ssp --stack P-885.51 -o stage.ssp")(guarded(ssp))
+_add(export, fmu, "psa export fmu --model extended.json -o stack.fmu")
+_add(export, modelica, "psa export modelica --model extended.json -o PiezoStack.mo")
+_add(export, c, "psa export c --stack P-885.51 --step 10us -o code")
+_add(export, ssp, "psa export ssp --stack P-885.51 -o stage.ssp")
 app.add_typer(design, name="design")
-design.command(
-    epilog="Example: psa design experiment --stack P-885.51 --duration 2"
-    " --separate field_dependent_gain rate_independent_asymmetry -o voltage.csv"
-)(guarded(experiment))
-design.command(epilog="Example: psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json")(
-    guarded(mechanism)
+_add(
+    design,
+    experiment,
+    "psa design experiment --stack P-885.51 --duration 2"
+    " --separate field_dependent_gain rate_independent_asymmetry -o voltage.csv",
 )
-design.command(
+_add(design, mechanism, "psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json")
+_add(
+    design,
+    input_,
+    "psa design input --stack P-885.51 --move 2 10 --min-voltage -20 --max-voltage 120 -o move.csv",
     "input",
-    epilog="Example: psa design input --stack P-885.51 --move 2 10 --min-voltage -20"
-    " --max-voltage 120 -o move.csv",
-)(guarded(input_))
-app.command(epilog="Example: psa check stack.fmu --model extended.json")(guarded(check))
-app.command(epilog="Example: psa web extended.json -o page.html")(guarded(web))
-app.command(epilog="Example: psa examples van_der_pol -o van_der_pol")(guarded(examples))
-app.command(epilog="Example: psa datasets micromanipulator -o records")(guarded(datasets))
+)
+_add(app, check, "psa check stack.fmu --model extended.json")
+_add(app, web, "psa web --model extended.json -o page.html", allow_extra_args=True)
+_add(app, examples, "psa examples van_der_pol -o van_der_pol")
+_add(app, datasets, "psa datasets micromanipulator -o records")
 
 
 def main() -> None:

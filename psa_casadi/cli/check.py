@@ -1,14 +1,18 @@
 """`psa check`: is an FMU valid, does it behave, does it agree with its model."""
 
+import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from psa_casadi.cli.expected import JunitOption, judge
 from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
+    ModelOption,
     Quiet,
+    StackOption,
     show,
     show_table,
     tell_written,
@@ -18,10 +22,8 @@ from psa_casadi.cli.screen import (
 
 def check(
     fmu: Annotated[Path, typer.Argument(help="FMU to check.", show_default=False)],
-    model: Annotated[
-        Path | None,
-        typer.Option(help="MODEL.json to compare with; by default the one that the FMU carries."),
-    ] = None,
+    model: ModelOption = None,
+    stack: StackOption = None,
     evidence: Annotated[
         bool,
         typer.Option(
@@ -36,9 +38,11 @@ def check(
     ] = None,
     columns: ColumnsOption = None,
     json: Annotated[Path | None, typer.Option(help="JSON file of all checks to write.")] = None,
+    junit: JunitOption = None,
     effects: EffectsOption = None,
     timeout: Annotated[
-        float, typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1)
+        float,
+        typer.Option(help="Seconds that the FMU's code may take for each check.", min=0.1, max=1e6),
     ] = 300.0,
     memory: Annotated[
         int,
@@ -50,6 +54,8 @@ def check(
 ) -> None:
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
 
+    It is compared with the model that --model or --stack names, else with the one that it carries.
+
     This RUNS THE CODE of the FMU, as every simulation with it does. A process
     of its own, with limits of time and memory, keeps its faults from the table.
     It is no sandbox: the code can read and write your files and use the
@@ -58,18 +64,18 @@ def check(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.check.check import check_fmu
     from psa_casadi.files import atomic_write
-    from psa_casadi.model.model_file import load_model
     from psa_casadi.report.documents.check_file import check_file
+    from psa_casadi.report.documents.junit import check_cases
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
     from psa_casadi.strict_json import json_text
 
-    given = Given(effects)
-    given.outputs({"--json": json}, [fmu, model])
+    given, began = Given(effects), time.perf_counter()
+    given.outputs({"--json": json, "--junit": junit}, [fmu, model])
     if not fmu.is_file():
         what = "is a directory" if fmu.is_dir() else "there is no such file"
         given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
-    chosen = None if model is None else given.attempt(lambda: load_model(model, given.effects))
+    chosen = given.model_or_stack(model, stack, any_model=True, needed=False)
     records = given.records(record, columns=columns) if record else ()
     given.check()
     with working("checking", quiet):
@@ -87,5 +93,4 @@ def check(
     if json is not None:
         atomic_write(json, json_text(check_file(report)))
         tell_written(json, quiet=quiet)
-    if not report.passed:
-        raise typer.Exit(1)
+    judge("check", fmu.name, check_cases(report), junit, began)

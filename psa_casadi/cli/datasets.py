@@ -5,11 +5,14 @@ from typing import Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 
 
 def datasets(
-    name: Annotated[str | None, typer.Argument(help="Name of one dataset.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="Name of one dataset.", autocompletion=names("datasets"))
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Folder to write its records to, as CSV files."),

@@ -46,8 +46,12 @@ Where a column cannot be told, the message ends with the option to type. Without
 
 def demo(
     directory: Annotated[
-        Path, typer.Argument(help="Where to leave the files; it is created.")
-    ] = Path("psa_demo"),
+        Path | None,
+        typer.Argument(help="Where to leave the files; it is created.", show_default="psa_demo"),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The same as DIRECTORY.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Identify, diagnose, extend, export and check a stack, on a synthetic record."""
@@ -66,7 +70,7 @@ def demo(
     from psa_casadi.simulation.ahead import compiled_ahead
     from psa_casadi.simulation.stepper import make_ready
 
-    paths = _prepared(directory)
+    directory, paths = _prepared(directory, output)
     record = read_record(paths[RECORD], need_excitation=True)
     show("A synthetic record, made by a simulated stack with one effect hidden in it.", quiet)
     with (
@@ -80,9 +84,11 @@ def demo(
         beside.submit(make_ready, d.model.plant())  # the check simulates with it
         save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
-        write_report(d, paths["report.html"], origin=_ORIGIN)
+        extended = str(paths["extended.json"])
+        write_report(d, paths["report.html"], origin=_ORIGIN, model_file=extended)
         save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
-    show(f"\n{story(d, origin=_ORIGIN, width=width())}\n\n{HIDDEN}\n", quiet)
+    told = story(d, origin=_ORIGIN, width=width(), model_file=extended)
+    show(f"\n{told}\n\n{HIDDEN}\n", quiet)
     with working("exporting and checking the FMU", quiet):
         exported.result()
         checked = check_fmu(paths["extended.fmu"], d.model)
@@ -103,22 +109,20 @@ def _searched(record: "Record") -> "Iterator[Model]":
     return (start.with_effect(e) for e in reversed(EFFECTS.values()) if not e.needs_column)
 
 
-def _prepared(directory: Path) -> dict[str, Path]:
+def _prepared(named: Path | None, output: Path | None) -> tuple[Path, dict[str, Path]]:
     """Create the directory, check that every file can be written, copy the record to it."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.errors import InputError
-    from psa_casadi.files import atomic_write
+    from psa_casadi.files import atomic_write, make_folder
 
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{directory}: cannot be created ({error.strerror}); name another directory."
-        ) from error
+    if named is not None and output is not None:
+        raise InputError(f"{named} and -o {output} name two directories; leave one of them out.")
+    directory = named or output or Path("psa_demo")
+    make_folder(directory)
     paths = {name: directory / name for name in FILES}
     given = Given()
     given.outputs(paths, [])
     given.check()
     packaged = resources.files("psa_casadi").joinpath("data", "demo.csv")
     atomic_write(paths[RECORD], packaged.read_bytes())
-    return paths
+    return directory, paths

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
+    ModelOption,
     Quiet,
     SampleTimeOption,
     StackOption,
@@ -49,10 +51,13 @@ def experiment(
     more: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Further effects to separate.", show_default=False, metavar="EFFECT..."
+            help="Further effects to separate.",
+            show_default=False,
+            metavar="EFFECT",
+            autocompletion=names("effects"),
         ),
     ] = None,
-    model: Annotated[Path | None, typer.Option(help="MODEL.json of the device.")] = None,
+    model: ModelOption = None,
     stack: StackOption = None,
     record: Annotated[
         list[Path] | None,
@@ -64,7 +69,11 @@ def experiment(
     ] = None,
     separate: Annotated[
         list[str] | None,
-        typer.Option("--separate", help="Effect to separate from the others that are named."),
+        typer.Option(
+            "--separate",
+            help="Effect to separate from the others that are named.",
+            autocompletion=names("effects"),
+        ),
     ] = None,
     parameter: Annotated[
         list[str] | None,
@@ -78,15 +87,15 @@ def experiment(
         Optimality, typer.Option(help="Volume, worst direction or mean square of the intervals.")
     ] = Optimality.D,
     family: Annotated[Family, typer.Option(help="Family of voltages.")] = Family.ANY,
-    low: Annotated[float | None, typer.Option(help="Lowest voltage \\[V].")] = None,
-    high: Annotated[float | None, typer.Option(help="Highest voltage \\[V].")] = None,
-    duration: Annotated[float | None, typer.Option(help="Length of the record \\[s].")] = None,
+    low: Annotated[float | None, typer.Option(help="Lowest voltage [V].")] = None,
+    high: Annotated[float | None, typer.Option(help="Highest voltage [V].")] = None,
+    duration: Annotated[float | None, typer.Option(help="Length of the record [s].")] = None,
     samples: Annotated[int | None, typer.Option(help="Number of samples.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Largest rate \\[V/s].")] = None,
-    current: Annotated[float | None, typer.Option(help="Largest current \\[A].")] = None,
-    bandwidth: Annotated[float | None, typer.Option(help="Bandwidth \\[Hz].")] = None,
+    rate: Annotated[float | None, typer.Option(help="Largest rate [V/s].")] = None,
+    current: Annotated[float | None, typer.Option(help="Largest current [A].")] = None,
+    bandwidth: Annotated[float | None, typer.Option(help="Bandwidth [Hz].")] = None,
     noise: Annotated[
-        float | None, typer.Option(help="Noise of the sensor, rms \\[nm]; 0.1 % of the stroke.")
+        float | None, typer.Option(help="Noise of the sensor, rms [nm]; 0.1 % of the stroke.")
     ] = None,
     correlation: Annotated[
         float, typer.Option(help="Correlation of the noise in neighbouring samples.")
@@ -121,7 +130,9 @@ def experiment(
         "low": low, "high": high, "duration": duration, "samples": samples,
         "rate": rate, "current": current, "bandwidth": bandwidth,
     }  # fmt: skip
-    limits = given.attempt(lambda: design_given.limits(records, chosen, wanted))
+    limits = None
+    if records or not record:
+        limits = given.attempt(lambda: design_given.limits(records, chosen, wanted))
     given.check()
     if chosen is None or limits is None:
         return

@@ -76,14 +76,14 @@ def limits(
         return limits_of(records, **wanted)
     if model is None:
         return None
-    own = {"low": 0.0, "high": model.values.get("u_rated"), "samples": _SAMPLES}
+    own = {"low": 0.0, "high": model.values.get("u_rated"), "samples": float(_SAMPLES)}
     own |= {k: v for k, v in wanted.items() if v is not None}
     if own.get("duration") is None:
         raise InputError("No length is given; add --duration SECONDS, or --record with records.")
     if own["high"] is None:
         raise InputError("The model has no rated voltage; add --high VOLTS.")
-    samples = int(own.pop("samples") or _SAMPLES)
-    return Limits(samples=samples, **{k: float(v) for k, v in own.items() if v is not None})
+    given = {k: float(v) for k, v in own.items() if v is not None}
+    return Limits(samples=int(given.pop("samples")), **given)
 
 
 def noise(

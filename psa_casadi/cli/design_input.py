@@ -7,6 +7,7 @@ import typer
 
 from psa_casadi.cli.screen import (
     EffectsOption,
+    ModelOption,
     Quiet,
     StackOption,
     StillOption,
@@ -18,13 +19,13 @@ if TYPE_CHECKING:
 
 def input_(
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json of the stack.")] = None,
+    model: ModelOption = None,
     stack: StackOption = None,
     target: Annotated[
-        Path | None, typer.Option(help="CSV of the path: time \\[s], displacement \\[um].")
+        Path | None, typer.Option(help="CSV of the path: time [s], displacement [um].")
     ] = None,
     move: Annotated[
-        tuple[float, float] | None, typer.Option(help="Quickest move FROM TO \\[um] instead.")
+        tuple[float, float] | None, typer.Option(help="Quickest move FROM TO [um] instead.")
     ] = None,
     measured: Annotated[
         Path | None,

@@ -8,6 +8,7 @@ import typer
 
 from psa_casadi.cli.screen import (
     EffectsOption,
+    ModelOption,
     Quiet,
     StackOption,
     StillOption,
@@ -30,7 +31,7 @@ class ActsOn(StrEnum):
 
 def mechanism(
     output: Annotated[Path, typer.Option("-o", "--output", help="MECHANISM.json to write.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json of the stack.")] = None,
+    model: ModelOption = None,
     stack: StackOption = None,
     damping: Annotated[
         float | None, typer.Option(help="Least damping ratio of all mechanical poles.")
@@ -40,7 +41,7 @@ def mechanism(
     ] = None,
     poles: Annotated[
         str | None,
-        typer.Option(help="One or two pairs of poles \\[rad/s]: -4e4+4e4j,-4e4-4e4j"),
+        typer.Option(help="One or two pairs of poles [rad/s]: -4e4+4e4j,-4e4-4e4j"),
     ] = None,
     max_stroke_loss: Annotated[
         str, typer.Option(help="Share of the stroke that the stiffness may take.")
@@ -49,8 +50,8 @@ def mechanism(
         float | None,
         typer.Option(help="Largest force in the mechanism in a step of rated voltage [N]."),
     ] = None,
-    min_mass: Annotated[float, typer.Option(help="Least mass \\[kg].")] = 0.0,
-    max_mass: Annotated[float, typer.Option(help="Largest mass \\[kg].")] = 1.0,
+    min_mass: Annotated[float, typer.Option(help="Least mass [kg].")] = 0.0,
+    max_mass: Annotated[float, typer.Option(help="Largest mass [kg].")] = 1.0,
     max_damping: Annotated[float, typer.Option(help="Largest damping [N.s/m].")] = 1e5,
     acts_on: Annotated[
         ActsOn,

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
+from psa_casadi.cli.expected import JunitOption, expected, judge
 from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
@@ -16,6 +18,8 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     SampleTimeOption,
+    StackOption,
+    StartModelOption,
     StillOption,
     show,
     show_table,
@@ -28,6 +32,7 @@ from psa_casadi.cli.steps import DIAGNOSE
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
     from psa_casadi.diagnosis.result import Diagnosis
+    from psa_casadi.simulation.timings import Timings
 
 
 def diagnose(
@@ -44,9 +49,8 @@ def diagnose(
             " quarter of every record, in blocks."
         ),
     ] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="MODEL.json whose values the base fit starts from.")
-    ] = None,
+    model: StartModelOption = None,
+    stack: StackOption = None,
     stiffness: Annotated[
         float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
     ] = None,
@@ -83,6 +87,7 @@ def diagnose(
             "--leave-out",
             help="Effect that is not to be looked for, as one that cannot be there; repeat the"
             " option for several.",
+            autocompletion=names("effects"),
         ),
     ] = None,
     events: Annotated[
@@ -93,6 +98,22 @@ def diagnose(
             " causes, evidence, score and errors.",
         ),
     ] = None,
+    expect: Annotated[
+        str | None,
+        typer.Option(
+            help="Verdicts of which one must come out, with commas between, else exit code 1:"
+            " adequate, cause_named, partly_explained, ambiguous, unexplained, not_driven.",
+            autocompletion=names("verdicts"),
+        ),
+    ] = None,
+    max_error: Annotated[
+        str | None,
+        typer.Option(
+            help="Largest held-out error of the extended model, in % of the range, as 0.5%, else"
+            " exit code 1."
+        ),
+    ] = None,
+    junit: JunitOption = None,
     still: StillOption = False,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
@@ -102,17 +123,16 @@ def diagnose(
 ) -> None:
     """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
 
-    The exit code is 0 for every verdict.
+    The exit code is 0 for every verdict; with --expect or --max-error it is 1 where the result is
+    not as they say.
     """
     from psa_casadi.simulation.timings import stage, timed
 
     outputs = {
-        "--output": output,
-        "--patch": patch,
-        "--json": json,
-        "--report": report,
+        "--output": output, "--patch": patch, "--json": json, "--report": report,
         "--figure": figure,
-    }
+    }  # fmt: skip
+    began = clock.perf_counter()
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli import diagnosis_files as files
@@ -121,15 +141,15 @@ def diagnose(
             from psa_casadi.diagnosis.diagnose import diagnose as run
             from psa_casadi.diagnosis.result import DiagnosisInterrupted
             from psa_casadi.report.words.text import story
-            from psa_casadi.report.words.timings import timings_table
         with stage("reading"):
             given, held = Given(effects), holdout or []
             given.stiffness(stiffness)
-            beside = {"--next": following, "--events": events}
+            beside = {"--next": following, "--events": events, "--junit": junit}
             given.outputs({**outputs, **beside}, [*records, *held, model])
             _keep_apart(given, output, model)
             found = given.records(records, held_out=held, columns=columns, sample_time=sample_time)
-            start, table = given.model(model), given.searched(leave_out or ())
+            start = given.model_or_stack(model, stack, needed=False)
+            table, wanted = given.searched(leave_out or ()), expected(given, expect, max_error)
             given.check()
         count = len(records)
         with working("diagnosing", quiet, DIAGNOSE) as progress, events_to(events) as watch:
@@ -150,13 +170,21 @@ def diagnose(
             place = following or _beside(json or report)
             d, unpatched = _finish(d, place, outputs, (origin.value, still), progress)
         with stage("writing"):
-            told = story(d, origin=origin.value, width=width())
+            path = None if output is None else str(output)
+            told = story(d, origin=origin.value, width=width(), model_file=path)
     show(told, quiet)
     _tell_files(d, outputs, unpatched, quiet)
     if timings:
-        show("", quiet)
-        show_table(timings_table(spent.stages), quiet)
-        show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", quiet)
+        _tell_timings(spent, quiet)
+    judge("diagnose", ", ".join(p.name for p in records), wanted.cases(d), junit, began, tells=True)
+
+
+def _tell_timings(spent: "Timings", quiet: bool) -> None:
+    from psa_casadi.report.words.timings import timings_table
+
+    show("", quiet)
+    show_table(timings_table(spent.stages), quiet)
+    show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", quiet)
 
 
 def _tell_files(
@@ -191,12 +219,12 @@ def _finish(
     origin, still = page
     try:
         with stage("next experiment"):
-            d = _with_next(d, following, progress)
+            d = files.with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
             files.write(d, {**outputs, "--patch": None}, origin, written, still=still)
         with stage("unnamed correction"):
-            return d, _write_patch(d, outputs["--patch"], progress)
+            return d, files.write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(files.keep(d, outputs, origin, written)) from None
 
@@ -212,48 +240,3 @@ def _keep_apart(given: "Given", output: Path | None, model: Path | None) -> None
 def _beside(path: Path | None) -> Path | None:
     """Return where the next voltage goes if no place is named."""
     return path.with_name(f"{path.stem}_next.csv") if path is not None else None
-
-
-def _with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> "Diagnosis":
-    """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
-    if path is None or d.verdict != "ambiguous":
-        return d
-    from dataclasses import replace
-
-    from psa_casadi.design.experiment.experiment import resolving_experiment
-    from psa_casadi.diagnosis.result import NextExperiment
-    from psa_casadi.diagnosis.search.contenders import one_of_each
-    from psa_casadi.errors import PsaError
-    from psa_casadi.report.page.experiment_part import sentences, write_voltage
-
-    told, same = one_of_each(d.contenders, d.experiments)
-    if same and len(told) < 2:
-        return d
-    try:
-        design = resolving_experiment(d, progress=progress)
-    except PsaError as error:
-        why = f"{d.next_experiment.why} No record could be designed: {error}"
-        return replace(d, next_experiment=replace(d.next_experiment, why=why))
-    each = sentences(design, d.model.values.get("C_p"))
-    if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
-        why = " ".join((d.next_experiment.why, *each[:-1], same)).rstrip()
-        return replace(d, next_experiment=replace(d.next_experiment, why=why))
-    write_voltage(path, design.record)
-    why = " ".join((f"Apply {path} and diagnose all records together.", *each, same)).rstrip()
-    following = NextExperiment(str(path), design.names, why, dict(design.chance))
-    return replace(d, next_experiment=following)
-
-
-def _write_patch(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> str:
-    """Write the model with the unnamed correction; say why where there is none to write."""
-    if path is None:
-        return ""
-    import psa_casadi as psa
-    from psa_casadi.errors import PsaError
-
-    progress("fitting the unnamed correction")
-    try:
-        psa.save_model(psa.patched_model(d), path)
-    except PsaError as error:
-        return f"{path} was not written: {error}"
-    return ""

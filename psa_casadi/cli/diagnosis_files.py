@@ -76,10 +76,13 @@ def write(
     import psa_casadi as psa
     from psa_casadi.files import atomic_write
 
+    extended = None if outputs["--output"] is None else str(outputs["--output"])
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
         "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: psa.write_report(d, path, origin=origin, still=still),
+        "--report": lambda path: psa.write_report(
+            d, path, origin=origin, still=still, model_file=extended
+        ),
         "--figure": lambda path: psa.save_figure(d, path, origin=origin),
     }
     for option, path in outputs.items():
@@ -89,3 +92,48 @@ def write(
     for a, path in alternatives(d, outputs["--output"]):
         psa.save_model(a.model, path)
         written.append(path)
+
+
+def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> "Diagnosis":
+    """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
+    if path is None or d.verdict != "ambiguous":
+        return d
+    from dataclasses import replace
+
+    from psa_casadi.design.experiment.experiment import resolving_experiment
+    from psa_casadi.diagnosis.result import NextExperiment
+    from psa_casadi.diagnosis.search.contenders import one_of_each
+    from psa_casadi.errors import PsaError
+    from psa_casadi.report.page.experiment_part import sentences, write_voltage
+
+    told, same = one_of_each(d.contenders, d.experiments)
+    if same and len(told) < 2:
+        return d
+    try:
+        design = resolving_experiment(d, progress=progress)
+    except PsaError as error:
+        why = f"{d.next_experiment.why} No record could be designed: {error}"
+        return replace(d, next_experiment=replace(d.next_experiment, why=why))
+    each = sentences(design, d.model.values.get("C_p"))
+    if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
+        why = " ".join((d.next_experiment.why, *each[:-1], same)).rstrip()
+        return replace(d, next_experiment=replace(d.next_experiment, why=why))
+    write_voltage(path, design.record)
+    why = " ".join((f"Apply {path} and diagnose all records together.", *each, same)).rstrip()
+    following = NextExperiment(str(path), design.names, why, dict(design.chance))
+    return replace(d, next_experiment=following)
+
+
+def write_patch(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> str:
+    """Write the model with the unnamed correction; say why where there is none to write."""
+    if path is None:
+        return ""
+    import psa_casadi as psa
+    from psa_casadi.errors import PsaError
+
+    progress("fitting the unnamed correction")
+    try:
+        psa.save_model(psa.patched_model(d), path)
+    except PsaError as error:
+        return f"{path} was not written: {error}"
+    return ""

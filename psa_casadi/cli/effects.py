@@ -6,26 +6,32 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.screen import EffectsOption, show, show_table, tell_written, width
 
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
+    from psa_casadi.diagnosis.remedy.size import Size
+    from psa_casadi.model.compose import Model
 
 
 def effects(
-    name: Annotated[str | None, typer.Argument(help="Name of one effect.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="Name of one effect.", autocompletion=names("effects"))
+    ] = None,
     figure: Annotated[
         Path | None,
         typer.Option(help="PNG picture of the effect's signature to write; needs NAME."),
     ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="MODEL.json of the stack for which NAME's size is told."),
+    ] = None,
     modules: EffectsOption = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print names only.")] = False,
 ) -> None:
-    """List the effects that a diagnosis looks for; show one with equation, signature and source.
-
-    Example: psa effects slow_creep --figure creep.png
-    """
+    """List the effects that a diagnosis looks for; show one: equation, signature, size, remedy."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.effects.modal_series import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects
@@ -35,6 +41,7 @@ def effects(
     given = Given(modules)
     listed = known_effects(given.effects)
     known = {**listed, **{e.name: e for e in MODAL_SERIES.values()}}
+    stack = given.model(model)
     wanted = _known(given, name, list(known), figure)
     if wanted is None:
         if quiet:
@@ -44,7 +51,7 @@ def effects(
         return
     if figure is not None:
         _draw(known[wanted], figure)
-    show(wanted if quiet else effect_page(known[wanted], width()))
+    show(wanted if quiet else effect_page(known[wanted], width(), _seen(known[wanted], stack)))
     tell_written(figure, quiet=quiet)
 
 
@@ -67,6 +74,17 @@ def _known(given: "Given", name: str | None, names: list[str], figure: Path | No
             given.add(f"There is no effect named '{name}'; {meant}")
     given.check()
     return wanted
+
+
+def _seen(effect: "Component", stack: "Model | None") -> "tuple[Model, tuple[Size, ...]] | None":
+    """Return how large an effect is on a stack, None where there is no compiler to simulate it."""
+    from psa_casadi.diagnosis.remedy.size import example
+    from psa_casadi.errors import MachineError
+
+    try:
+        return example(effect, stack)
+    except MachineError:
+        return None
 
 
 def _draw(effect: "Component", path: Path) -> None:

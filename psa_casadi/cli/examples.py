@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.screen import Quiet, show, show_table, tell_written, working
 
 if TYPE_CHECKING:
@@ -14,7 +15,10 @@ if TYPE_CHECKING:
 
 
 def examples(
-    name: Annotated[str | None, typer.Argument(help="Name of an example or a recipe.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Name of an example or a recipe.", autocompletion=names("examples")),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="Folder for its files; it is created."),
@@ -27,6 +31,7 @@ def examples(
     """List examples and recipes; show one; with -o copy it to a folder and run an example there."""
     from psa_casadi.examples.index import copy_example, run_example
     from psa_casadi.examples.index import examples as known
+    from psa_casadi.files import make_folder
 
     found = _chosen(name, output, copy_only)
     if found is None:
@@ -38,7 +43,7 @@ def examples(
     if output is None:
         show(found.text.rstrip("\n"))
         return
-    _create(output)
+    make_folder(output)
     before = {p.name for p in output.iterdir()}
     written = copy_example(found, output)
     result: object = None
@@ -70,17 +75,6 @@ def _chosen(name: str | None, output: Path | None, copy_only: bool) -> "Example 
             given.add(f"There is no example or recipe named '{name}'; {meant}")
     given.check()
     return found
-
-
-def _create(folder: Path) -> None:
-    from psa_casadi.errors import InputError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be created ({error.strerror}); name another folder."
-        ) from error
 
 
 def _list(found: "Mapping[str, Example]") -> None:

@@ -14,6 +14,7 @@ from psa_casadi.cli.screen import (
     EffectsOption,
     HistoryOption,
     LicenseOption,
+    ModelOption,
     ModelVersionOption,
     PartOption,
     Quiet,
@@ -48,7 +49,7 @@ class Solver(StrEnum):
 
 def fmu(
     output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
+    model: ModelOption = None,
     stack: StackOption = None,
     part: PartOption = None,
     fmi: Annotated[FmiVersion, typer.Option(help="Version of the standard.")] = FmiVersion.TWO,
@@ -157,11 +158,11 @@ def fmu(
 def write_sets(model: "Model", samples: int, folder: Path | None) -> int:
     """Write the parameter sets to a folder, if one is named, and return how many there are."""
     from psa_casadi.export.fmu.evidence_files import set_files
-    from psa_casadi.files import atomic_write
+    from psa_casadi.files import atomic_write, make_folder
 
     texts = set_files(model, samples)
     if folder is not None and texts:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for place, text in texts.items():
             atomic_write(folder / place.rpartition("/")[2], text)
     return len(texts)

@@ -11,6 +11,7 @@ from psa_casadi.cli.screen import (
     EffectsOption,
     HistoryOption,
     LicenseOption,
+    ModelOption,
     ModelVersionOption,
     PartOption,
     Quiet,
@@ -26,7 +27,7 @@ from psa_casadi.cli.screen import (
 
 def modelica(
     output: Annotated[Path, typer.Option("-o", "--output", help="Modelica file to write.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
+    model: ModelOption = None,
     stack: StackOption = None,
     part: PartOption = None,
     name: Annotated[str, typer.Option(help="Name of the package.")] = "PiezoStack",

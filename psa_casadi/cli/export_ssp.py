@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.screen import (
     AuthorOption,
     CopyrightOption,
     EffectsOption,
     LicenseOption,
+    ModelOption,
     ModelVersionOption,
     Quiet,
     show,
@@ -26,13 +28,14 @@ DEFAULT_STACK = "P-885.51"
 
 def ssp(
     output: Annotated[Path, typer.Option("-o", "--output", help="SSP archive to write.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json of the stack.")] = None,
+    model: ModelOption = None,
     stack: Annotated[
         str | None,
         typer.Option(
             "--stack",
             help="Named stack in place of a model; `psa stacks` lists them.",
             show_default=DEFAULT_STACK,
+            autocompletion=names("stacks"),
         ),
     ] = None,
     no_compensator: Annotated[

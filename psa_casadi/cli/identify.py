@@ -16,6 +16,8 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     SampleTimeOption,
+    StackOption,
+    StartModelOption,
     StillOption,
     show,
     tell_written,
@@ -43,10 +45,11 @@ def identify(
             help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="MODEL.json to write.")],
-    model: Annotated[
-        Path | None, typer.Option(help="MODEL.json whose values the fit starts from.")
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="MODEL.json to write.")
     ] = None,
+    model: StartModelOption = None,
+    stack: StackOption = None,
     stiffness: Annotated[
         float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
     ] = None,
@@ -79,14 +82,14 @@ def identify(
     given = Given(effects)
     if method is Method.PAPER and profile:
         given.add("--method paper has no likelihood; leave --profile or --method out.")
-    if method is Method.PAPER and model is not None:
-        given.add("--method paper starts from no model; leave --model or --method out.")
+    if method is Method.PAPER and (model, stack) != (None, None):
+        given.add("--method paper starts from no model; leave --model, --stack or --method out.")
     if method is Method.PAPER and hysteresis not in (None, Form.BOUC_WEN):
         given.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
     given.stiffness(stiffness)
     given.outputs({"--output": output, "--json": json, "--report": report}, [*records, model])
     measured = given.records(records, columns=columns, sample_time=sample_time)
-    start = given.model(model)
+    start = given.model_or_stack(model, stack, needed=False)
     given.check()
     with working("identifying", quiet, IDENTIFY) as progress:
         if method is Method.PAPER:
@@ -117,7 +120,7 @@ def identify(
 
 def _finish(
     found: "Identification",
-    output: Path,
+    output: Path | None,
     more: tuple[Path | None, Path | None, bool],
     wanted: Sequence[str],
     origin: str,
@@ -136,9 +139,11 @@ def _finish(
     from psa_casadi.strict_json import json_text
 
     json, report, still = more
-    done = [output]
+    done: list[Path] = []
     try:
-        save_model(found.model, output)
+        if output is not None:
+            save_model(found.model, output)
+            done.append(output)
         names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
         profiles = [profile(found.fit, found.experiments, n, progress=progress) for n in names]
         if json is not None:
@@ -149,11 +154,14 @@ def _finish(
             write_fit_report(found, report, origin=origin, profiles=profiles, still=still)
         ended = found.interrupted
     except KeyboardInterrupt:
-        save_model(found.model, output)
+        if output is not None and output not in done:
+            save_model(found.model, output)
+            done.append(output)
         ended = True
     if not ended:
         return profiles
     cut = found.fit.interrupted
     what = "the search was cut off" if cut else "the fit was finished before"
     mark = " (marked as interrupted)" if cut else ""
-    raise KeyboardInterrupt(kept(what, done, [p for p in (json, report) if p not in done], mark))
+    missing = [p for p in (output, json, report) if p not in done]
+    raise KeyboardInterrupt(kept(what, done, missing, mark))

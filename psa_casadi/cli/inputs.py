@@ -3,12 +3,13 @@
 import difflib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from psa_casadi.cli.screen import tell
 from psa_casadi.component import Component
 from psa_casadi.errors import InputError
 from psa_casadi.files import why_not_written
@@ -17,7 +18,7 @@ from psa_casadi.model.model_file import load_model
 from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record, read_record
+from psa_casadi.records import Record, read_record, read_records
 from psa_casadi.records.read.column_map import files_named, parse_columns
 from psa_casadi.records.read.columns import ColumnMap
 from psa_casadi.simulation.history import settled_at
@@ -70,23 +71,21 @@ class Given:
         if wanted is None:
             return []
         found: list[Record] = []
-        for path in (*paths, *held_out):
-            fitted = path in paths
-            # the loop's values are bound as defaults, whose types a lambda cannot state
-            record = self.attempt(
-                lambda p=path, f=fitted: read_record(  # type: ignore[misc]
-                    p, need_excitation=f, columns=wanted, sample_time=sample_time
-                )
+        for files, fitted in ((paths, True), (held_out, False)):
+            read = partial(
+                read_records, files, need_excitation=fitted, columns=wanted, sample_time=sample_time
             )
-            if record is None:
-                continue
-            twin = next((r for r in found if r.sha256 == record.sha256), None)
-            if twin is not None:
-                self.add(
-                    f"{path}: holds the same data as {twin.source}; a record counts once, and one"
-                    " that is held out cannot be fitted too: remove one of the two."
-                )
-            found.append(record)
+            for record in (self.attempt(read) if files else None) or ():
+                twin = next((r for r in found if r.is_same(record)), None)
+                if twin is not None:
+                    self.add(
+                        f"{record.source}: holds the same data as {twin.source}; a record counts"
+                        " once, and one that is held out cannot be fitted too: remove one of the"
+                        " two."
+                    )
+                found.append(record)
+                for note in record.notes:
+                    tell(f"Note: {note}")
         return found
 
     def voltage(
@@ -133,10 +132,9 @@ class Given:
         known = known_effects(self.effects)
         for name in dict.fromkeys(left_out):
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-                meant = f"is '{near[0]}' meant? " if near else ""
                 self.add(
-                    f"--leave-out: there is no effect '{name}'; {meant}`psa effects` lists them."
+                    f"--leave-out: there is no effect '{name}'; {meant(name, known)}`psa effects`"
+                    " lists them."
                 )
         return tuple(c for n, c in known.items() if n not in left_out)
 
@@ -147,8 +145,9 @@ class Given:
         *,
         part: str | None = None,
         any_model: bool = False,
+        needed: bool = True,
     ) -> Model | None:
-        """Read a model, or compose a named stack or part; exactly one of them must be given.
+        """Read a model, or compose a named stack or part; one at most, and one where it is needed.
 
         With `any_model` the file need not hold a stack.
         """
@@ -163,7 +162,10 @@ class Given:
         if stack is not None:
             return self.attempt(lambda: stack_model(stack))
         if path is None:
-            self.add("No model is given; add --model MODEL.json, or --stack NAME (`psa stacks`).")
+            if needed:
+                self.add(
+                    "No model is given; add --model MODEL.json, or --stack NAME (`psa stacks`)."
+                )
             return None
         if any_model:
             return self.attempt(lambda: load_model(path, self.effects))
@@ -254,6 +256,12 @@ class Given:
                 f"{path}: cannot write, {path.resolve().parent} may not be written to; choose"
                 " another place."
             )
+
+
+def meant(word: str, known: Iterable[str]) -> str:
+    """Return the question whether the most similar of the known words is meant, or nothing."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"is '{near[0]}' meant? " if near else ""
 
 
 def step_seconds(text: str) -> float:

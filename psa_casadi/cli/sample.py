@@ -12,6 +12,7 @@ from psa_casadi.cli.screen import (
     OriginOption,
     Quiet,
     SampleTimeOption,
+    StackOption,
     show,
     tell_written,
     width,
@@ -20,16 +21,17 @@ from psa_casadi.cli.screen import (
 
 
 def sample(
-    model: Annotated[
-        Path,
-        typer.Argument(help="MODEL.json whose values the chains start near.", show_default=False),
-    ],
     records: Annotated[
         list[Path],
         typer.Argument(
             help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
         ),
     ],
+    model: Annotated[
+        Path | None,
+        typer.Option(help="MODEL.json whose values the chains start near.", show_default=False),
+    ] = None,
+    stack: StackOption = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="netCDF file of the draws to write, as ArviZ has it."),
@@ -81,10 +83,12 @@ def sample(
     from psa_casadi.strict_json import json_text
 
     given = Given(effects)
+    if (model, stack) == (None, None) and len(records) > 1 and records[0].suffix == ".json":
+        model, *records = records  # as it was written before there was --model here
     given.outputs({"--output": output, "--json": json, "--figure": figure}, [model, *records])
     centres, widths = given.priors(prior or ())
     measured = given.records(records, columns=columns, sample_time=sample_time)
-    start = given.model(model)
+    start = given.model_or_stack(model, stack)
     given.check()
     if start is None:
         return

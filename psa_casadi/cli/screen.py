@@ -3,7 +3,9 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -12,6 +14,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from psa_casadi.characters import visible
+from psa_casadi.cli.completion import names
 from psa_casadi.cli.steps import PLAIN, Course, Told
 
 if TYPE_CHECKING:
@@ -22,9 +25,24 @@ Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress and no summary; errors still show.")
 ]
 
+ModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--model", help="MODEL.json, as `psa identify`, `psa diagnose` and `psa design` write it."
+    ),
+]
+
+StartModelOption = Annotated[
+    Path | None, typer.Option("--model", help="MODEL.json whose values the fits start from.")
+]
+
 StackOption = Annotated[
     str | None,
-    typer.Option("--stack", help="Named stack in place of a model; `psa stacks` lists them."),
+    typer.Option(
+        "--stack",
+        help="Named stack in place of a model; `psa stacks` lists them.",
+        autocompletion=names("stacks"),
+    ),
 ]
 
 PartOption = Annotated[
@@ -33,6 +51,7 @@ PartOption = Annotated[
         "--part",
         help="Part around a stack, in place of a model: flexure_stage,"
         " position_controller, hysteresis_compensator, voltage_amplifier, charge_amplifier.",
+        autocompletion=names("parts"),
     ),
 ]
 
@@ -51,7 +70,8 @@ ColumnsOption = Annotated[
         "--columns",
         help="Which array of the file is which column, if the names differ:"
         " time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:"
-        " displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms",
+        " displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms; table=2 takes one"
+        " of several tables in a file, table=all each as a record.",
     ),
 ]
 
@@ -64,9 +84,7 @@ StillOption = Annotated[
 
 SampleTimeOption = Annotated[
     float | None,
-    typer.Option(
-        "--sample-time", help="Time from sample to sample \\[s], for files without a time."
-    ),
+    typer.Option("--sample-time", help="Time from sample to sample [s]; it goes before a file's."),
 ]
 
 
@@ -100,11 +118,11 @@ SweepOption = Annotated[
     float,
     typer.Option(
         "--sweep",
-        help="Duration of each sweep of the history \\[s]; it matters to delta and creep.",
+        help="Duration of each sweep of the history [s]; it matters to delta and creep.",
     ),
 ]
 
-RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history \\[s].")]
+RestOption = Annotated[float, typer.Option("--rest", help="Rest after the history [s].")]
 
 StartVoltageOption = Annotated[
     float | None,
@@ -152,8 +170,8 @@ OriginOption = Annotated[
 
 
 def width() -> int:
-    """Return the columns to write in: the terminal's up to 110, or 100 where there is none."""
-    return min(110, Console().width) if sys.stdout.isatty() else 100
+    """Return the columns to write in: the terminal's up to 110, or 80 where there is none."""
+    return min(110, Console().width) if sys.stdout.isatty() else 80
 
 
 @contextmanager
@@ -203,16 +221,19 @@ def show_table(table: "Table", quiet: bool = False) -> None:
     """Print a table: drawn on a terminal, in plain columns elsewhere."""
     if quiet:
         return
+    table = replace(table, rows=tuple(tuple(map(visible, row)) for row in table.rows))
     if not sys.stdout.isatty():
-        show(str(table))
+        show(table.fitted(width()))
         return
-    drawn = RichTable(show_edge=False)
-    for name in table.head:
-        drawn.add_column(name, overflow="fold")
+    console, drawn = Console(), RichTable(show_edge=False)
+    # two spaces in a column, a line between two of them
+    widths = table.widths(console.width - 3 * len(table.head) + 1)
+    for name, column in zip(table.head, widths, strict=True):
+        drawn.add_column(name, overflow="fold", width=column)
     styles = {"FAIL": "bold red", "pass": "green"}
     for row in table.rows:
-        drawn.add_row(*(Text(visible(cell), style=styles.get(cell, "")) for cell in row))
-    Console().print(drawn)
+        drawn.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+    console.print(drawn)
 
 
 def tell_written(*paths: object, quiet: bool = False) -> None:

@@ -9,6 +9,7 @@ from psa_casadi.cli.screen import (
     ColumnsOption,
     EffectsOption,
     HistoryOption,
+    ModelOption,
     Quiet,
     RestOption,
     SampleTimeOption,
@@ -31,7 +32,7 @@ def simulate(
         Path, typer.Option("--input", help="Record with time and voltage, and load_force if any.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="CSV to write.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json to simulate.")] = None,
+    model: ModelOption = None,
     stack: StackOption = None,
     columns: ColumnsOption = None,
     sample_time: SampleTimeOption = None,
@@ -53,8 +54,7 @@ def simulate(
 
     The stack starts settled at the first voltage, its hysteresis and creep relaxed, or as --history
     leaves them. With --start-voltage, or a model file that has start values, it starts like an FMU
-    exported with the same options. Example:
-    psa simulate --stack P-885.51 --input voltage.csv --history 120,0,120 -o out.csv
+    exported with the same options.
     """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.records import write_record

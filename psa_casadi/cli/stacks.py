@@ -1,14 +1,18 @@
 """`psa stacks`: stacks by name, with the sources of their figures."""
 
+import textwrap
 from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.screen import show, show_table
+from psa_casadi.cli.completion import names
+from psa_casadi.cli.screen import show, show_table, width
 
 
 def stacks(
-    name: Annotated[str | None, typer.Argument(help="Name of one stack.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="Name of one stack.", autocompletion=names("stacks"))
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print names only.")] = False,
 ) -> None:
     """List the stacks that can be used by name; show the figures of one with their sources."""
@@ -25,5 +29,5 @@ def stacks(
     if quiet:
         show(name)
         return
-    show(f"{name}: {description}\n")
+    show(textwrap.fill(f"{name}: {description}", width()) + "\n")
     show_table(stack_table(STACKS[name]))

@@ -22,9 +22,10 @@ from psa_casadi.errors import InputError
 
 
 def web(
+    more: typer.Context,
     model: Annotated[
         Path | None,
-        typer.Argument(help="MODEL.json to play with; by default the stack P-885.51."),
+        typer.Option(help="MODEL.json to play with; by default every named stack."),
     ] = None,
     output: Annotated[
         Path | None,
@@ -59,10 +60,14 @@ def web(
     It needs the compiler of the extra `compiler`; the page needs a browser alone. With --diagnose,
     serve a page that diagnoses records until Ctrl-C; nothing leaves the machine.
     """
+    if more.args and model is None:  # as it was written before there was --model here
+        model = Path(more.args.pop(0))
+    if more.args:
+        raise InputError(f"{more.args[0]}: is one file too many; give one model, by --model.")
     if diagnose:
         if model is not None or stack is not None or output is not None:
             raise InputError(
-                "--diagnose serves a page of its own: leave MODEL.json, --stack and -o out; a"
+                "--diagnose serves a page of its own: leave --model, --stack and -o out; a"
                 " MODEL.json to start from is dropped there."
             )
         _serve(port or 0, no_browser, effects or [])

@@ -9,7 +9,7 @@ from psa_casadi.cache import writable_room
 from psa_casadi.datasets.devices import DATASETS
 from psa_casadi.datasets.published import Dataset, DatasetFile, Original
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.files import atomic_write
+from psa_casadi.files import atomic_write, make_folder
 
 #: Names the folder with the records of a machine that downloads nothing.
 DATA_VARIABLE = "PSA_CASADI_DATA"
@@ -43,13 +43,8 @@ def copy(name: str, folder: str | os.PathLike[str]) -> list[Path]:
         PsaError: as `paths`.
     """
     dataset, target = find(name), Path(folder)
+    make_folder(target)
     found = paths(name)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{target}: cannot be made a folder ({error.strerror}); name another one."
-        ) from error
     written = []
     for path in found:
         written.append(target / path.name)

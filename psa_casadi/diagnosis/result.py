@@ -12,6 +12,7 @@ from psa_casadi.diagnosis.budget import Budget
 from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.held_out.errors import Errors, Gain
 from psa_casadi.diagnosis.noise.floor import NoiseFloor
+from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
@@ -38,7 +39,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Cause:
-    """A named cause: where it sits, how sure, how large, and what else it may be."""
+    """A named cause: where it sits, how sure, how large, and what else it may be.
+
+    `remedy` says as a code what to do about it, `sizes` what it changes in the tests that the
+    effect declares.
+    """
 
     effect: str
     belongs_to: str
@@ -46,6 +51,8 @@ class Cause:
     parameters: Mapping[str, Estimate]
     cannot_be_told_from: tuple[str, ...]
     explained_share: float
+    remedy: str = ""
+    sizes: tuple[Size, ...] = ()
 
 
 @dataclass(frozen=True)

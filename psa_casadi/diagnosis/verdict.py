@@ -32,6 +32,7 @@ from psa_casadi.diagnosis.judgement import (
 )
 from psa_casadi.diagnosis.next_record import next_experiment
 from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
+from psa_casadi.diagnosis.remedy.size import sizes
 from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
     Candidate,
@@ -49,7 +50,6 @@ from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.diagnosis.weighing import Balance
 from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
-from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
@@ -141,7 +141,9 @@ def conclude(
     named = kept if verdict in NAMING else []
     small = too_small([c for c in spent.causes if c.what not in vague]) if partly and named else ()
     unnamed = {*vague, *(c.what for c in small)}
-    causes = tuple(_cause(s, last.fit, found, spent) for s in named if s.cause.name not in unnamed)
+    causes = tuple(
+        _cause(s, model, found, spent, experiments) for s in named if s.cause.name not in unnamed
+    )
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -216,11 +218,14 @@ def _misfits(
     )
 
 
-def _cause(s: Step, final: Fit, found: Determinacy, spent: Budget) -> Cause:
-    """State a cause: its probability, and the share of the error that it removes."""
+def _cause(
+    s: Step, model: Model, found: Determinacy, spent: Budget, experiments: Sequence[Experiment]
+) -> Cause:
+    """State a cause: its probability, the share of the error that it removes, what it changes."""
+    records = [e.record for e in experiments]
     estimates = {
         p.name: Estimate(
-            final.model.values[p.name],
+            model.values[p.name],
             p.unit,
             (found.intervals[p.name].low, found.intervals[p.name].high),
         )
@@ -235,6 +240,8 @@ def _cause(s: Step, final: Fit, found: Determinacy, spent: Budget) -> Cause:
         parameters=estimates,
         cannot_be_told_from=told_from(s),
         explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
+        remedy=s.cause.what_now.code,
+        sizes=sizes(s.cause, model, records, unit=records[0].displacement_unit),
     )
 
 

@@ -7,7 +7,7 @@ second does; which of the two it is, is not fitted but tried.
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.smooth import rate_magnitude
 from psa_casadi.variables import Parameter, State
 
@@ -52,5 +52,6 @@ AGEING = Component(
     ),
     equations=_equations,
     probe={"ageing_time": (0.1, 10.0), "ageing_by_travel": (0.0, 1.0)},
+    remedy=Remedy("identify_again", "record"),
     looks_like="the gain falls by the same share with every decade of time, or of cycles made",
 )

@@ -5,7 +5,7 @@ for the hysteresis, which an amplifier bends as well. A monitor of the output vo
 apart: the effect is looked for where there is one.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.effects.bend import ANGLES, BEND_TEXT, bend, shape_parameters
 from psa_casadi.variables import Parameter
 
@@ -40,5 +40,6 @@ AMPLIFIER_NONLINEARITY = Component(
     equations=_equations,
     needs_column=("monitor_voltage",),
     probe={"amplifier_angle": ANGLES},
+    remedy=Remedy("measure_voltage", "range"),
     looks_like="the voltage at the stack is a bent curve over the command, on both branches alike",
 )

@@ -5,7 +5,7 @@ reversal z moves from one end to the other and the output, at gain 1, stands sti
 with dry friction does the same in the displacement: it holds the output back over a fixed width.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.effects.sizes import stroke
 from psa_casadi.scales import stroke_scale
 from psa_casadi.smooth import magnitude_power, signed_power, smooth_magnitude
@@ -63,5 +63,6 @@ BACKLASH = Component(
     ),
     equations=_equations,
     probe={"backlash_width": (0.003, 0.01)},
+    remedy=Remedy("preload", "reversal"),
     looks_like="a dwell of one fixed width after every reversal, whatever the amplitude",
 )

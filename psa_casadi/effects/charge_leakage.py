@@ -8,7 +8,7 @@ amplifier goes over to controlling the voltage. z is the part that leaks: 0 afte
 after it. A record may begin before it has settled, so z is a memory.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.scales import voltage_scale
 from psa_casadi.variables import Parameter, State
 
@@ -40,5 +40,6 @@ CHARGE_LEAKAGE = Component(
     equations=_equations,
     finite_step=(1.0, 100.0),  # plain leakage takes the whole charge: far from a derivative at 0
     probe={"leak_time": (0.3, 3.0, 30.0)},
+    remedy=Remedy("hold_charge", "hold"),
     looks_like="droop back after every step, exponential in time; less stroke at low frequencies",
 )

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.variables import Parameter, Values
 
 #: Even exponent of the smooth clip; the larger, the sharper the corner.
@@ -41,5 +41,6 @@ CURRENT_LIMIT = Component(
         ),
     ),
     equations=_equations,
+    remedy=Remedy("more_current", "slew"),
     looks_like="steps become ramps; the rate of the displacement is capped at one value",
 )

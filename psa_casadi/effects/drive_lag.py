@@ -4,7 +4,7 @@ v_d = G v / (1 + s T + shape s^2 T^2): one pole for a shape of 0, two equal ones
 maximally flat pair for 1/2. Beside the base's R_s C_p a single pole hardly shows.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.scales import voltage_scale
 from psa_casadi.variables import Parameter, State
 
@@ -57,6 +57,7 @@ DRIVE_LAG = Component(
     ),
     equations=_equations,
     probe={"drive_lag_shape": (0.01, 0.4)},
+    remedy=Remedy("better_drive", "slew"),
     looks_like=(
         "extra lag and roll-off with frequency, the same at every amplitude; the current lags too"
     ),

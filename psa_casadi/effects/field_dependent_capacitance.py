@@ -5,7 +5,7 @@ shows no more of it than a drive whose lag grows with the voltage, so that it is
 charge or a current was measured.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.smooth import smooth_magnitude
 from psa_casadi.variables import Parameter
 
@@ -45,5 +45,6 @@ FIELD_DEPENDENT_CAPACITANCE = Component(
     ),
     equations=_equations,
     needs_column=("charge", "current"),
+    remedy=Remedy("control_charge", "slew"),
     looks_like="charge per volt grows with the amplitude; the drive's lag grows with the voltage",
 )

@@ -7,7 +7,7 @@ is d_0 E + alpha E |E|. The loops around this curve are the hysteresis force's b
 bend of their middle line is what the base lacks.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.smooth import smooth_magnitude
 from psa_casadi.variables import Parameter
 
@@ -35,5 +35,6 @@ FIELD_DEPENDENT_GAIN = Component(
         ),
     ),
     equations=_equations,
+    remedy=Remedy("undo_curve", "range"),
     looks_like="the gain grows in proportion to the amplitude; both branches curve upwards",
 )

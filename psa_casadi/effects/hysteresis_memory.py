@@ -1,6 +1,6 @@
 """Hysteresis memory: the error depends on past reversal points; minor loops nest differently."""
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.plays import spectrum_force, spectrum_parameters
 from psa_casadi.scales import stop_scale, voltage_scale
 from psa_casadi.smooth import stop_rate
@@ -78,6 +78,7 @@ HYSTERESIS_MEMORY = Component(
     states=tuple(_state(i + 1) for i in range(len(_RATIOS))),
     equations=_equations,
     probe={"memory_threshold": (0.015, 0.12)},
+    remedy=Remedy("undo_hysteresis", "reversal"),
     looks_like=(
         "the residual changes with the distance from past reversal points; minor loops do not nest"
     ),

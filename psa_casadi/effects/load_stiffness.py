@@ -11,7 +11,7 @@ off: a load that softens would run away.
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.effects.bend import ANGLES, BEND_TEXT, bend, shape_parameters
 from psa_casadi.effects.sizes import static_stiffness, stroke
 from psa_casadi.variables import Parameter
@@ -50,5 +50,6 @@ LOAD_STIFFNESS = Component(
     curve="displacement",
     measured_by="load_force",
     probe={"load_angle": ANGLES},
+    remedy=Remedy("undo_load_curve", "range"),
     looks_like="the curve bends with displacement, however fast or by what force it got there",
 )

@@ -10,7 +10,7 @@ both phases.
 
 import casadi as ca
 
-from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Symbols
+from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Remedy, Symbols
 from psa_casadi.scales import reading_scale
 from psa_casadi.variables import Parameter, State
 
@@ -52,6 +52,7 @@ MAINS_HUM = Component(
     states=(_part("cosine"), _part("sine")),
     equations=_equations,
     probe={"hum_frequency": SPECTRAL_PEAKS},
+    remedy=Remedy("shield", "record"),
     looks_like="a narrow line in the residual's spectrum, as strong when the voltage rests",
     trial_starts=({"hum_cosine": 1.0}, {"hum_sine": 1.0}),
 )

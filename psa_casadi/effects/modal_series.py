@@ -7,7 +7,7 @@ There is a component for every number of modes.
 
 from functools import partial
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Expression, Remedy, Symbols
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, State, Values
@@ -82,6 +82,7 @@ def modal_series(count: int) -> Component:
         parameters=(gain, *(p for k in numbers for p in _parameters(k))),
         states=tuple(s for k in numbers for s in _states(k)),
         equations=partial(_equations, count),
+        remedy=Remedy("avoid_resonance", "resonance"),
         looks_like="the residual rings at several tones that are no poles of the stack",
         more_of=STRUCTURAL_MODE.name,
         count=count,

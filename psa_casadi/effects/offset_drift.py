@@ -1,6 +1,6 @@
 """Offset drift: the sensor's zero moves with time alone."""
 
-from psa_casadi.component import RECORD_DURATION, Component, Equations, Symbols
+from psa_casadi.component import RECORD_DURATION, Component, Equations, Remedy, Symbols
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, Values
 
@@ -34,5 +34,6 @@ OFFSET_DRIFT = Component(
     ),
     equations=_equations,
     probe={"drift_span": RECORD_DURATION, "drift_bend": (-0.5, 0.0)},
+    remedy=Remedy("zero_again", "record"),
     looks_like="the residual is a slow function of time alone, also at constant voltage",
 )

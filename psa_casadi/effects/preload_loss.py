@@ -9,7 +9,7 @@ stiffer on one side of a displacement than on the other bends the curve there in
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.effects.sizes import static_stiffness, stroke
 from psa_casadi.variables import Parameter
 
@@ -53,5 +53,6 @@ PRELOAD_LOSS = Component(
     ),
     equations=_equations,
     probe={"contact_position": (0.2, 0.4, 0.65)},
+    remedy=Remedy("preload", "range"),
     looks_like="the slope changes abruptly at one displacement, the same on both branches",
 )

@@ -13,7 +13,7 @@ leaves the memory as it is.
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.scales import stop_scale, voltage_scale
 from psa_casadi.smooth import direction, magnitude_power, signed_power, stop_rate
 from psa_casadi.variables import Parameter, State
@@ -100,5 +100,6 @@ RATE_DEPENDENT_HYSTERESIS = Component(
     ),
     equations=_equations,
     probe={"rate_onset": (0.1, 3.0), "rate_by_threshold": (0.0, 1.0)},
+    remedy=Remedy("undo_hysteresis", "slew"),
     looks_like="loops grow wider, or narrower, by the same share with every decade of rate",
 )

@@ -1,6 +1,6 @@
 """Rate-independent asymmetry: the two branches curve differently, equally at every frequency."""
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.smooth import magnitude_power, rate_magnitude
 from psa_casadi.variables import Parameter, Values
 
@@ -37,6 +37,7 @@ RATE_INDEPENDENT_ASYMMETRY = Component(
     ),
     equations=_equations,
     probe={"asymmetry_bend": (-2.0, 0.0, 2.0)},
+    remedy=Remedy("undo_hysteresis", "reversal"),
     looks_like=(
         "the residual differs between rising and falling voltage in the same way at every rate"
     ),

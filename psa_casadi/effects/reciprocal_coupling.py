@@ -5,7 +5,7 @@ m_P m_B s^4 + (m_P c_B + m_B (c_P + g c_B)) s^3 + (m_P k_B + m_B (k_P + g k_B) +
 + q (c_P k_B + k_P c_B) s + q k_P k_B, and Hurwitz' determinant is a sum of positive terms.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.scales import stroke_scale, velocity_scale
 from psa_casadi.variables import Parameter, State
 
@@ -62,5 +62,6 @@ RECIPROCAL_COUPLING = Component(
         State("v_r", "m/s", "its rate", velocity_scale, display_unit="um/s"),
     ),
     equations=_equations,
+    remedy=Remedy("extended_model", "resonance"),
     looks_like="the resonances and the zero between them do not fit the one-way cascade",
 )

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.variables import Parameter
 
 
@@ -31,5 +31,6 @@ SATURATION_OF_STRAIN = Component(
         ),
     ),
     equations=_equations,
+    remedy=Remedy("undo_curve", "range"),
     looks_like="the curve flattens towards high voltage on both branches, at every rate",
 )

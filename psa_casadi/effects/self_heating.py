@@ -6,7 +6,7 @@ slowly with a large one. Share of heat, heat capacity and the gain's temperature
 one number, heating_gain.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.smooth import magnitude_power, rate_magnitude
 from psa_casadi.variables import Parameter, State, Values
 
@@ -61,5 +61,6 @@ SELF_HEATING = Component(
     ),
     equations=_equations,
     probe={"heating_time": (1.0, 10.0)},
+    remedy=Remedy("cool", "record"),
     looks_like="the gain climbs while the drive is fast and recovers when it rests",
 )

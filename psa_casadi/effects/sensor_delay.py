@@ -1,6 +1,6 @@
 """Sensor delay: the measured displacement arrives late by a fixed time."""
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.scales import stroke_scale
 from psa_casadi.smooth import pade_section
 from psa_casadi.variables import Parameter, State
@@ -53,5 +53,6 @@ SENSOR_DELAY = Component(
     ),
     states=(*_states(1), *_states(2)),
     equations=_equations,
+    remedy=Remedy("align_clocks", "slew"),
     looks_like="phase linear in frequency; the residual follows the displacement's rate",
 )

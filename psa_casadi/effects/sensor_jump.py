@@ -6,7 +6,14 @@ interferometer that has lost a count, is not this.
 
 import casadi as ca
 
-from psa_casadi.component import DISPLACEMENT_STEPS, Component, Equations, Expression, Symbols
+from psa_casadi.component import (
+    DISPLACEMENT_STEPS,
+    Component,
+    Equations,
+    Expression,
+    Remedy,
+    Symbols,
+)
 from psa_casadi.effects.sizes import stroke
 from psa_casadi.scales import reading_scale, stroke_scale
 from psa_casadi.variables import Parameter, Values
@@ -58,5 +65,6 @@ SENSOR_JUMP = Component(
     ),
     equations=_equations,
     probe={"jump_place": DISPLACEMENT_STEPS, "jump_width": (0.003, 0.03)},
+    remedy=Remedy("calibrate_sensor", "range"),
     looks_like="the residual jumps at one displacement, the same on both branches",
 )

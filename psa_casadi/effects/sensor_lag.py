@@ -1,6 +1,6 @@
 """Sensor lag: the sensor's electronics follow the displacement with a time constant."""
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, State
 
@@ -41,5 +41,6 @@ SENSOR_LAG = Component(
         ),
     ),
     equations=_equations,
+    remedy=Remedy("faster_sensor", "slew"),
     looks_like="phase of a first-order lag, which saturates at 90 degrees, and roll-off with it",
 )

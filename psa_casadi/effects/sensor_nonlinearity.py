@@ -4,7 +4,7 @@ A constant and a slope are the sensor's offset and its sensitivity, which a fit 
 stack's own; what remains of a smooth curve is a bow, an S and a W.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.effects.bend import ANGLES, BEND_TEXT, bend, shape_parameters
 from psa_casadi.effects.sizes import stroke
 from psa_casadi.variables import Parameter
@@ -40,5 +40,6 @@ SENSOR_NONLINEARITY = Component(
     equations=_equations,
     curve="displacement",
     probe={"nonlinearity_angle": ANGLES},
+    remedy=Remedy("calibrate_sensor", "range"),
     looks_like="the residual is a function of the displacement alone, the same on both branches",
 )

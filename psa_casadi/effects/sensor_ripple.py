@@ -8,7 +8,14 @@ from math import pi
 
 import casadi as ca
 
-from psa_casadi.component import DISPLACEMENT_PEAKS, Component, Equations, Expression, Symbols
+from psa_casadi.component import (
+    DISPLACEMENT_PEAKS,
+    Component,
+    Equations,
+    Expression,
+    Remedy,
+    Symbols,
+)
 from psa_casadi.scales import reading_scale
 from psa_casadi.variables import Parameter
 
@@ -62,5 +69,6 @@ SENSOR_RIPPLE = Component(
     ),
     equations=_equations,
     probe={"ripple_period": DISPLACEMENT_PEAKS, "ripple_phase": (0.0, 0.5 * pi)},
+    remedy=Remedy("calibrate_sensor", "range"),
     looks_like="the residual repeats many times over the displacement, the same on both branches",
 )

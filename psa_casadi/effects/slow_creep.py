@@ -1,6 +1,6 @@
 """Slow creep: displacement that keeps growing for seconds to hours at constant voltage."""
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, State, Values
 
@@ -57,5 +57,6 @@ SLOW_CREEP = Component(
     states=(_state(1), _state(2), _state(3)),
     equations=_equations,
     probe={"creep_time": (0.03, 0.3, 3.0)},
+    remedy=Remedy("wait_or_feed_forward", "hold"),
     looks_like="the residual is a straight line in log time after every change of voltage",
 )

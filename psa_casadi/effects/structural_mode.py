@@ -4,7 +4,7 @@ What drives it may run ahead of the output mass or behind it: the lead turns the
 resonance by its arc tangent, so that a mode driven by the force ahead of its lag is told as well.
 """
 
-from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Symbols
+from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Remedy, Symbols
 from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, State, Values
 
@@ -48,5 +48,6 @@ STRUCTURAL_MODE = Component(
     ),
     equations=_equations,
     probe={"mode_frequency": SPECTRAL_PEAKS, "mode_damping": (0.03,)},
+    remedy=Remedy("avoid_resonance", "resonance"),
     looks_like="the residual rings at a tone that is neither pole of the stack",
 )

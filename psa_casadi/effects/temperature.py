@@ -10,7 +10,7 @@ coefficient of soft PZT grows by one or a few tenths of a percent per kelvin. A 
 ordinary change in a laboratory and 0.1 % of the stroke is noticeable: 1e-3 per kelvin is ordinary.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.effects.sizes import stroke
 from psa_casadi.variables import Input, Parameter, State
 
@@ -72,5 +72,6 @@ TEMPERATURE = Component(
     states=(State("stack_warmer", "K", "temperature of the stack above the reference", 1.0),),
     equations=_equations,
     probe={"temperature_gain_ratio": (-1.0, 0.0, 1.0), "temperature_lag": (0.01, 1.0)},
+    remedy=Remedy("steady_surroundings", "record"),
     looks_like="the residual follows the temperature, by an offset and in proportion to the stroke",
 )

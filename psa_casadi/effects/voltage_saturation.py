@@ -5,7 +5,7 @@ off: d below the level it vanishes (exactly so from 37 widths w on), above it is
 is rounded over the width. Only the upper end clips: a stack is driven from zero upward.
 """
 
-from psa_casadi.component import Component, Equations, Symbols
+from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.smooth import softplus
 from psa_casadi.variables import Parameter
 
@@ -39,5 +39,6 @@ VOLTAGE_SATURATION = Component(
     ),
     equations=_equations,
     probe={"clip_level": (0.7, 0.85, 0.95)},
+    remedy=Remedy("stay_below_level", "range"),
     looks_like="the displacement has flat tops at one level of the voltage, however high it goes",
 )

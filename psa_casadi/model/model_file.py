@@ -10,7 +10,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import MODAL_SERIES
 from psa_casadi.effects.patches import PATCHES
 from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write
+from psa_casadi.files import atomic_write, why_not_read
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence_file import evidence_content, read_evidence
 from psa_casadi.model.model_file_checks import FORMAT, check_content, first_ones, name_of
@@ -126,8 +126,8 @@ def load_model(path: str | os.PathLike[str], effects: Iterable[Component] = ()) 
         text = read_json_text(path)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"The model file {path} cannot be read ({error}); give a file that `psa identify`"
-            " wrote."
+            f"The model file {path} cannot be read ({why_not_read(error)}); give a file that"
+            " `psa identify` wrote."
         ) from error
     return loads(text, str(path), effects)
 

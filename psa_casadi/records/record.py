@@ -32,7 +32,7 @@ class Record:
     unknown; nan marks a missing sample. `load_force` [N], `current` [A], `temperature` [K],
     `monitor_voltage` [V], `charge` [C], `displacement_2` [m] and `strain` [1] are None where they
     were not recorded. `sha256` is that of the file at `source`, or of the arrays
-    where there is no file.
+    where there is no file. `notes` are sentences on what the reader took for what.
 
     Raises:
         InputError: an array is not one-dimensional or its length differs from that of `time`; the
@@ -55,6 +55,7 @@ class Record:
     charge: FloatArray | None = None
     displacement_2: FloatArray | None = None
     strain: FloatArray | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         problems = []
@@ -137,6 +138,10 @@ class Record:
                 f"a displacement column."
             )
         return float(np.nanmax(self.displacement) - np.nanmin(self.displacement))
+
+    def is_same(self, other: "Record") -> bool:
+        """Whether another record is the same samples of the same content."""
+        return self.sha256 == other.sha256 and np.array_equal(self.time, other.time)
 
     def slice(self, start: int, stop: int) -> "Record":
         """Return the samples `start <= k < stop`, counted as Python counts; `sha256` is kept.

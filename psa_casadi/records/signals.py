@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.files import why_not_read
 
 FloatArray = npt.NDArray[np.float64]
 #: What an input does between two samples.
@@ -179,7 +180,9 @@ def _read(path: Path) -> Signals:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}); give a CSV file.") from error
+        raise InputError(
+            f"{path} cannot be read ({why_not_read(error)}); give a CSV file."
+        ) from error
     if len(rows) < 2:
         raise InputError(f"{path} holds no samples; give names in the first line, then numbers.")
     names = [n.strip() for n in rows[0]]

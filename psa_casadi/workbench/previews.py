@@ -15,7 +15,8 @@ import numpy as np
 
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.records.read.head import Head, head_of
+from psa_casadi.records.read.apart import head_of
+from psa_casadi.records.read.head import Head
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 
@@ -34,8 +35,8 @@ def preview(
     """
     asked = {"file": path.name, "columns": columns, "sample_time": sample_time, "held": held}
     try:
-        with started_python(_MODULE, directory=path.parent) as child:
-            done = heard(child, json.dumps(asked).encode(), limit=_LIMIT_S)
+        with started_python(_MODULE, json.dumps(asked), directory=path.parent) as child:
+            done = heard(child, limit=_LIMIT_S)
     except subprocess.TimeoutExpired:
         return _problem(f"{path.name}: reading it comes to no end; save it again.")
     except MachineError as error:
@@ -104,9 +105,9 @@ def _curve(record: Record) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Read what is asked for from standard input and write the answer to standard output."""
+    """Read what is asked for on the command line and write the answer to standard output."""
     end_with_parent()
-    asked = json.load(sys.stdin)
+    asked = json.loads(sys.argv[1])
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # libraries may say something
         found = looked_at(asked["file"], asked["columns"], asked["sample_time"], held=asked["held"])

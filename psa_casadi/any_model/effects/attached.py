@@ -1,9 +1,10 @@
 """An effect with the ports that it needs, and the parameters that most effects have alike."""
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Expression, Remedy, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.from_casadi.ports import Port, with_ports
 from psa_casadi.variables import Parameter, State
@@ -12,6 +13,8 @@ from psa_casadi.variables import Parameter, State
 ORDINARY, LARGEST = 0.03, 10.0
 
 
+#: What ends the kind of an effect in its name; the kind is the code of its remedy, too.
+_KIND = re.compile("_(?:of|in)_")
 #: Returns a parameter or a state of an effect by its short name.
 Own = Callable[[str], Expression]
 #: The equations of an effect: (symbols, its own by short name) -> derivatives, term.
@@ -79,6 +82,7 @@ def at_port(
         equation_text=text.replace("Q", port.balance).replace("q", signal),
         looks_like=looks,
         belongs_to=belongs_to,
+        remedy=Remedy(_KIND.split(name)[0], "record"),
     )
     return Attached(component, port, reads)
 

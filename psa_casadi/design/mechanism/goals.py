@@ -92,8 +92,10 @@ def _check_limits(limits: Limits, problems: Problems) -> None:
             f"The largest stroke loss is {limits.stroke_loss:g}; give a share of the stroke from 0"
             " up to, not including, 1."
         )
-    if limits.force is not None and not limits.force > 0.0:
-        problems.add(f"The largest force is {limits.force:g} N; give a positive one.")
+    if limits.force is not None and not 0.0 < limits.force < inf:
+        problems.add(
+            f"The largest force is {limits.force:g} N; give a positive one, or leave it out."
+        )
     for what, (low, high), unit in (
         ("mass", limits.mass, "kg"),
         ("damping", limits.damping, "N.s/m"),

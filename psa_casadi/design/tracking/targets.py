@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import Problems
-from psa_casadi.records.read.csv_table import load_text, parse_numbers
-from psa_casadi.records.read.header import parse_header
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.read import apart
+from psa_casadi.records.read.samples import Request
 from psa_casadi.units import parse_unit, to_si
 
 FloatArray = npt.NDArray[np.float64]
@@ -41,22 +41,20 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     Raises InputError with every mistake found: a column missing, a cell that is no number, times
     that do not increase, fewer than ten samples, a displacement that never changes.
     """
-    problems = Problems()
-    text = load_text(str(path))
-    required = ("time", "displacement")
-    fields = parse_header(text.header, required, text.where_header, problems)
-    problems.raise_if_any()
-    numbers = parse_numbers(text, fields, problems)
-    problems.raise_if_any()
-    if parse_unit(fields["displacement"].unit).counts:
-        problems.add(
-            f"{text.where_header}: the displacement is in counts of a sensor, which is no length;"
+    outcome, _ = apart.read(str(path), Request(voltage=False))
+    outcome.problems.raise_if_any()
+    if outcome.samples is None:
+        raise InputError(
+            f"{path}: holds no path; name its columns as 'time [s],displacement [um]'."
+        )
+    units, values = outcome.samples.units, outcome.samples.values
+    if parse_unit(units["displacement"]).counts:
+        raise InputError(
+            f"{path}: line 1: the displacement is in counts of a sensor, which is no length;"
             " give the path in um."
         )
-        problems.raise_if_any()
-    names = list(fields)
     time, displacement = (
-        to_si(numbers.values[:, names.index(n)], fields[n].unit) for n in required
+        to_si(values[:, list(units).index(n)], units[n]) for n in ("time", "displacement")
     )
     return checked_target(time, displacement, str(path))
 

@@ -39,6 +39,7 @@ from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
+from psa_casadi.files import why_not_read
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
 from psa_casadi.records.record import Record
@@ -141,7 +142,7 @@ def _archive_rows(path: Path) -> list[CheckRow]:
         with path.open("rb") as file:
             head = file.read(2)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error}); name an FMU.") from error
+        raise InputError(f"{path}: cannot be read ({why_not_read(error)}); name an FMU.") from error
     if head != b"PK":
         raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
     found = archive_problems(path)

@@ -140,7 +140,8 @@ def unit_definitions(root: ET.Element, table: Iterable[Variable]) -> None:
     for name in sorted(displays):
         unit = parse_unit(name)
         element = ET.SubElement(definitions, "Unit", {"name": name})
-        ET.SubElement(element, "BaseUnit", base_unit(unit))
+        if all(isinstance(power, int) for power in unit.exponents):  # FMI has no m2.5
+            ET.SubElement(element, "BaseUnit", base_unit(unit))
         for shown_name in sorted(displays[name]):
             ET.SubElement(element, "DisplayUnit", _display(unit, shown_name))
 

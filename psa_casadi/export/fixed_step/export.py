@@ -7,7 +7,7 @@ from pathlib import Path
 from psa_casadi.export.common.foreign import refuse_foreign
 from psa_casadi.export.fixed_step.planning import fixed_step
 from psa_casadi.export.fixed_step.probe import VoltageError
-from psa_casadi.files import atomic_write
+from psa_casadi.files import atomic_write, make_folder
 from psa_casadi.model.compose import Model
 
 
@@ -54,7 +54,7 @@ def export_c(
         exported, name=identifier, step=step, precision=precision, hold=hold, substeps=substeps
     )
     folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for file_name, text in found.texts.items():
         atomic_write(folder / file_name, text)
     return CodeExport(

@@ -3,17 +3,19 @@
 A wrong guess is worse than a question: what only one can be is taken, all else is suggested.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.records.read.columns import COLUMNS, Source, measures, usual_source
-from psa_casadi.records.read.header_names import column_named, stated_unit, understood, words_of
+from psa_casadi.records.read.names import column_named, stated_unit, understood, words_of
 from psa_casadi.units import parse_unit
 
 #: The quantities that tell the columns which every record has.
 QUANTITIES = {"time": "time", "voltage": "voltage", "displacement": "length"}
 #: What `--columns` takes for its own marks in a name, where a unit follows.
 _MARKS = set(",[]")
+_CHANNEL = re.compile(r"\d*$")
 #: Words for what is commanded and for what drives, for what is measured, and for neither.
 _COMMANDED = {
     "command", "commanded", "cmd", "setpoint", "set", "target", "reference", "ref", "demand",
@@ -27,8 +29,21 @@ _MEASURED = {
 _NEITHER = {
     "mon", "error", "err", "fehler", "offset", "gain", "noise", "rms", "std", "min", "max",
 }  # fmt: skip
+#: Words for what only says when, and for what only counts.
+_MARKING = {
+    "trigger", "trig", "sync", "gate", "ttl", "marker", "flag", "enable", "status", "comment",
+    "remark", "note", "digital", "dio",
+}  # fmt: skip
+_COUNTING = {
+    "sample", "samples", "index", "idx", "nr", "no", "number", "num", "count", "counter", "point",
+    "points", "row", "line", "nummer", "pos",
+}  # fmt: skip
 _FOR = {"voltage": _COMMANDED | _DRIVING, "displacement": _MEASURED}
-_AGAINST = {"voltage": _MEASURED | _NEITHER, "displacement": _COMMANDED | _NEITHER}
+_AGAINST = {
+    "time": _MARKING | _COUNTING,
+    "voltage": _MEASURED | _NEITHER | _MARKING | (_COUNTING - {"pos"}),
+    "displacement": _COMMANDED | _NEITHER | _MARKING | (_COUNTING - {"pos"}),
+}
 
 
 @dataclass(frozen=True)
@@ -49,6 +64,8 @@ class Cell:
     def speaks(self, column: str) -> int:
         """Return 1 where the words of the name speak for a column, -1 against it, else 0."""
         meant = {column_named(word) for word in self.words} - {None}
+        if self.words & _MARKING:
+            return -1
         if meant - {column} or self.words & _AGAINST.get(column, set()):
             return -1
         return 1 if meant or self.words & _FOR.get(column, set()) else 0
@@ -95,22 +112,34 @@ def decided(
     return None, [*alike, *rivals] if alike else ()
 
 
-def suggested(columns: Collection[str], cells: Sequence[Cell]) -> Mapping[str, int]:
+def suggested(
+    columns: Collection[str], cells: Sequence[Cell], rises: Callable[[Cell], bool]
+) -> Mapping[str, int]:
     """Return the cell that is most likely each of the columns, for those that one can be.
 
-    None is suggested against its unit. The volts of a sensor may be a displacement.
+    None is suggested against its unit, and as the time none that does not rise. The volts of a
+    sensor may be a displacement; of several channels one of the voltage's number is it first.
     """
     found: dict[str, int] = {}
+    number = ""
     for column in (name for name in COLUMNS if name in columns):
         ranks = [
-            (rank, k)
+            (rank, column == "displacement" and _channel(cell) != number, k)
             for k, cell in enumerate(cells)
             if cell.label and not set(cell.label) & _MARKS and k not in found.values()
             if (rank := _rank(cell, column)) is not None
+            if column != "time" or rises(cell)
         ]
         if ranks:
-            found[column] = min(ranks)[1]
+            found[column] = min(ranks)[-1]
+        if column == "voltage" and column in found:
+            number = _channel(cells[found[column]])
     return found
+
+
+def _channel(cell: Cell) -> str:
+    """Return the number at the end of a name, "" without one."""
+    return _CHANNEL.search(cell.text)[0] if cell.unit is None else ""  # type: ignore[index]
 
 
 def source_of(column: str, cell: Cell) -> Source:

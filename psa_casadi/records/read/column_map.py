@@ -6,6 +6,12 @@ import re
 from psa_casadi.errors import Problems
 from psa_casadi.records.read.columns import COLUMNS, ColumnMap, Source, check_unit
 
+#: What stands for the choice of a table among the names of columns.
+TABLE = "table"
+#: Its value that takes each table of a file as a record.
+ALL = "all"
+#: What a name may not hold that `--columns` is to name.
+MARKS = re.compile(r"[,:=\[\]]+")
 _NAMES = ", ".join(COLUMNS)
 _PART = re.compile(
     r"(?P<name>[^=]*)=(?P<array>[^\[\]]*?)(?::(?P<unit>[^:\[\]]*)|\[(?P<in>[^]]*)\])?"
@@ -23,6 +29,8 @@ def parse_columns(text: str) -> ColumnMap:
     `m.2`. Without UNIT the header's own unit counts, else the SI unit; a displacement is never
     guessed. A number before UNIT says what 1 in the file is, whatever the header says: `10um` for
     the volts of a sensor of 10 um/V. `FILE@NAME=ARRAY:UNIT` is said of one file by its name.
+    `table=NAME` takes one of several tables of a file (sheets, groups, blocks, segments of time) by
+    its name or number, `table=all` each as a record.
 
     Raises:
         InputError: every part that is not of this form, names no column or no unit of it.
@@ -39,7 +47,9 @@ def parse_columns(text: str) -> ColumnMap:
         name = re.sub(r"[\s-]+", "_", own.strip().lower())
         key = f"{file.strip()}{at}{name}"
         unit = match["unit"] if match["in"] is None else match["in"]
-        if name not in COLUMNS:
+        if name == TABLE:
+            found[key] = Source(part.partition("=")[2].strip(), None)
+        elif name not in COLUMNS:
             near = difflib.get_close_matches(name, COLUMNS, n=1, cutoff=0.6)
             meant = f"is '{near[0]}' meant? There are" if near else "there are"
             problems.add(f"{where}: '{name}' is no column of a record; {meant} {_NAMES}.")

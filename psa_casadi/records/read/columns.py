@@ -72,14 +72,19 @@ SI_UNITS = {
 }  # fmt: skip
 
 
-def ready_line(sources: ColumnMap) -> str:
-    """Return the option that says which array is which column, as a shell takes it."""
-    line = ",".join(f"{name}={source}" for name, source in sources.items())
+def ready_line(sources: ColumnMap, sample_time: float | None = None, table: str = "") -> str:
+    """Return the options that say which array is which column, and the sample time, for a shell."""
+    named = [f"table={table}"] if table else []
+    line = ",".join([*named, *(f"{name}={source}" for name, source in sources.items())])
     if os.name == "nt" or _SPECIAL.search(line):  # PowerShell takes a comma for its own
         line = f'"{line}"'
-    if any(source.scale is not None for source in sources.values()):
-        return f"--columns {line} (with your units; ':10um' says that 1 in the file is 10 um)"
-    return f"--columns {line} (with your units)"
+    options = [f"--columns {line}"] if line else []
+    options += [f"--sample-time {sample_time:g}"] if sample_time is not None else []
+    yours = ["your units"] if sources else []
+    yours += ["your time between samples [s]"] if sample_time is not None else []
+    scale = "; ':10um' says that 1 in the file is 10 um"
+    scale = scale if any(source.scale is not None for source in sources.values()) else ""
+    return f"{' '.join(options)} (with {' and '.join(yours)}{scale})" if yours else options[0]
 
 
 def usual_source(name: str, array: str, unit: str | None = None) -> Source:
@@ -126,6 +131,5 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
     if not measures(column.name, unit):
         problems.add(
             f"{where}: the unit '{unit}' does not measure {column.quantities[0]}; correct it to "
-            f"one of {accepted}, or say what 1 in the file is: --columns {column.name}=NAME:10"
-            f"{SI_UNITS.get(column.name, 'um')}."
+            f"one of {accepted}."
         )

@@ -1,6 +1,7 @@
 """The bytes of a record's file, or a sentence that says why there are none."""
 
 import gzip
+import hashlib
 import io
 import os
 import zlib
@@ -12,17 +13,19 @@ from psa_casadi.errors import InputError
 #: The most bytes that a record may have, in its file or unpacked in memory.
 MOST_BYTES = 2**30
 _BLOCK = 2**20
+#: Bytes in memory of the fewest columns that a record has: a time and one number.
+_LEAST_ON_A_LINE = 16
 
 
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """Return the content of a file that is meant to hold a record.
+def check_there(path: str | os.PathLike[str]) -> None:
+    """Refuse what is no file that can be read and holds something.
 
     Raises:
-        InputError: the file is missing, a directory, unreadable, empty or larger than `MOST_BYTES`.
+        InputError: the file is missing, a directory, unreadable or empty.
     """
     try:
         with Path(path).open("rb") as stream:
-            data = _most(stream.read)
+            is_empty = not stream.read(_BLOCK).strip()
     except FileNotFoundError:
         raise InputError(
             f"{path}: there is no such file; check the name and the directory it is in."
@@ -33,10 +36,23 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check that you may read it."
         ) from error
-    check_size(path, len(data), "holds")
-    if not data.strip():
+    if is_empty:
         raise InputError(f"{path}: the file is empty; export the record again.")
-    return data
+
+
+def read_text(path: str | os.PathLike[str]) -> tuple[bytes, str]:
+    """Return the content of a file of text, unpacked where it is gzipped, and the file's SHA-256.
+
+    Raises:
+        InputError: it is larger than `MOST_BYTES`, or damaged.
+    """
+    with Path(path).open("rb") as stream:
+        data = _most(stream.read)
+    check_size(path, len(data), "holds")
+    content = unpacked(data, path)
+    lines = max(content.count(b"\n"), content.count(b"\r"))
+    check_size(path, _LEAST_ON_A_LINE * lines, "its lines need")
+    return content, hashlib.sha256(data).hexdigest()
 
 
 def _most(read: Callable[[int], bytes]) -> bytes:

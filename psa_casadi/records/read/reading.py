@@ -1,53 +1,53 @@
 """Records from files: read, checked as a whole, converted to SI units.
 
-The format follows the ending: `.mat` (MATLAB), `.h5`, `.hdf5` or `.hdf`, `.tdms` (LabVIEW), `.npy`
-or `.npz` (NumPy), `.parquet` or `.pq`, `.xlsx` (Excel), and text for everything else: CSV, LabVIEW
-measurements (`.lvm`) and PI's data recorder are known by their content.
+The format follows the ending (`READERS`), or the first bytes where that is another; all else is
+text: CSV, LabVIEW measurements (`.lvm`), PI's data recorder and oscilloscopes are known by their
+content.
 """
 
+import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeGuard, cast
+from typing import Any, Protocol, TypeGuard, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.checks import (
-    Located,
-    check_complete,
-    check_displacement,
-    check_excitation,
-    check_length,
-    check_time,
-)
-from psa_casadi.records.read.column_map import columns_of, parse_columns
-from psa_casadi.records.read.columns import ColumnMap
-from psa_casadi.records.read.read_arrays import LOADERS, read_arrays
-from psa_casadi.records.read.read_csv import read_csv
-from psa_casadi.records.read.read_parquet import read_parquet
-from psa_casadi.records.read.read_table import Table, read_table
-from psa_casadi.records.read.read_xlsx import read_xlsx
-from psa_casadi.records.read.samples import Samples, scaled
+from psa_casadi.records.read import apart
+from psa_casadi.records.read.column_map import ALL, TABLE, columns_of, parse_columns
+from psa_casadi.records.read.columns import ColumnMap, Source
+from psa_casadi.records.read.join import joined, parts_of
+from psa_casadi.records.read.samples import Outcome, Request, Samples, samples_of
+from psa_casadi.records.read.table import Columns
+from psa_casadi.records.read.table import Table as FileTable
 from psa_casadi.records.record import Record
 from psa_casadi.units import parse_unit, to_si
 
 AnyPath = str | os.PathLike[str]
+
+
+class Frame(Protocol):
+    """A data frame: column names, and a column by its name (pandas, polars)."""
+
+    @property
+    def columns(self) -> Any:
+        """Names of the columns."""
+        ...
+
+    def __getitem__(self, name: Any, /) -> Any:
+        """Return the column of that name."""
+        ...
+
+
+Table = Frame | Mapping[str, npt.ArrayLike]
 #: What stands for one record wherever records are asked for.
 OneRecord = Record | AnyPath | Table
 #: What stands for the records of one device.
 Records = OneRecord | Iterable[OneRecord]
-
-#: What reads a file, by its ending; a file with another ending is CSV.
-READERS = {
-    **dict.fromkeys(LOADERS, read_arrays),
-    ".parquet": read_parquet,
-    ".pq": read_parquet,
-    ".xlsx": read_xlsx,
-    ".xlsm": read_xlsx,
-}
 
 
 def read_record(
@@ -58,31 +58,27 @@ def read_record(
     columns: str | ColumnMap | None = None,
     sample_time: float | None = None,
 ) -> Record:
-    """Return the record in one file: text, Excel, MATLAB, HDF5, TDMS, NumPy or Parquet.
+    """Return the record in one file: text, Excel, MATLAB, HDF5, TDMS, NumPy, Parquet, UFF.
 
     `need_displacement` demands a displacement column with values, as a comparison does;
     `need_excitation` a voltage that changes, as a fit does. `columns` names the arrays of the file
     that are the columns, such as "time=t:ms,voltage=log.u,displacement=m.2:um" (`parse_columns`);
     `displacement=CH2:10um` says that 1 in the file is 10 um, `b.csv@time=t:ms` is said of one file.
-    `sample_time` [s] gives the time of a file without one.
+    `columns="table=2"` takes one of several sheets, groups, blocks or segments. `sample_time` [s]
+    gives the time, whatever the file says of it. "a.csv+b.csv" are the channels of one record that
+    an instrument has saved one by one. `notes` of the record tell what was taken for what.
 
     Raises:
         InputError: every mistake found in the file, one sentence each: file, line, column, what was
-            found, what was expected, what to do. At most 20 are listed, the others counted.
+            found, what was expected, what to do. At most 20 are listed, the others counted. An
+            option that a sentence offers reads this file.
     """
-    problems = Problems()
-    wanted = _wanted(columns, Path(path).name)
-    required = _required(need_displacement, sample_time)
-    reader = READERS.get(Path(path).suffix.lower(), read_csv)
-    samples = reader(str(path), required, wanted, problems)
-    samples = _timed(samples, sample_time, problems)
-    if samples is not None:
-        samples = scaled(samples, wanted)
-        _check(samples, problems, need_excitation=need_excitation)
-    problems.raise_if_any()
-    if samples is None:
-        raise InputError(f"{path}: holds no columns; export the record again.")
-    return _record(samples)
+    request = _request(
+        columns, Path(path).name, sample_time, displacement=need_displacement,
+        excitation=need_excitation,
+    )  # fmt: skip
+    outcome, digest = _read(str(path), request)
+    return _record(str(path), outcome, digest)
 
 
 def read_records(
@@ -95,25 +91,34 @@ def read_records(
 ) -> tuple[Record, ...]:
     """Return the records in several files, which are experiments on the same device.
 
+    `columns="table=all"` takes each table and segment of a file as a record. Files of one channel
+    each are joined to one record.
+
     Raises:
         InputError: the mistakes of all files together, or no file was named.
     """
     wanted = parse_columns(columns) if isinstance(columns, str) else columns
+    places = [str(path) for path in paths]
     records: list[Record] = []
     problems: list[str] = []
-    for path in paths:
+    failed = 0
+    for path in places:
+        request = _request(
+            wanted, Path(path).name, sample_time, displacement=need_displacement,
+            excitation=need_excitation,
+        )  # fmt: skip
         try:
-            record = read_record(
-                path,
-                need_displacement=need_displacement,
-                need_excitation=need_excitation,
-                columns=wanted,
-                sample_time=sample_time,
-            )
-            records.append(record)
+            for one in _each(path, request) if request.table == ALL else (request,):
+                outcome, digest = _read(path, one)
+                records.append(_record(path, outcome, digest))
         except InputError as error:
+            failed += 1
             problems.extend(error.problems)
-    if not records and not problems:
+    if failed == len(places) > 1 and (
+        pair := _joined(places, wanted, sample_time, need_excitation)
+    ):
+        return pair
+    if not places:
         problems.append("no record was named; name at least one CSV file.")
     if problems:
         raise InputError(problems)
@@ -137,24 +142,92 @@ def record_from(
     Raises:
         InputError: every mistake found, one sentence each.
     """
-    problems = Problems()
-    wanted = _wanted(columns, name)
-    required = _required(need_displacement, sample_time)
-    samples = read_table(table, name, required, wanted, problems)
-    samples = _timed(samples, sample_time, problems)
-    if samples is not None:
-        samples = scaled(samples, wanted)
-        _check(samples, problems, need_excitation=False)
-    problems.raise_if_any()
-    if samples is None:
-        raise InputError(f"{name}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
-    return _record(samples, source="")
+    request = _request(columns, name, sample_time, displacement=need_displacement)
+    held = _table_of(table, name)
+    outcome = samples_of(name, [held], request)
+    digest = hashlib.sha256()
+    if outcome.samples is not None:
+        for (column, unit), values in zip(
+            outcome.samples.units.items(), outcome.samples.values.T, strict=True
+        ):
+            digest.update(f"{column} [{unit}]".encode() + np.ascontiguousarray(values).tobytes())
+    return _record(name, outcome, digest.hexdigest(), source="")
 
 
-def _wanted(columns: str | ColumnMap | None, file: str) -> ColumnMap:
-    """Return which array of a file is which column, as far as it is said."""
+def _table_of(table: Table, name: str) -> FileTable:
+    """Return a table in memory as the tables of files are."""
+    own = list(table if isinstance(table, Mapping) else table.columns)
+
+    def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
+        cells = [_cells(name, own[k], table[own[k]], problems) for k in asked]
+        longest = max(map(len, cells), default=0)
+        return Columns([c[:most] for c in cells], np.arange(1, longest + 1))
+
+    header = [str(text) for text in own]
+    labels = [text.partition("[")[0].strip() for text in header]
+    return FileTable(name, "", header, labels, f"{name}: column names", "row", load)
+
+
+def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
+    """Return a column in memory as numbers or instants."""
+    values = np.asarray(column)
+    if values.dtype.kind not in "mM":
+        try:
+            values = np.asarray(column, dtype=np.float64)
+        except (TypeError, ValueError):
+            problems.add(
+                f"{name}: column '{own}': holds {type(column).__name__} that is not all"
+                " numbers; convert the column first."
+            )
+            return np.full(len(values) if values.ndim else 0, np.nan)
+    if values.ndim != 1:
+        problems.add(
+            f"{name}: column '{own}': has shape {values.shape}; give one value for each instant"
+        )
+    return values.ravel()
+
+
+def _request(
+    columns: str | ColumnMap | None,
+    file: str,
+    sample_time: float | None,
+    *,
+    displacement: bool,
+    excitation: bool = False,
+) -> Request:
+    """Return what is wanted of a file, as far as it is said of this one."""
     told = parse_columns(columns) if isinstance(columns, str) else columns or {}
-    return columns_of(told, file)
+    own = dict(columns_of(told, file))
+    chosen = own.pop(TABLE, Source("", None)).array
+    return Request(own, sample_time, chosen, displacement, excitation)
+
+
+def _read(path: str, request: Request) -> tuple[Outcome, str]:
+    parts = parts_of(path)
+    if len(parts) == 1:
+        return apart.read(path, request)
+    return joined([(part, *apart.text_of(part)) for part in parts], request)
+
+
+def _each(path: str, request: Request) -> Sequence[Request]:
+    """Return the requests for each table of a file, one where it holds one."""
+    whole = replace(request, table="")
+    outcome, _ = _read(path, whole)
+    return [replace(request, table=key) for key in outcome.tables] or [whole]
+
+
+def _joined(
+    paths: Sequence[str], wanted: ColumnMap | None, sample_time: float | None, excitation: bool
+) -> tuple[Record, ...]:
+    """Return the record of files of one channel each, none where they are not such files."""
+    request = _request(wanted, "", sample_time, displacement=True, excitation=excitation)
+    try:
+        outcome, digest = joined(
+            [(path, *apart.text_of(path)) for path in paths], request, alone=True
+        )
+    except InputError:
+        return ()
+    return (_record("+".join(paths), outcome, digest),)
 
 
 def records_given(given: Records) -> tuple[Record, ...]:
@@ -196,81 +269,31 @@ def _is_table(given: object) -> TypeGuard[Table]:
     return isinstance(given, Mapping) or hasattr(given, "columns")
 
 
-def _required(need_displacement: bool, sample_time: float | None) -> tuple[str, ...]:
-    needed = {"time": sample_time is None, "voltage": True, "displacement": need_displacement}
-    return tuple(name for name, is_needed in needed.items() if is_needed)
+def _record(path: str, outcome: Outcome, digest: str, source: str | None = None) -> Record:
+    outcome.problems.raise_if_any()
+    if outcome.samples is None:
+        raise InputError(f"{path}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
+    return _in_si(path, outcome.samples, digest, source)
 
 
-def _timed(
-    samples: Samples | None, sample_time: float | None, problems: Problems
-) -> Samples | None:
-    """Return the samples with the time that a sample time gives, where one was given."""
-    if samples is None or sample_time is None:
-        return samples
-    if not 0.0 < sample_time < 1e9:
-        problems.add(f"{samples.path}: the sample time {sample_time} s is no time; give seconds.")
-        return None
-    if "time" in samples.units:
-        problems.add(
-            f"{samples.path}: has a column 'time' of its own; leave --sample-time (sample_time) out"
-            " or rename the column."
-        )
-        return None
-    time = sample_time * np.arange(len(samples.values))
-    reported = np.zeros(len(time), dtype=np.bool_)
-    return replace(
-        samples,
-        units={"time": "s", **samples.units},
-        values=np.column_stack([time, samples.values]),
-        reported=np.column_stack([reported, samples.reported]),
-    )
-
-
-def _check(samples: Samples, problems: Problems, *, need_excitation: bool) -> None:
-    check_length(samples.path, len(samples.lines), problems)
-    for k, name in enumerate(samples.units):
-        column = Located(
-            samples.path,
-            name,
-            samples.values[:, k],
-            samples.lines,
-            samples.reported[:, k],
-            samples.place,
-        )
-        if name == "time":
-            check_time(column, problems)
-        elif name == "displacement":
-            check_displacement(column, problems)
-        else:
-            check_complete(column, problems)
-        if name == "voltage" and need_excitation:
-            check_excitation(column, problems)
-
-
-def _record(samples: Samples, source: str | None = None) -> Record:
+def _in_si(path: str, samples: Samples, digest: str, source: str | None) -> Record:
     columns = {
         name: to_si(samples.values[:, k], unit)
         for k, (name, unit) in enumerate(samples.units.items())
     }
+    for array in columns.values():
+        array.flags.writeable = False  # a record need not copy it
     if not (np.diff(columns["time"]) > 0.0).all():
         raise InputError(
-            f"{samples.path}: instants are the same in seconds; give the time from the start of"
+            f"{path}: instants are the same in seconds; give the time from the start of"
             " the record, in a unit in which neighbours differ by more than the last digit."
         )
     in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
     return Record(
-        name=plain(Path(samples.path).stem if source is None else samples.path),
-        time=columns["time"],
-        voltage=columns["voltage"],
-        displacement=columns.get("displacement"),
-        load_force=columns.get("load_force"),
-        current=columns.get("current"),
-        temperature=columns.get("temperature"),
-        monitor_voltage=columns.get("monitor_voltage"),
-        charge=columns.get("charge"),
-        displacement_2=columns.get("displacement_2"),
-        strain=columns.get("strain"),
-        sha256=samples.sha256,
-        source=samples.path if source is None else source,
+        name=plain("+".join(Path(p).stem for p in parts_of(path)) if source is None else path),
+        **columns,
+        sha256=digest,
+        source=path if source is None else source,
         displacement_unit="counts" if in_counts else "m",
+        notes=tuple(f"{path}: {note}" for note in samples.notes),
     )

@@ -9,6 +9,7 @@ from typing import Any
 
 from psa_casadi.component import Component
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.files import why_not_read
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
 from psa_casadi.model.model_file_checks import FORMAT as MODEL
@@ -88,7 +89,7 @@ def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: cannot be read ({error}); {_ADVICE}") from error
+        raise InputError(f"{path}: cannot be read ({why_not_read(error)}); {_ADVICE}") from error
     kind = content.get("format") if isinstance(content, dict) else None
     if kind == DEVICE:
         return _of_device(path, read_document(DeviceFile, content, source), effects, traces)

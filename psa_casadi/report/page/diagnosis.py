@@ -15,6 +15,7 @@ from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
 from psa_casadi.report.page.own_model_page import write_own_report
 from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_worst
+from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.words.phrases import (
     handy_scale,
     in_page_unit,
@@ -47,10 +48,12 @@ def write_report(
     *,
     origin: str = "measured",
     still: bool = False,
+    model_file: str | None = None,
 ) -> None:
     """Write the page of a diagnosis, whole or not at all: the story first, then the details.
 
-    `origin`, "measured" or "synthetic", is what the page calls the records. Unless it is to be
+    `origin`, "measured" or "synthetic", is what the page calls the records; `model_file` is where
+    the extended model was written, which the commands of the page read. Unless it is to be
     `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
     page is below 3 MB; where scripts are off it has one still picture. That of a model of one's
     own holds no model that runs.
@@ -65,6 +68,7 @@ def write_report(
     page = Document(f"Diagnosis: {VERDICTS[d.verdict]}", _badges(d, origin))
     with one_unit(scale_of(d.experiments, d.base_errors.holdout_rms_m)):
         page.paragraph(verdict_sentence(d), "verdict")
+        add_what_now(page, d, model_file)
         _add_floor(page, d)
         page.bullets(_answers(d))
         add_worst(page, series, origin)

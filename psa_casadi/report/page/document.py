@@ -75,6 +75,14 @@ class Document:
                 f'<div class="warnings" role="alert"><p>{word}</p>{blocks.bullets(texts)}</div>'
             )
 
+    def advice(self, title: str, texts: Sequence[str], commands: Sequence[str]) -> None:
+        """Add a box that says what to do, and what to type."""
+        typed_text = "\n".join(commands)
+        block = f'<pre tabindex="0">{_text(typed_text)}</pre>' if commands else ""
+        self._parts.append(
+            f'<div class="advice"><p>{_text(title)}</p>{blocks.bullets(texts)}{block}</div>'
+        )
+
     def tiles(self, figures: Iterable[tuple[str, str, str]]) -> None:
         """Add the main figures in a row: label, figure, and a remark that may be empty."""
         self._parts.append(blocks.tiles(figures))

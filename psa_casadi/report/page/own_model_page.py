@@ -13,6 +13,7 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_worst
+from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.plots.patch_plot import free_plot
 from psa_casadi.report.words.fit_words import whiteness_sentence
 from psa_casadi.report.words.own_series import own_fit_series, own_series
@@ -56,6 +57,7 @@ def _page(d: OdeDiagnosis) -> str:
     series = own_series(d)
     page = Document(f"Diagnosis of {plain(d.model.name)}: {VERDICTS[d.verdict]}", _badges(d.runs))
     page.paragraph(own_verdict_sentence(d), "verdict")
+    add_what_now(page, d)
     _add_floors(page, d)
     add_worst(page, series, _ORIGIN)
     _budget(page, d)

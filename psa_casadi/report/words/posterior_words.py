@@ -36,6 +36,6 @@ def posterior_text(found: Posterior, *, origin: str = "measured", width: int = 1
     head = [("records", records_text(found.task.experiments, origin)), ("drawn", drawn)]
     tail = [("warning", w) for w in found.warnings] + [("note", n) for n in found.sentences]
     blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
-    blocks.append(str(posterior_table(found)))
+    blocks.append(posterior_table(found).fitted(width))
     blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
     return "\n\n".join(blocks)

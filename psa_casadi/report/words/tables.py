@@ -1,7 +1,10 @@
 """Tables of text that the terminal and the HTML page both show."""
 
+import math
+import textwrap
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 from psa_casadi.component import Component
@@ -42,12 +45,39 @@ class Table:
 
     def __str__(self) -> str:
         """Return the table in columns of plain text, without spaces at line ends."""
-        widths = [max(map(len, column)) for column in zip(self.head, *self.rows, strict=True)]
-        lines = (
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in (self.head, tuple("-" * w for w in widths), *self.rows)
-        )
+        return self.fitted()
+
+    def fitted(self, width: float = math.inf) -> str:
+        """Return the table in columns of plain text whose lines have `width` characters at most.
+
+        Cells go on in further lines where their column is narrower.
+        """
+        widths = self.widths(width - 2 * (len(self.head) - 1))
+        lines: list[str] = []
+        for row in (self.head, tuple("-" * w for w in widths), *self.rows):
+            cells = (
+                textwrap.wrap(cell, max(w, 1), break_on_hyphens=False)
+                for cell, w in zip(row, widths, strict=True)
+            )
+            for line in zip_longest(*cells, fillvalue=""):
+                padded = (part.ljust(w) for part, w in zip(line, widths, strict=True))
+                lines.append("  ".join(padded).rstrip())
         return "\n".join(lines)
+
+    def widths(self, room: float) -> list[int]:
+        """Return the characters of each column, which have `room` together.
+
+        The widest columns are made narrower. One becomes narrower than its longest word only where
+        no other way is left.
+        """
+        columns = list(zip(self.head, *self.rows, strict=True))
+        widths = [max(map(len, column)) for column in columns]
+        least = [max(map(len, " ".join(column).split()), default=0) for column in columns]
+        while sum(widths) > room and max(widths) > 1:
+            spare = [w if w > n else 0 for w, n in zip(widths, least, strict=True)]
+            widest = spare if any(spare) else widths
+            widths[widest.index(max(widest))] -= 1
+        return widths
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:

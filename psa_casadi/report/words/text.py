@@ -2,16 +2,18 @@
 
 import re
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out.errors import Errors
+from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import Identification
+from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.own_words import own_lines
@@ -27,6 +29,7 @@ from psa_casadi.report.words.phrases import (
     scale_of,
     strongest_sentence,
 )
+from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
 from psa_casadi.report.words.verdict_words import (
     VERDICTS,
@@ -46,10 +49,17 @@ _FIRST = re.compile(r"(?<=\.) ")
 _EXPLAINS = re.compile(r"; this(?: view)? explains (\d+ %) of the excess(?=\.)")
 
 
-def story(d: Diagnosis | OdeDiagnosis, *, origin: str = "measured", width: int = 100) -> str:
-    """Return a diagnosis in ten to fifteen lines: verdict with gain, errors, cause, rest.
+def story(
+    d: Diagnosis | OdeDiagnosis,
+    *,
+    origin: str = "measured",
+    width: int = 100,
+    model_file: str | None = None,
+) -> str:
+    """Return a diagnosis in ten to twenty lines: verdict with gain, errors, cause, what now, rest.
 
-    `origin` is what a stack's records are called. Raises InputError for what is no diagnosis.
+    `origin` is what a stack's records are called, `model_file` where its model was written. Raises
+    InputError for what is no diagnosis.
     """
     if isinstance(d, OdeDiagnosis):
         lines = own_lines(d)
@@ -59,6 +69,10 @@ def story(d: Diagnosis | OdeDiagnosis, *, origin: str = "measured", width: int =
         raise InputError(
             f"`story` tells a diagnosis, and this is of type {type(d).__name__}; print it."
         )
+    advice = what_now(d, model_file)
+    now = [("what now", text) for text in advice.causes]
+    now += [("then", command) for command in advice.commands[:1]]
+    lines[1:1] = now
     return "\n".join(labelled(label, text, width) for label, text in lines)
 
 
@@ -140,13 +154,18 @@ def identification_text(
     tail += [("next", a.sentence) for a in found.advice]
     tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
     blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
-    blocks.append(str(parameter_table(found.model, found)))
+    blocks.append(parameter_table(found.model, found).fitted(width))
     blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
     return "\n\n".join(blocks)
 
 
-def effect_page(effect: Component, width: int = 100) -> str:
-    """Return one effect: what it is, equation, signature, source, parameters."""
+def effect_page(
+    effect: Component, width: int = 100, seen: tuple[Model, Sequence[Size]] | None = None
+) -> str:
+    """Return one effect: what it is, equation, signature, source, what now, parameters.
+
+    `seen` is a model that holds it, and how large it is there (`diagnosis.remedy.size.example`).
+    """
     lines = [
         ("what", effect.description),
         ("belongs to", effect.belongs_to),
@@ -154,8 +173,10 @@ def effect_page(effect: Component, width: int = 100) -> str:
         ("signature", effect.looks_like),
         ("source", effect.source),
     ]
+    lines += [("how large", effect_size(effect, *seen))] if seen is not None else []
+    lines += zip(("what now", "record"), effect_advice(effect), strict=True)
     body = "\n".join(labelled(label, text, width) for label, text in lines)
-    return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect)}"
+    return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect).fitted(width)}"
 
 
 def check_sentence(report: "CheckReport") -> str:

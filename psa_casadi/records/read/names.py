@@ -66,6 +66,10 @@ _FORMS = (
     re.compile(r"(?P<name>.*)[_ ](?P<unit>[^_ ]+)"),
 )
 _DIGITS = re.compile(r"[0-9.+-]")
+#: The number of a channel at the end of a name; it is never a unit.
+_CHANNEL = re.compile(r"(?<=\w)[ _]?\d+$")
+#: A clock time is written in the place of the unit: `[hh:mm:ss.fff]`.
+_CLOCK = re.compile(r"[ymd./ -]*h{1,2}:m{1,2}(:s{1,2}([.,:][sf0]+)?)?", re.I)
 _WORD = re.compile(r"[^\W\d_]{2,}")
 #: What stands in a row of units where a column has none.
 _NO_UNIT = ("-", "\N{EN DASH}")
@@ -95,7 +99,8 @@ def understood(text: str) -> Name | None:
     What follows an underscore or a space may belong to the name: `U_amp` and `V_min` are in no
     ampere and no minute.
     """
-    whole = _COLUMN_OF.get(_plain(text))
+    name = _plain(text)
+    whole = _COLUMN_OF.get(name) or _COLUMN_OF.get(_CHANNEL.sub("", name))
     if whole is not None:
         return Name(whole, None)
     for part in _parts(text):
@@ -162,8 +167,10 @@ def _parts(text: str) -> Iterator[_Part]:
     whole = unit_named(bare) is not None
     for k, form in enumerate(_FORMS):
         match = form.fullmatch(bare)
-        unit = unit_named(match["unit"]) if match else None
-        if match and unit:
+        if match is None or (k > 0 and match["unit"].isdecimal()):
+            continue
+        unit = unit_named(match["unit"], common=k > 0)
+        if unit:
             is_sure = (True, not whole, _is_symbol(match["unit"]))[k]
             yield _Part(match["name"], unit, is_sure, is_lone=k == 2 and len(unit) == 1)
 
@@ -191,11 +198,16 @@ def columns_known(cells: Sequence[str]) -> int:
     return len({parse_unit(unit).quantity for unit in units if unit} - {""})
 
 
-def unit_named(text: str) -> str | None:
-    """Return the unit that a text names, by its symbol or written out; None where it names none."""
+def unit_named(text: str, *, common: bool = True) -> str | None:
+    """Return the unit that a text names, by its symbol or written out; None where it names none.
+
+    `common` looks at the units of the table alone: a word of a name is easily one of all others.
+    """
     unit = _UNIT_OF.get(text.strip().lower(), text.strip())
+    if _CLOCK.fullmatch(unit):
+        return "s"
     try:
-        parse_unit(unit)
+        parse_unit(unit, common=common)
     except InputError:
         return None
     return unit or None
@@ -209,10 +221,11 @@ def units_row(cells: Sequence[str]) -> list[str] | None:
     bare = [_unquoted(c).strip("[](){}").strip() for c in cells]
     bare = ["" if c in _NO_UNIT else c for c in bare]
     filled = [c for c in bare if c]
-    units = [None if _DIGITS.search(c[:1]) else unit_named(c) for c in filled]
-    if len(filled) < 2 or None in units:
+    if len(filled) < 2 or any(_DIGITS.search(c[:1]) for c in filled):
         return None
-    return [(unit_named(c) or "") if c else "" for c in bare]
+    if not any(map(unit_named, filled)) or None in [unit_named(c, common=False) for c in filled]:
+        return None
+    return [(unit_named(c, common=False) or "") if c else "" for c in bare]
 
 
 def _plain(name: str) -> str:

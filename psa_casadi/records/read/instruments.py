@@ -1,8 +1,9 @@
-"""Text that instruments write in a form of their own, told as a plain table.
+"""Text that instruments write in a form of their own, as a plain table.
 
 LabVIEW measurement files (`.lvm`), the data recorders of PI controllers (GCS arrays) and
-oscilloscopes by Rigol keep the names of the columns and the sample time in a head. The table has
-the same number of lines, so that a mistake is told with the line of the file.
+oscilloscopes by Rigol and Tektronix keep the names of the columns and the sample time in a head, or
+beside the numbers. The table has the same number of lines, so that a mistake is told with the line
+of the file.
 
 Sources: National Instruments, "Specification for the LabVIEW Measurement File (.lvm)"; Physik
 Instrumente, "GCS Array Data Format".
@@ -13,29 +14,72 @@ import re
 from collections.abc import Mapping, Sequence
 
 from psa_casadi.errors import InputError
-from psa_casadi.records.read.header_names import unit_named
+from psa_casadi.records.read.names import unit_named
+from psa_casadi.units import to_si
 
 _END = "***End_of_Header***"
 _ENTRY = re.compile(r"#\s*(?P<key>[A-Z_]+[0-9]*)\s*=\s*(?P<value>.*?)\s*")
 #: Lines in which a head is looked for.
 _MOST_LINES = 500
+#: How a head states the time between samples, or their rate, with a unit before or behind it.
+_STEP = re.compile(
+    r"""\W*(?P<name>[\w ]*?(?:(?P<rate>rate|freq\w*|\bfs)|interval|period|increment|\bx ?incr?|\bdt|
+        time step|step|delta[_ ]?[xt]|sample[_ ]?time|sampling[_ ]?time))\s*
+        [\[(]?(?P<before>[A-Za-zµ/]+)?[\])]?[\s:=,;"']+(?P<number>[\d.,]+(?:[eE][+-]?\d+)?)"?
+        [\s,;"\[(]*(?P<unit>[A-Za-zµ]+(?:/s|PS)?)?.*""",
+    re.I | re.X,
+)
+_SAMPLES = ("sampl", "acqui", "record", "scan", "adc", "time", "x", "delta", "dt", "fs", "incr")
 
 
-def instrument_lines(path: str, lines: Sequence[str]) -> Sequence[str]:
+def instrument_lines(path: str, lines: Sequence[str]) -> tuple[Sequence[str], tuple[str, ...]]:
     """Return the lines of a table where an instrument wrote them in its form, else the same lines.
+
+    The second is the header of a table that has none among its lines.
 
     Raises:
         InputError: the head is damaged, or the channels were sampled at different instants.
     """
     if lines[0].strip().startswith("LabVIEW Measurement"):
-        return _labview(path, lines)
+        return _labview(path, lines), ()
     names = [cell.strip() for cell in lines[0].strip().rstrip(",").split(",")]
+    if names[0] == "Record Length" and len(names) > 4:
+        return _tektronix(lines)
     if names[0] == "X" and names[-2:] == ["Start", "Increment"] and len(lines) > 1:
-        return _oscilloscope(path, lines, names[1:-2])
+        return _oscilloscope(path, lines, names[1:-2]), ()
     head = lines[:_MOST_LINES]
     ends = (k for k, line in enumerate(head) if re.fullmatch(r"#\s*END_HEADER\s*", line))
     end = next(ends, None)
-    return lines if end is None else _data_recorder(path, lines, end)
+    return (lines if end is None else _data_recorder(path, lines, end)), ()
+
+
+def stated_step(lines: Sequence[str]) -> float | None:
+    """Return the time between samples [s] that the lines above a table state, None without one."""
+    found = set()
+    for line in lines[:_MOST_LINES]:
+        match = _STEP.fullmatch(line)
+        if match is None or not match["name"].lower().lstrip("# ").startswith(_SAMPLES):
+            continue
+        number, is_rate = _number(match["number"].rstrip(",")), match["rate"] is not None
+        unit = unit_named(match["unit"] or "") or unit_named(match["before"] or "")
+        unit = unit or ("Hz" if is_rate else "s")
+        try:
+            value = to_si(number, unit)
+        except InputError:
+            continue
+        if 0.0 < value < 1e12:
+            found.add(1.0 / value if unit.endswith("Hz") or is_rate else value)
+    return found.pop() if len(found) == 1 else None
+
+
+def _tektronix(lines: Sequence[str]) -> tuple[Sequence[str], tuple[str, ...]]:
+    """Return the time and the value of a channel, which stand beside the settings."""
+    rows = [[cell.strip() for cell in line.split(",")] for line in lines]
+    told = {row[0]: row[1] for row in rows if len(row) > 1 and row[0]}
+    unit, clock = (unit_named(told.get(f"{axis} Units", "")) for axis in ("Vertical", "Horizontal"))
+    name = told.get("Source") or "value"
+    header = (f"time [{clock or 's'}]", f"{name} [{unit}]" if unit else name)
+    return [",".join(row[3:5]) if len(row) > 4 else "" for row in rows], header
 
 
 def _data_recorder(path: str, lines: Sequence[str], end: int) -> Sequence[str]:

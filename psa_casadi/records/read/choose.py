@@ -1,0 +1,312 @@
+"""Which column of a table is which column of a record, in which unit, and what remains open."""
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.read import clock, words
+from psa_casadi.records.read.candidates import Cell, cell_of, decided, source_of, suggested
+from psa_casadi.records.read.columns import (
+    COLUMNS,
+    SI_UNITS,
+    ColumnMap,
+    Field,
+    Source,
+    check_unit,
+    measures,
+    usual_source,
+)
+from psa_casadi.records.read.names import column_named, stated_unit, unit_for
+from psa_casadi.records.read.table import Table
+from psa_casadi.units import parse_unit
+
+_HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The columns that a table has for sure; what is open, in sentences, and suggested for it."""
+
+    fields: Mapping[str, Field]
+    open: Sequence[str]
+    sources: ColumnMap
+
+    @property
+    def guess(self) -> set[str]:
+        """The columns that are there or that one is suggested for."""
+        return set(self.fields) | set(self.sources)
+
+
+def choose(table: Table, required: Sequence[str], wanted: ColumnMap, problems: Problems) -> Choice:
+    """Return the columns that the header of a table names.
+
+    `wanted` says which name, or which column counted from 1, stands for which column where the
+    header does not use the columns' own names. Added to `problems`: columns misspelled or there
+    twice, units that are wrong, names in `wanted` that the table does not have.
+    """
+    if table.headless and not wanted:
+        return _numbered(table, required)
+    fields: dict[str, Field] = {}
+    strangers: list[int] = []
+    wrong: dict[str, Source] = {}
+    units = Problems()
+    places = {name: _place(source.array, table) for name, source in wanted.items()}
+    for index, text in enumerate(table.header):
+        match = _HEADER.fullmatch(text.strip())
+        own = match["name"].strip() if match else text
+        asked = [name for name, place in places.items() if place == index]
+        name = asked[0] if asked else plain(own)
+        bare = match is not None and match["unit"] is None
+        second = name == "displacement_2" and not asked and _has_a_first(table)
+        if (
+            match is None or name not in COLUMNS or second or (name in wanted and not asked)
+            or (bare and not asked and (name in required or name == "time"))
+        ):  # fmt: skip
+            strangers.append(index)
+        elif name in fields:
+            problems.add(
+                f"{table.where}, column {index + 1}: '{name}' stands twice in the header (first as "
+                f"column {fields[name].index + 1}); rename or remove one of the two."
+            )
+        else:
+            place = f"{table.where}, column '{own if asked else name}'"
+            stated = match["unit"] or (unit_for(name, _last(own)) if asked else None)
+            if table.sizes and asked and wanted[name].unit:  # of an array it is more often wrong
+                stated = None
+            scaled = not asked and stated is not None and not measures(name, stated)
+            unit = _agreed_unit(
+                name, stated, wanted.get(name), place, units if scaled else problems
+            )
+            fields[name] = Field(index, unit)
+            if scaled:
+                wrong[name] = usual_source(name, table.labels[index], unit)
+    cells, unclear = _by_other_names(table, strangers, fields, required, wanted, units, wrong)
+    for name, source in wanted.items():
+        if places[name] is None:
+            problems.add(
+                f"{table.where}: '{source.array}', which --columns names for '{name}', is not in "
+                f"the header (found: {_listed(fields, cells)}); correct --columns."
+            )
+    missing = _missing(table, cells, fields, required, wanted, problems)
+    told = [sentence.removesuffix(".") for sentence in units.sentences()]
+    found = _open(table, cells, unclear, missing, fields, wanted)
+    if not told:
+        return found
+    return Choice(found.fields, [*found.open, *told], {**wanted, **wrong, **found.sources})
+
+
+def rises(table: Table, index: int) -> bool:
+    """Whether a column is one of instants, or of numbers each of which is larger than the last."""
+    cells = table.glance[index]
+    times = clock.times(cells, "s")
+    if times is None:
+        is_array = isinstance(cells, np.ndarray)
+        texts = [] if is_array else [str(cell) for cell in cells]
+        sign = words.decimal_sign(texts)
+        times = np.asarray(cells) if is_array else words.numbers(texts, sign, "s").values
+    if times.size < 2 or times.dtype.kind not in "biuf":
+        return False
+    steps = np.diff(times)
+    if clock.evened(times):
+        return True
+    counts = np.all(steps == 1.0) and times[0] in (0.0, 1.0)  # rows, not seconds
+    starts_anew = (steps < 0.0).sum() <= 0.1 * steps.size and np.all(steps != 0.0)
+    return bool(starts_anew and not (counts and not stated_unit(table.header[index])))
+
+
+def plain(name: str) -> str:
+    """Return a name as those of columns are written."""
+    return re.sub(r"\s+", "_", name.strip().lower())
+
+
+def misspelled(cell: Cell, absent: Sequence[str]) -> str:
+    """Return the column whose own name a cell has with a mistake, "" where it has none."""
+    cutoff = 0.9 if any(map(column_named, cell.words)) else 0.8
+    return next(iter(difflib.get_close_matches(plain(cell.label), absent, n=1, cutoff=cutoff)), "")
+
+
+def _place(array: str, table: Table) -> int | None:
+    """Return the index of the column that `--columns` names: by its name, its text, its number."""
+    meant = plain(array)
+    for texts in (table.labels, table.header, [_last(label) for label in table.labels]):
+        found = [k for k, text in enumerate(texts) if plain(text) == meant]
+        if found:
+            return found[0]
+    k = int(array) - 1 if array.isdecimal() and len(array) < 6 else -1
+    return k if 0 <= k < len(table.header) else None
+
+
+def _last(label: str) -> str:
+    """Return the name of an array without that of its group and its number in a matrix."""
+    name = re.split(r"\.(?=[^\W\d])", label)[-1]
+    return re.sub(r"(?<=\w\w)\.\d+(?=$| \[)", "", name)
+
+
+def _has_a_first(table: Table) -> bool:
+    return any(plain(label).replace("_", "") == "displacement1" for label in table.labels)
+
+
+def _numbered(table: Table, required: Sequence[str]) -> Choice:
+    """Return what can be said of a table without a header: its columns are counted."""
+    free = [k for k in range(len(table.header)) if not table.sizes or table.sizes[k] > 1]
+    time = next((k for k in free if rises(table, k)), None) if "time" in required else None
+    rest = iter(k for k in free if k != time)
+    sources: dict[str, Source] = {}
+    for name in required:
+        k = time if name == "time" else next(rest, None)
+        if k is not None:
+            sources[name] = usual_source(name, str(k + 1))
+    example = ",".join(COLUMNS[name].example for name in required)
+    told = (
+        f"{table.where}: found '{table.headless[:60]}', expected a header; write a first line such "
+        f"as '{example}'"
+    )
+    return Choice({}, [told], sources)
+
+
+def _by_other_names(
+    table: Table,
+    strangers: Sequence[int],
+    fields: dict[str, Field],
+    required: Sequence[str],
+    wanted: ColumnMap,
+    units: Problems,
+    wrong: dict[str, Source],
+) -> tuple[list[tuple[int, Cell]], dict[str, list[Cell]]]:
+    """Add the columns that go by a laboratory's name for them, or by the unit that only one has.
+
+    What has a column's own name keeps it, and what has it misspelled is nothing else. Returns the
+    cells that remain, and by the name of a column those that may be it. Units that do not measure
+    their column are told in `units`; how it is scaled is asked as in `wrong`.
+    """
+    last = _last if table.sizes else str
+    cells = [(k, cell_of(last(table.header[k]), table.labels[k])) for k in strangers]
+    absent = [n for n in COLUMNS if n not in fields]
+    spelled = [(k, c) for k, c in cells if c.column is not None or not misspelled(c, absent)]
+    unclear: dict[str, list[Cell]] = {}
+    taken: list[int] = []
+    for column in [n for n in absent if n not in wanted]:
+        is_required = column in required
+        one, several = decided(column, [c for _, c in spelled], by_unit=is_required)
+        may_be = [spelled[k] for k in (several if one is None else (one,))]
+        if not may_be or (one is None and not is_required):
+            continue
+        index, cell = may_be[0]
+        if one is None and not (column == "time" and _are_equal(table, may_be)):
+            unclear[column] = [c for _, c in may_be]
+        else:
+            check_unit(COLUMNS[column], cell.unit, f"{table.where}, column '{cell.text}'", units)
+            if not measures(column, cell.unit or ""):
+                wrong[column] = source_of(column, cell)
+            taken.append(index)
+        fields[column] = Field(index, cell.unit or SI_UNITS.get(column, "um"))
+    return [(k, c) for k, c in cells if k not in taken], unclear
+
+
+def _are_equal(table: Table, cells: Sequence[tuple[int, Cell]]) -> bool:
+    """Whether several clocks with units are the same one, as each channel of a file has its own."""
+    (first, one), *others = cells
+    return one.unit is not None and all(
+        cell.unit == one.unit and np.array_equal(table.glance[first], table.glance[k])
+        for k, cell in others
+    )
+
+
+def _missing(
+    table: Table,
+    cells: Sequence[tuple[int, Cell]],
+    fields: Mapping[str, Field],
+    required: Sequence[str],
+    wanted: ColumnMap,
+    problems: Problems,
+) -> list[str]:
+    """Complain of columns that seem to be misspelled; return the others that are missing."""
+    absent = [name for name in COLUMNS if name not in fields]
+    unknown = [cell for _, cell in cells if cell.column is None]
+    wrong = {near: plain(c.label) for c in unknown if (near := misspelled(c, absent))}
+    for name, found in wrong.items():
+        problems.add(
+            f"{table.where}: the column '{found}' is unknown; if '{name}' is meant, correct "
+            f"the header to '{COLUMNS[name].example}', else give it a less similar name."
+        )
+    needed = [name for name in required if name not in wanted]
+    return [name for name in absent if name in needed and name not in wrong]
+
+
+def _open(
+    table: Table,
+    cells: Sequence[tuple[int, Cell]],
+    unclear: Mapping[str, Sequence[Cell]],
+    missing: Sequence[str],
+    fields: Mapping[str, Field],
+    wanted: ColumnMap,
+) -> Choice:
+    """Return the choice with what is said of columns that are unclear or missing."""
+    told = []
+    if unclear:
+        which = ", ".join(
+            f"'{name}' {'has no unit' if len(own) == 1 else 'may be more than one column'}"
+            f" ({', '.join(cell.text for cell in own)})"
+            for name, own in unclear.items()
+        )
+        examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
+        told.append(
+            f"{table.where}: {which}{'' if table.sizes else f'; write {examples} in the header'}"
+        )
+    known = {name: field for name, field in fields.items() if name not in unclear}
+    told += [
+        f"{table.where}: the column '{name}' is missing (found: {_listed(known, cells)})"
+        + ("" if table.sizes else f"; add it to the header as '{COLUMNS[name].example}'")
+        for name in missing
+    ]
+    main = _main_size(table)
+    free = [(k, c) for k, c in cells if not table.sizes or table.sizes[k] == main]
+    index = {id(cell): k for k, cell in free}
+    chosen = suggested(
+        [*unclear, *missing], [c for _, c in free], lambda c: rises(table, index[id(c)])
+    )
+    sources = {name: source_of(name, free[k][1]) for name, k in chosen.items()}
+    return Choice(fields, told, {**wanted, **sources} if sources else {})
+
+
+def _main_size(table: Table) -> int:
+    """Return the length of most of the arrays, of the longest where none is more frequent."""
+    sizes = [n for n in table.sizes if n > 1]
+    return max(sizes, key=lambda n: (sizes.count(n), n), default=0)
+
+
+def _agreed_unit(
+    name: str, own: str | None, source: Source | None, where: str, problems: Problems
+) -> str:
+    """Return the unit that the header or `--columns` gives; the two must not disagree."""
+    given = source.unit if source else None
+    if source and source.scale is not None:  # of the header's unit, as a sensor's volts
+        return given or ""
+    unit = own or given or (SI_UNITS.get(name) if source else None)
+    check_unit(COLUMNS[name], unit, where, problems)
+    if own and given and not _same_unit(own, given):
+        problems.add(
+            f"{where}: the header gives the unit '{own}', --columns gives '{given}'; leave the one "
+            f"in --columns out, or say there what 1 in the file is, such as 10{given}."
+        )
+    return unit or ""
+
+
+def _same_unit(one: str, other: str) -> bool:
+    try:
+        first, second = parse_unit(one), parse_unit(other)
+    except InputError:
+        return True  # the unknown one was told already
+    return (first.dimension, first.ratio, first.offset) == (
+        second.dimension, second.ratio, second.offset,
+    )  # fmt: skip
+
+
+def _listed(fields: Mapping[str, Field], left: Sequence[tuple[int, Cell]]) -> str:
+    """Return the columns that are known and the names of the cells that are none."""
+    names = [*fields, *(cell.label for _, cell in left)]
+    return ", ".join(filter(None, names))[:120] or "nothing"

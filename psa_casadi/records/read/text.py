@@ -1,0 +1,475 @@
+"""Tables in the lines of a text or of a spreadsheet: preamble, header, units in a row, several."""
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.checks import FEWEST_SAMPLES
+from psa_casadi.records.read import words
+from psa_casadi.records.read.clock import is_stamp, unit_of_times
+from psa_casadi.records.read.columns import COLUMNS, measures
+from psa_casadi.records.read.instruments import instrument_lines, stated_step
+from psa_casadi.records.read.names import (
+    columns_known,
+    stated_unit,
+    understood,
+    unit_named,
+    units_row,
+)
+from psa_casadi.records.read.table import Cells, Columns, Table
+from psa_casadi.units import units_of
+
+#: Lines in which the first header is looked for, and the most that are asked for further ones.
+_MOST_LINES, _MOST_HEADERS = 500, 20_000
+#: The most lines below a table that are told as no samples: sums, means, an end mark.
+_MOST_BELOW = 20
+_WIDE = re.compile(r"\s*\t\s*|[ ]{2,}")
+#: The most rows of remarks below the units.
+_MOST_REMARKS = 3
+_SPACES, _BEFORE_UNIT = re.compile(r"[ \t]+"), re.compile(r"\s+(?=[\[(])")
+#: A first line that tells Excel what separates the cells.
+_TOLD_MARK = re.compile(r"\s*\"?sep=([^\w\s]|\t)\"?[\s,;]*", re.I)
+_NAME = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
+_IN_BRACKETS = re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]+)[\])}]")
+#: How a line begins that may be a header: with a letter or a bracket, perhaps quoted or a comment.
+_WORDY = re.compile(r"[#%\s\"']*[^\W\d_(\[]")
+_COMMENTS = ("#", "%", "!", "//", ";")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The header's cells, the delimiter, and the lines of the header and of the first numbers."""
+
+    header: tuple[str, ...]
+    delimiter: str
+    header_line: int
+    first: int
+
+
+def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> list[Table]:
+    """Return the tables in lines, each from its header on; none in nothing but comments.
+
+    The header is the first line that names two columns of a record, in a comment too if numbers
+    follow; where none does, it is the line above the first numbers, else the first line that is no
+    comment, and where that one holds numbers there is no header. A row of units below is joined to
+    the names. A first line `sep=;` says what separates the cells.
+
+    Raises:
+        InputError: the head of an instrument's file is damaged.
+    """
+    lines, header = instrument_lines(path, lines) if place == "line" else (lines, ())
+    told = _TOLD_MARK.fullmatch(lines[0]) if lines else None
+    mark = told[1] if told else ""
+    lines = ["", *lines[1:]] if told else lines
+    first = _in_rows(lines, mark) or _laid_out(lines, mark)
+    first = _Layout(header, ",", 0, 0) if header else first
+    if first is None:
+        return []
+    if isinstance(first, Table):
+        return [replace(first, path=path, where=f"{path}: {place} 1", name=name)]
+    found = [first, *_further(lines, mark, first)]
+    ends = [*(layout.header_line for layout in found[1:]), len(lines)]
+    parts = [
+        _Part(path, place, layout, lines[layout.first : _end(lines, layout, end)], single)
+        for layout, end in zip(found, ends, strict=True)
+        if (single := len(found) == 1) or end - layout.first >= FEWEST_SAMPLES
+    ]
+    step = stated_step(lines[: first.first])
+    tables = [side for part in parts for side in _side_by_side(part.table(name, step))]
+    if len(tables) == 1:
+        return tables
+    return [replace(t, name=f"{name}.{k}" if name else "") for k, t in enumerate(tables, 1)]
+
+
+def _side_by_side(table: Table) -> list[Table]:
+    """Return the tables that stand beside each other: the header has the same names again."""
+    header = list(table.header)
+    first = next((text for text in header if text.strip()), None)
+    starts = [k for k, text in enumerate(header) if text == first]
+    ends = [*starts[1:], len(header)] if starts else []
+    widths = {len([t for t in header[a:b] if t.strip()]) for a, b in zip(starts, ends, strict=True)}
+    if (
+        len(starts) < 2
+        or len(set(header)) == 1
+        or table.headless
+        or len(widths) > 1
+        or widths == {1}
+    ):
+        return [table]
+
+    def part(first: int, end: int) -> Table:
+        def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
+            return table.load([first + k for k in asked], most, problems)
+
+        return replace(
+            table, header=header[first:end], labels=list(table.labels)[first:end], load=load
+        )
+
+    return [part(a, b) for a, b in zip(starts, ends, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The lines of one table below its header; `single` if nothing else is in the file."""
+
+    path: str
+    place: str
+    layout: _Layout
+    rows: Sequence[str]
+    single: bool
+
+    def table(self, name: str, step: float | None) -> Table:
+        layout = self.layout
+        first = next((row for row in self.rows if _holds(row)), "")
+        width = len(layout.header) or len(self._cells(first))
+        bare = Table(
+            path=self.path, name=name, header=layout.header or [""] * width, labels=[],
+            where=f"{self.path}: {self.place} {layout.header_line + 1}", place=self.place,
+            load=self._load, step=step,
+        )  # fmt: skip
+        if not layout.header:
+            numbered = tuple(str(k) for k in range(1, width + 1))
+            told = ",".join(self._cells(first))
+            return replace(bare, header=numbered, labels=numbered, headless=told)
+        header = [_with_unit(h, c) for h, c in zip(layout.header, bare.glance, strict=True)]
+        return replace(bare, header=header, labels=[label_of(text) for text in header])
+
+    def _cells(self, row: str) -> list[str]:
+        return cells_of(row, self.layout.delimiter)
+
+    def _load(self, asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
+        kept = self._kept()
+        rows = [self.rows[k] for k in kept[:most]]
+        lines = np.asarray(kept[:most], dtype=np.int64) + self.layout.first + 1
+        quick = self._at_once(rows, asked)
+        if quick is not None:
+            return Columns([quick[:, k] for k in range(len(asked))], lines)
+        width = max(len(self.layout.header), max(asked, default=0) + 1)
+        split, whole = [], []
+        for line, row in zip(lines, rows, strict=True):
+            cells = self._cells(row)
+            if most is not None:  # a glance tells no mistakes
+                cells = [*cells, *[""] * width][:width]
+            spare = len(cells) - width
+            if (spare > 0 and any(c.strip() for c in cells[width:])) or (
+                spare < 0 and len(cells) <= max(asked, default=0)
+            ):
+                problems.add(self._wrong_count(line, cells, width))
+                continue
+            split.append(cells)
+            whole.append(line)
+        columns = [[cells[k] for cells in split] for k in asked]
+        return Columns(columns, np.array(whole, dtype=np.int64))
+
+    def _kept(self) -> list[int]:
+        """Return the indices of the rows that hold cells, up to what stands below the numbers."""
+        marks = tuple(m for m in _COMMENTS if m != self.layout.delimiter)
+        kept = [k for k, row in enumerate(self.rows) if row.strip() and not row.startswith(marks)]
+        below = 0
+        while below < min(_MOST_BELOW, len(kept) - FEWEST_SAMPLES) and self._is_below(
+            kept[-1 - below]
+        ):
+            below += 1
+        return kept[: len(kept) - below] if below < _MOST_BELOW else kept
+
+    def _is_below(self, k: int) -> bool:
+        """Whether a row is no sample: it begins with a word and is not as the rows above it."""
+        cells = self._cells(self.rows[k])
+        wordy = cells[0].strip() if cells else ""
+        return bool(_WORDY.match(wordy)) and not (
+            words.is_missing(wordy) or is_stamp(wordy) or _WORDY.match(self.rows[0])
+        )
+
+    def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> NDArray[np.float64] | None:
+        """Let NumPy read all rows; None if any of them needs a closer look."""
+        body, mark = "\n".join(rows), self.layout.delimiter
+        point = words.decimal_sign([c for row in rows[:20] for c in self._cells(row)])
+        if not body or '"' in body or (point == "," and mark == ","):
+            return None
+        if mark == " ":
+            rows = [_SPACES.sub(" ", row.strip()) for row in rows]
+            body = "\n".join(rows)
+        width = len(self.layout.header) or rows[0].count(mark) + 1
+        if body.count(mark) != len(rows) * (width - 1):
+            return None
+        if point == ",":
+            body = body.translate(words.SWAPPED)
+        for _ in range(2):
+            body = body.replace(mark * 2, f"{mark}nan{mark}") if mark != " " else body
+        body = f"\n{body}\n".replace(f"{mark}\n", f"{mark}nan\n").replace(
+            f"\n{mark}", f"\nnan{mark}"
+        )
+        try:
+            values = np.loadtxt(
+                body[1:-1].split("\n"), delimiter=mark, comments=None, usecols=asked, ndmin=2
+            )
+        except ValueError:
+            return None
+        return None if np.any((np.abs(values) > 1e8) & np.isfinite(values)) else values
+
+    def _wrong_count(self, line: int, cells: Sequence[str], width: int) -> str:
+        hint = f"complete or remove the {self.place}"
+        if self.layout.delimiter == "," and len(cells) == 2 * width:
+            hint = "where numbers have decimal commas, separate the cells by semicolons"
+        return (
+            f"{self.path}: {self.place} {line}: found {len(cells)} cells, expected {width} as in"
+            f" the header; {hint}."
+        )
+
+
+def label_of(text: str) -> str:
+    """Return the name of a column in a header without its unit in brackets."""
+    match = _NAME.fullmatch(text.strip())
+    return (match["name"] if match else text).strip()
+
+
+def _with_unit(text: str, cells: Cells) -> str:
+    """Return a header's cell with the unit that only the cells below it tell.
+
+    That is the second for dates and clock times, what stands behind the numbers, or what makes a
+    number the time since 1970.
+    """
+    match = _NAME.fullmatch(text.strip())
+    unit = match["unit"] if match else None
+    if match and unit is not None and unit_named(unit) == "s" and ":" in unit:
+        return f"{match['name']} [s]"
+    text = _in_small_letters(text)
+    if stated_unit(text) or unit:
+        return text
+    name = understood(text)
+    filled = cells if isinstance(cells, np.ndarray) else [c for c in cells if c.strip()]
+    if not isinstance(filled, np.ndarray):
+        if filled and is_stamp(filled[0]):
+            return f"{text.strip()} [s]"
+        own = words.unit_in(filled)
+        if own:
+            return f"{text.strip()} [{own}]"
+        filled = words.numbers(filled[:9], words.decimal_sign(filled[:9]), "s").values
+    own = unit_of_times(filled[:9]) if name and name.column == "time" else None
+    return f"{text.strip()} [{own}]" if own else text
+
+
+def _in_small_letters(text: str) -> str:
+    """Return a header's cell in capitals with its unit as it is written: `TIME(S)`, `DISP (UM)`."""
+    match = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
+    name = understood(match["name"]) if match else None
+    if match is None or name is None or measures(name.column, match["unit"]):
+        return text
+    units = [u for quantity in COLUMNS[name.column].quantities for u in units_of(quantity)]
+    small = next((u for u in units if u.lower() == match["unit"].lower()), None)
+    return f"{match['name']} [{small}]" if small else text
+
+
+def _laid_out(lines: Sequence[str], mark: str) -> _Layout | None:
+    """Return where the first header and its numbers are; "" for a `mark` that is not told."""
+    start = next((k for k, line in enumerate(lines) if _holds(line)), None)
+    if start is None:
+        return None
+    plain = _named(lines, [start], mark)
+    place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)), mark)
+    if place is None:
+        numbers = _numbers(lines[start], mark)
+        if numbers:
+            return _Layout((), numbers, start, start)
+        place = _above_numbers(lines, start, mark)
+    return _with_header(lines, place, mark)
+
+
+def _with_header(lines: Sequence[str], place: int, mark: str) -> _Layout:
+    delimiter = mark or delimiter_of(lines[place].lstrip("#% "))
+    header = cells_of(lines[place].lstrip("#% "), delimiter, spaced=True)
+    below = place + 1
+    if below < len(lines):
+        units = units_row(cells_of(lines[below].lstrip("#% "), delimiter))
+        if units is not None and len(units) == len(header):
+            pairs = zip(header, units, strict=True)
+            header = [f"{n.strip()} [{u}]" if u and not stated_unit(n) else n for n, u in pairs]
+            below += 1
+    for k, line in enumerate(lines[below : below + _MOST_REMARKS + 1]):
+        if _numbers(line, mark):  # below remarks, as Origin has them under its units
+            below += k
+            break
+        if not _is_remark(line, delimiter):
+            break
+    while len(header) > 1 and not header[-1].strip():
+        header.pop()
+    row = lines[below] if below < len(lines) else ""
+    if delimiter in " \t" and not mark and len(cells_of(row, delimiter)) != len(header):
+        for form in (_WIDE, _SPACES):  # names with spaces in them, tabs and spaces mixed
+            names = form.split(_BEFORE_UNIT.sub(" ", lines[place].strip("#% \t")))
+            if len(names) == len(cells_of(row, " ")) and _numbers(row, " "):
+                header, delimiter = names, " "
+                break
+    return _Layout(tuple(header), delimiter, place, below)
+
+
+def _is_remark(line: str, delimiter: str) -> bool:
+    """Whether a line below a header holds words and no number."""
+    cells = [c for c in cells_of(line, delimiter) if c.strip()]
+    return bool(cells) and not any(
+        words.is_number(c) or is_stamp(c) or words.is_missing(c) or words.unit_in([c])
+        for c in cells
+    )
+
+
+def _further(lines: Sequence[str], mark: str, first: _Layout) -> Iterator[_Layout]:
+    """Yield the layouts of the headers below the first one."""
+    asked, begin = 0, first.first
+    if not first.header:
+        return
+    for k in range(first.first + 1, len(lines)):
+        if k < begin or not _WORDY.match(lines[k]):
+            continue
+        asked += 1
+        if asked > _MOST_HEADERS:
+            return
+        if _named(lines, [k], mark, sure=True) is not None:
+            found = _with_header(lines, k, mark)
+            if found.delimiter == first.delimiter:
+                begin = found.first
+                yield found
+
+
+def _end(lines: Sequence[str], layout: _Layout, end: int) -> int:
+    """Return where the rows of a table end: above the preamble of the next one."""
+    if end == len(lines):
+        return end
+    while end > layout.first and not (
+        (cells := cells_of(lines[end - 1], layout.delimiter))
+        and len(cells) >= len(layout.header)
+        and (words.is_number(cells[0]) or is_stamp(cells[0]))
+    ):
+        end -= 1
+    return end
+
+
+def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
+    """Return the table of records that lie in rows: each a name with its numbers behind it."""
+    rows = [line for line in lines[:100] if line.strip() and not line.startswith("#")]
+    if not 2 <= len(rows) <= 64 or len([line for line in lines if line.strip()]) > 100:
+        return None
+    delimiter = mark or delimiter_of(rows[0])
+    cells = [cells_of(row.rstrip(delimiter), delimiter) for row in rows]
+    width = len(cells[0])
+    if width <= FEWEST_SAMPLES or any(
+        len(row) != width or words.is_number(row[0]) or not all(map(words.is_number, row[1:9]))
+        for row in cells
+    ):
+        return None
+    header = [_with_unit(row[0], row[1:]) for row in cells]
+
+    def load(asked: Sequence[int], most: int | None, _: Problems) -> Columns:
+        end = width if most is None else min(width, most + 1)
+        return Columns([cells[k][1:end] for k in asked], np.arange(1, end))
+
+    return Table("", "", header, [label_of(h) for h in header], "", "sample", load)
+
+
+def cells_of(line: str, delimiter: str, *, spaced: bool = False) -> list[str]:
+    """Return the cells of a line; the delimiter " " stands for any number of spaces.
+
+    `spaced` says that a space may stand before a quoted cell.
+    """
+    if delimiter == " ":
+        return _SPACES.split(_BEFORE_UNIT.sub("", line.strip()))
+    if '"' not in line:
+        return line.split(delimiter)
+    try:
+        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=spaced), [])
+    except csv.Error:  # a cell of more than 128 KiB, as where a quote never ends
+        return line.split(delimiter)
+
+
+def delimiter_of(line: str) -> str:
+    """Return the one of comma, semicolon and tab that a line holds most often, else a space."""
+    most = max(",;\t", key=line.count)
+    return most if most in line else " "
+
+
+def _holds(line: str) -> bool:
+    return bool(line.strip()) and not line.startswith("#")
+
+
+def _numbers(line: str, mark: str) -> str:
+    """Return what separates the numbers of a line, "" where it does not hold numbers alone.
+
+    Where numbers have decimal commas, that is no comma.
+    """
+    for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), ";", "\t", " ")):
+        cells = [c for c in cells_of(line, delimiter) if c.strip()]
+        if len(cells) > 1 and all(map(words.is_number, cells)):
+            return delimiter
+    return ""
+
+
+def _above_numbers(lines: Sequence[str], start: int, mark: str) -> int:
+    """Return the line of names, and of units below it, above the first numbers, else the first."""
+    places = range(start, min(len(lines), _MOST_LINES))
+    first = next((k for k in places if _numbers(lines[k], mark)), start)
+    told = mark or _numbers(lines[first], mark).strip(" ")
+    cells = [
+        cells_of(line, told if told and told in line else delimiter_of(line))
+        for line in lines[max(start, first - 2) : first + 1]
+    ]
+    if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
+        return first - 2
+    alike = len(cells) > 1 and len(cells[-2]) == len(cells[-1])
+    return first - 1 if alike and not words.is_number(cells[-2][0]) else start
+
+
+def _named(
+    lines: Sequence[str], places: Sequence[int], mark: str, *, sure: bool = False
+) -> int | None:
+    """Return the first of the places that names two columns, and has more lines below.
+
+    `sure` demands numbers below in any case, not only below a comment.
+    """
+    for k in places:
+        line = lines[k].lstrip("#% ")
+        for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), " ")):
+            known = columns_known(cells_of(line, delimiter))
+            if known >= 2 and (
+                not (sure or lines[k].startswith(("#", "%"))) or _follow(lines, k, mark)
+            ):
+                return k
+    return None
+
+
+def _follow(lines: Sequence[str], k: int, mark: str) -> bool:
+    """Whether a line that begins with a number comes within three lines of line k."""
+    return any(
+        words.is_number(cells_of(line, mark or delimiter_of(line))[0])
+        for line in lines[k + 1 : k + 4]
+        if line.strip()
+    )
+
+
+def decoded(data: bytes, path: str) -> str:
+    """Return the text in the content of a file: UTF-8, UTF-16 with or without a mark, Windows' own.
+
+    Raises:
+        InputError: it is no text.
+    """
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        try:
+            return data.decode("utf-16")
+        except UnicodeDecodeError:
+            raise InputError(
+                f"{path}: begins as UTF-16 text and is none; save it as 'CSV UTF-8'."
+            ) from None
+    for first, coding in ((1, "utf-16-le"), (0, "utf-16-be")):  # Windows' text without a mark
+        if data[first : first + 3 : 2] == b"\0\0" and len(data) % 2 == 0:
+            return data.decode(coding, errors="replace")
+    if b"\0" in data:
+        raise InputError(
+            f"{path}: is not text but a binary file; export the record as CSV and name that file."
+        )
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")

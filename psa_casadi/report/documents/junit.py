@@ -1,0 +1,54 @@
+"""What `--junit` writes: a command as a suite of tests, as CI servers read it (JUnit XML)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from xml.etree import ElementTree
+
+from psa_casadi.characters import plain
+from psa_casadi.export.check.check import CheckReport
+from psa_casadi.report.words.tables import check_table
+
+
+@dataclass(frozen=True)
+class Case:
+    """One test: its name, what was found, and why it failed, "" where it passed."""
+
+    name: str
+    found: str
+    failure: str = ""
+
+
+def check_cases(report: CheckReport) -> list[Case]:
+    """Return every check of an FMU as a test."""
+    rows = zip(check_table(report).rows, report.rows, strict=True)
+    return [
+        Case(name, text, "" if row.passed else text)
+        for (name, found, allowed, _, remark), row in rows
+        if (text := f"found {found}, allowed {allowed}{f': {remark}' if remark else ''}")
+    ]
+
+
+def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float) -> str:
+    """Return JUnit XML: one suite of the `command` on its `subject`, which took `seconds`.
+
+    The elements and attributes are those that Jenkins' schema and GitLab's and GitHub's readers
+    share: counts in `testsuites` and `testsuite`, `failure` with a message, `system-out`.
+    """
+    counts = {
+        "name": plain(f"psa {command} {subject}"),
+        "tests": str(len(cases)),
+        "failures": str(sum(bool(c.failure) for c in cases)),
+        "errors": "0",
+        "time": f"{seconds:.3f}",
+    }
+    suites = ElementTree.Element("testsuites", counts)
+    suite = ElementTree.SubElement(suites, "testsuite", {**counts, "skipped": "0"})
+    for case in cases:
+        told = {"classname": plain(f"psa.{command}.{subject}"), "name": plain(case.name)}
+        test = ElementTree.SubElement(suite, "testcase", told)
+        if case.failure:
+            failure = {"message": plain(case.failure), "type": "failure"}
+            ElementTree.SubElement(test, "failure", failure).text = plain(case.failure)
+        ElementTree.SubElement(test, "system-out").text = plain(case.found)
+    ElementTree.indent(suites)
+    return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
