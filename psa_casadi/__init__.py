@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         port_model,
     )
     from psa_casadi.design.online.observer import FeedForward, HysteresisObserver, stack_values
+    from psa_casadi.design.online.part_for import part_for
     from psa_casadi.design.online.recursive_least_squares import (
         AdaptiveFeedForward,
         OnlineIdentification,
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     )
     from psa_casadi.records.signals import Signals
     from psa_casadi.report.documents.findings import read_findings
+    from psa_casadi.report.documents.load_diagnosis import load_diagnosis
     from psa_casadi.report.page.comparison_page import write_comparison
     from psa_casadi.report.page.diagnosis import write_report
     from psa_casadi.report.page.fit_page import write_fit_report
@@ -130,6 +132,7 @@ _HOMES = {
         "HysteresisObserver",
         "stack_values",
     ),
+    "psa_casadi.design.online.part_for": ("part_for",),
     "psa_casadi.design.online.recursive_least_squares": (
         "AdaptiveFeedForward",
         "OnlineIdentification",
@@ -189,6 +192,7 @@ _HOMES = {
     "psa_casadi.devices.jobs": ("Job",),
     "psa_casadi.devices.task": ("Options",),
     "psa_casadi.report.documents.findings": ("read_findings",),
+    "psa_casadi.report.documents.load_diagnosis": ("load_diagnosis",),
     "psa_casadi.report.page.comparison_page": ("write_comparison",),
     "psa_casadi.report.page.population_page": ("write_population",),
     "psa_casadi.report.page.fit_page": ("write_fit_report",),
@@ -261,6 +265,7 @@ __all__ = [
     "diagnose",
     "Diagnosis",
     "OdeDiagnosis",
+    "load_diagnosis",
     "timed",
     "Timings",
     "story",
@@ -280,6 +285,7 @@ __all__ = [
     "OnlineIdentification",
     "AdaptiveFeedForward",
     "identifier_for",
+    "part_for",
     "design_mechanism",
     "mechanism_model",
     "port_model",
@@ -299,44 +305,6 @@ __all__ = [
     "system",
     "__version__",
 ]
-#: What `dir` and a notebook's completion show: the names to begin with. What belongs to `design`,
-#: `online` and `system`, and the types of results, answer to their names here as well.
-_FIRST = (
-    "Record",
-    "Signals",
-    "read_record",
-    "read_records",
-    "record_from",
-    "write_record",
-    "EFFECTS",
-    "Component",
-    "STACKS",
-    "stack_model",
-    "Model",
-    "compose",
-    "ode_model",
-    "Parameter",
-    "load_model",
-    "save_model",
-    "simulate",
-    "simulate_record",
-    "identify",
-    "diagnose",
-    "batch",
-    "story",
-    "export_fmu",
-    "export_modelica",
-    "export_ssp",
-    "check_fmu",
-    "InputError",
-    "PsaError",
-    "MachineError",
-    "datasets",
-    "design",
-    "online",
-    "system",
-    "__version__",
-)
 #: Packages and modules that are public as such.
 _SPACES = ("datasets", "design", "online", "system")
 
@@ -353,5 +321,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names to begin with, loaded or not."""
-    return sorted(_FIRST)
+    """List the public names, loaded or not."""
+    return sorted(__all__)

@@ -5,14 +5,26 @@ meaning. `psa_casadi.model.structure` adds the terms up, puts the sums in the or
 dependence and refuses a loop.
 """
 
+import pickle
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from importlib import import_module
 from typing import Any
+
+import casadi as ca
 
 from psa_casadi.variables import Input, Output, Parameter, State
 
 # casadi ships no type information; a symbolic expression is Any to the type checker.
 Expression = Any
+
+#: Where the components of this package are, by module and name of a table.
+_TABLES = (
+    ("psa_casadi.components", "COMPONENTS"),
+    ("psa_casadi.effects", "EFFECTS"),
+    ("psa_casadi.effects.modal_series", "MODAL_SERIES"),
+    ("psa_casadi.effects.patches", "PATCHES"),
+)
 
 #: Probe value that stands for "the frequencies where the residual's spectrum peaks", in Hz.
 SPECTRAL_PEAKS = "spectral_peaks"
@@ -109,6 +121,17 @@ class Symbols:
             raise AttributeError(f"no symbol named '{name}' in this model") from None
 
 
+class OnDemand(Symbols):
+    """Symbols of any name, made when they are asked for; `made` are those that were."""
+
+    def __init__(self) -> None:
+        super().__init__({})
+        self.made = self._table
+
+    def __getattr__(self, name: str) -> Expression:
+        return self._table.setdefault(name, ca.SX.sym(name))
+
+
 @dataclass(frozen=True, eq=False)
 class Foreign:
     """A compiled function `name` that equations call, and its derivative: an imported FMU.
@@ -198,6 +221,25 @@ class Component:
         """Whether an exported plant holds it: sensor and environment stay outside."""
         return self.belongs_to not in ("sensor", "environment")
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle by reference where a table or an own module has it, else with its equations.
+
+        Equations that are no function of a module, such as those of `ode_model`, are kept as a
+        function of CasADi.
+        """
+        if self.home:
+            return _of_module, ("psa_casadi.model.own_effects", self.home, self.name)
+        for module, table in _TABLES:
+            for key, component in getattr(import_module(module), table).items():
+                if component is self:
+                    return _of_table, (module, table, key)
+        declared = {f.name: getattr(self, f.name) for f in fields(self)}
+        try:
+            pickle.dumps(self.equations)
+        except (pickle.PicklingError, AttributeError, TypeError):
+            declared["equations"] = KeptEquations.of(self)
+        return _of_fields, (declared,)
+
     def at_gain(self, gain: float, values: Mapping[str, float]) -> dict[str, float]:
         """Return `values` with a gain, as a fit has them: the `linear` ones times it, beside 1."""
         if not self.linear:
@@ -210,3 +252,48 @@ class Component:
     def fitted(self) -> tuple[str, ...]:
         """Names of the parameters that records can tell."""
         return tuple(p.name for p in self.parameters if p.fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class KeptEquations:
+    """Equations of a component that can be pickled: a function of the symbols of some names.
+
+    `places` are the field of `Equations` and the name of each of its results.
+    """
+
+    function: ca.Function
+    symbols: tuple[str, ...]
+    places: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def of(cls, component: Component) -> "KeptEquations":
+        """Return the equations of a component as a function."""
+        symbols = OnDemand()
+        written = component.equations(symbols)
+        parts = [f.name for f in fields(Equations)]
+        results = {(part, n): e for part in parts for n, e in getattr(written, part).items()}
+        made = symbols.made
+        function = ca.Function("equations", list(made.values()), [*map(ca.SX, results.values())])
+        return cls(function, tuple(made), tuple(results))
+
+    def __call__(self, s: Symbols) -> Equations:
+        """Return the equations in these symbols."""
+        results = self.function.call([getattr(s, name) for name in self.symbols])
+        parts: dict[str, dict[str, Expression]] = {}
+        for (part, name), result in zip(self.places, results, strict=True):
+            parts.setdefault(part, {})[name] = result
+        return Equations(**parts)
+
+
+def _of_table(module: str, table: str, key: Any) -> Component:
+    found: Component = getattr(import_module(module), table)[key]
+    return found
+
+
+def _of_module(reader: str, module: str, name: str) -> Component:
+    found: Component = import_module(reader).own_effects(module)[name]
+    return found
+
+
+def _of_fields(declared: dict[str, Any]) -> Component:
+    return Component(**declared)

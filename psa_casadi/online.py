@@ -1,6 +1,7 @@
 """For use sample by sample in a control loop: observers, feed-forward, identification online."""
 
 from psa_casadi.design.online.observer import FeedForward, HysteresisObserver, stack_values
+from psa_casadi.design.online.part_for import part_for
 from psa_casadi.design.online.recursive_least_squares import (
     AdaptiveFeedForward,
     OnlineIdentification,
@@ -13,5 +14,6 @@ __all__ = [
     "HysteresisObserver",
     "OnlineIdentification",
     "identifier_for",
+    "part_for",
     "stack_values",
 ]

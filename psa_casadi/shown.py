@@ -5,29 +5,50 @@ name of what makes it.
 """
 
 import os
+from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _HOME = "psa_casadi.report.shown"
 
 
-class Shown:
-    """What a result can show of itself: a line, a notebook's cell, a picture."""
+class Celled:
+    """What shows itself as a cell of a notebook."""
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: words, and a table or a picture."""
+        return str(_made("cell", self))
+
+
+class Plotted(Celled):
+    """What can show a picture of itself."""
+
+    def plot(self, ax: "Axes | None" = None, output: str | None = None) -> "Figure":
+        """Return the picture as a matplotlib figure; a notebook shows it by itself.
+
+        With `ax` or `output` it is one quantity over time, on these axes or on its own: an output
+        or state by name, "residual" of a fit or diagnosis, a parameter of a posterior.
+
+        Raises:
+            InputError: there is no such output.
+        """
+        return cast("Figure", _made("plot", self, ax, output))
+
+
+class Lined(Celled):
+    """What shows itself in one line and as a cell."""
 
     def __repr__(self) -> str:
         """Return the result in one line."""
         return str(_made("line", self))
 
-    def _repr_html_(self) -> str:
-        """Return what a notebook shows: words and picture."""
-        return str(_made("cell", self))
 
-    def plot(self) -> "Figure":
-        """Return the picture as a matplotlib figure; a notebook shows it by itself."""
-        return cast("Figure", _made("plot", self))
+class Shown(Plotted, Lined):
+    """What a result can show of itself: a line, a notebook's cell, a picture."""
 
 
 class Reported(Shown):
@@ -54,6 +75,11 @@ class StillReported(Shown):
             InputError: `path` cannot be written to.
         """
         _made("page", self, path, True)
+
+
+def with_units(columns: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, Any]:
+    """Return columns whose names carry their units, as in `time [s]`; none where it is unknown."""
+    return {f"{n} [{units[n]}]" if units.get(n) else n: values for n, values in columns.items()}
 
 
 def frame(columns: dict[str, Any]) -> Any:

@@ -32,7 +32,7 @@ class NumpyIdentification:
         return np.asarray(self.start + self.spread * self.z, dtype=np.float64)
 
     def after(self, f: float, theta: FloatArray, u: float) -> float:
-        """Return f_H after one step of Heun's method from the last voltage to u."""
+        """Return f_H after one step of Alexander's method from the last voltage to u."""
         v, T = self.v, self.v["period"]
         A, beta, gamma, delta, n = theta[:5]
         du = u - self.last
@@ -43,8 +43,15 @@ class NumpyIdentification:
             free = A * du + delta * 0.5 * (u + self.last) * sign * T
             return float(free - (beta * du * sign * np.sign(f) + gamma * du) * r)
 
-        first = change(f)
-        return f + 0.5 * (first + change(f + first))
+        share = 1.0 - 0.5**0.5
+
+        def stage(known: float) -> float:
+            at = known
+            for _ in range(50):  # converges: the steps of these records are small
+                at = known + share * change(at)
+            return at
+
+        return stage(f + (1.0 - share) * change(stage(f)))
 
     def slopes(self, theta: FloatArray, u: float) -> tuple[float, FloatArray]:
         """Return the derivatives of `after` by f and by A, beta, gamma, delta, n."""

@@ -41,7 +41,7 @@ def rows_with(row: int, text: str) -> list[str]:
 
 RECORDS: dict[str, tuple[list[str], str]] = {
     "wrong unit": (["time [s],voltage [N],displacement [um]", *ROWS], "'N' does not measure"),
-    "unknown unit": (["time [s],voltage [volts],displacement [um]", *ROWS], "'volts' is unknown"),
+    "unknown unit": (["time [s],voltage [vlots],displacement [um]", *ROWS], "'vlots' is unknown"),
     "unit of a load": (
         [f"{HEADER},load_force [kg]", *(f"{r},0" for r in ROWS)], "'kg' does not measure force"
     ),

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
+from psa_casadi.cli.inputs import step_seconds
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
@@ -145,15 +146,22 @@ def test_a_start_voltage_is_at_rest() -> None:
     assert np.max(np.abs(held - first)) <= 1e-6 * first
 
 
-@pytest.mark.parametrize(
-    ("component", "reason"),
-    [(KINK, "kink of their own"), (JUMP, "equations jump"), (FEEDBACK, "voltage_reversal")],
-    ids=["kink", "jump", "feedback"],
-)
-def test_an_effect_that_does_not_fit_is_named(component: Component, reason: str) -> None:
-    model = compose((*BASE, component), stack("P-885.51").values)
-    with pytest.raises(psa.InputError, match=f"'{component.name}' does not fit.*{reason}"):
+def test_an_effect_that_does_not_fit_is_named() -> None:
+    model = compose((*BASE, JUMP), stack("P-885.51").values)
+    with pytest.raises(psa.InputError, match=r"'jump' does not fit.*equations jump"):
         fixed_step(model, name="stack", step=STEP)
+
+
+@pytest.mark.parametrize("component", [KINK, FEEDBACK], ids=lambda c: str(c.name))
+def test_what_kinks_or_feeds_back_to_the_hysteresis_is_stepped_as_a_whole(
+    component: Component,
+) -> None:
+    model = compose((*BASE, component), stack("P-885.51").values).plant()
+    found = fixed_step(model, name="stack", step=STEP, substeps=8)
+    assert all(0.0 < e <= 1e-3 for e in errors(found).values())
+    wave = 60.0 * (1.0 - np.cos(np.arange(901) / 70.0))
+    away = simulate(model.without([component.name]), STEP * np.arange(901), wave)
+    assert error(play(found, wave), away.outputs[OUTPUT][1:]) > 1e-2
 
 
 def test_a_clock_in_single_precision_is_refused() -> None:
@@ -161,9 +169,12 @@ def test_a_clock_in_single_precision_is_refused() -> None:
         fixed_step(with_effect("ageing"), name="stack", step=STEP, precision="single")
 
 
-def test_a_sampled_part_is_refused_as_a_whole() -> None:
-    with pytest.raises(psa.InputError, match=r"'position_controller'.*sampled states"):
-        fixed_step(psa.part_model("position_controller"), name="part", step=STEP)
+def test_a_sampled_part_acts_at_its_period() -> None:
+    part = psa.part_model("position_controller")
+    with pytest.raises(psa.InputError, match=r"sampled every 5e-05 s.*no multiple.*of 2\.5e-05 s"):
+        fixed_step(part, name="part", step=2e-5)
+    with pytest.raises(psa.InputError, match="sample instants; --hold zero"):
+        fixed_step(part, name="part", step=5e-5, hold="zero")
 
 
 @pytest.mark.parametrize(
@@ -193,8 +204,30 @@ def test_the_command_writes_two_files_and_tells_the_error(tmp_path: Path) -> Non
     assert "step: 1e-05 s, 1 substep, double precision" in done.output
     assert "left out: sensor" in done.output
     assert f"{errors(base())['jumps']:.1e}" in done.output
-    wrong = CliRunner().invoke(app, [*arguments[:5], "3V", "-o", str(tmp_path / "code")])
-    assert wrong.exit_code != 0
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10us", 1e-5), ("1e-5s", 1e-5), (" 0.02 ms", 2e-5), ("50 ns", 5e-8)]
+)
+def test_a_step_has_its_unit(text: str, seconds: float) -> None:
+    assert step_seconds(text) == pytest.approx(seconds, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("10", r"'10', without a unit; type --step 10s or 10ms or 10us\.$"),
+        ("1e-5", "type --step 1e-5s or 1e-5ms"),
+        ("3V", "a unit of time, such as 10us"),
+        ("us", "a number with a unit"),
+        ("1.2.3us", "a number with a unit"),
+    ],
+)
+def test_the_unit_of_a_step_is_never_guessed(text: str, said: str) -> None:
+    with pytest.raises(psa.InputError, match=said):
+        step_seconds(text)
+    arguments = ["export", "c", "--stack", "P-885.51", "-o", "x", "--step", text]
+    assert CliRunner().invoke(app, arguments).exit_code == 2
 
 
 def limit(name: str) -> float:

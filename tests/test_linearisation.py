@@ -15,7 +15,7 @@ from psa_casadi.design.online.recursive_least_squares import (
 )
 from psa_casadi.errors import InputError
 from psa_casadi.model.parts import compensator_for, part_model
-from psa_casadi.model.stacks import stack_model
+from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.simulation.stepper import run
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
@@ -114,7 +114,7 @@ def test_feed_forward_on_an_independent_stack() -> None:
     time = np.arange(0.0, 1.0, 1e-3)
     wanted = 0.4 * stack.u_rated * (1.0 - np.cos(2.0 * np.pi * 3.0 * time)) * (1.0 - 0.4 * time)
     forward = FeedForward(stack_values(model, 1e-3))
-    applied = np.array([forward.step(w) for w in wanted.tolist()])
+    applied = np.array([forward.step_voltage(w) for w in wanted.tolist()])
     rest = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
     bare = DriftingStack({**model.values, **rest}, 1e-3)
     line = np.array([bare.step(w) for w in wanted.tolist()])
@@ -137,7 +137,7 @@ def test_feed_forward_agrees_with_the_compensator_part() -> None:
     steps = run(part, time, wanted[:, None], np.zeros(len(part.state_names)), rtol=1e-8)
     command = steps.y[:, part.output_names.index("compensated_command")]
     forward = FeedForward(stack_values(model, PERIOD))
-    found = np.array([forward.step(w) for w in wanted.tolist()])
+    found = np.array([forward.step_voltage(w) for w in wanted.tolist()])
     assert np.abs(found - wanted).max() > 3.0
     assert np.abs(found - command).max() < 0.005
 
@@ -158,4 +158,56 @@ def test_tracked_feed_forward_starts_as_the_plain_one() -> None:
     values = identifier_for(model, PERIOD, noise=1.0).values
     plain, tracked = FeedForward(stack_values(model, PERIOD)), AdaptiveFeedForward(values)
     for w in np.linspace(0.0, 80.0, 200).tolist():
-        assert tracked.step(w, 0.0) == pytest.approx(plain.step(w), abs=1e-3)
+        assert tracked.step_voltage(w, 0.0) == pytest.approx(plain.step_voltage(w), abs=1e-3)
+
+
+def test_a_wanted_motion_in_metres_is_where_the_stack_goes() -> None:
+    """The independent plant follows a slow raster in metres but for its lag and its creep."""
+    model, period = stack_model(STACK).with_values({"delta": 0.0}), 2e-3
+    values = stack_values(model, period)
+    time = np.arange(0.0, 4.0, period)
+    wanted = 4e-6 * (1.0 - np.cos(np.pi * time)) * (1.0 - 0.15 * time)
+    for forward in (FeedForward(values), AdaptiveFeedForward(
+        identifier_for(model, period, noise=NOISE).values)):  # fmt: skip
+        plant, x, missed = DriftingStack(model.values, period), 0.0, []
+        for w in wanted.tolist():
+            u = forward.step(w) if isinstance(forward, FeedForward) else forward.step(w, x)
+            x = plant.step(u)
+            missed.append(x - w)
+        slope = float(np.abs(np.gradient(wanted, period)).max())
+        assert np.abs(missed).max() < 1.1 * values["lag"] * slope + 2e-5 * np.ptp(wanted)
+
+
+def test_volts_are_no_motion() -> None:
+    model = stack_model(STACK)
+    forward = FeedForward(stack_values(model, PERIOD))
+    before = forward.step(2e-6)
+    for wrong in (50.0, float("nan"), float("inf"), -1e-3):
+        with pytest.raises(InputError, match=r"step_voltage"):
+            forward.step(wrong)
+    assert forward.kept["u_last"] == before
+    adaptive = AdaptiveFeedForward(identifier_for(model, PERIOD, noise=NOISE).values)
+    with pytest.raises(InputError, match=r"stroke is \d+(\.\d+)? um"):
+        adaptive.step(20.0, 0.0)
+
+
+@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize(("samples", "limit"), [(1, 0.035), (10, 0.0025)])
+def test_jumps_across_the_range_are_followed(name: str, samples: int, limit: float) -> None:
+    """Equation (8), solved finely along each jump, is what the voltage is corrected for."""
+    p = (model := stack_model(name).with_values({"delta": 0.0})).values
+    forward = FeedForward(stack_values(model, PERIOD, at_electrodes=True))
+    per_volt = p["k_L"] * (1.0 / p["k_P"] + 1.0 / p["k_B"])
+    turns = p["u_rated"] * np.array([0.0, 1.0, 0.0, 0.8, 0.8, -0.2, 1.0, 1.0, 0.5, 0.5])
+    force, last, missed = 0.0, 0.0, []
+    for volts in np.interp(np.arange(9 * samples + 1) / samples, np.arange(10), turns):
+        u = forward.step(float(per_volt * volts))
+
+        def slope(_: float, f: FloatArray, du: float = u - last) -> FloatArray:
+            bend = p["beta"] * abs(du) * np.sign(f) + p["gamma"] * du
+            return np.asarray(p["A"] * du - bend * np.abs(f / p["h_ref"]) ** p["n"])
+
+        force = float(solve_ivp(slope, (0.0, 1.0), [force], rtol=1e-9, atol=1e-6).y[0, -1])
+        last = u
+        missed.append((p["k_L"] * u + force) / p["k_L"] - volts)
+    assert np.abs(missed).max() < limit * p["u_rated"]

@@ -209,8 +209,8 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     "not an identifier": (lambda: {"x": X, "ode": X}, {"states": ["x 1"]}, "cannot name a var"),
     "model name": (lambda: {"x": X, "ode": X}, {"name": "1st"}, "'1st' cannot name a model"),
     "unit": (
-        lambda: {"x": X, "ode": X}, {"states": [psa.State("x", "furlong", "", 1.0)]},
-        "unit 'furlong'"),
+        lambda: {"x": X, "ode": X}, {"states": [psa.State("x", "furlang", "", 1.0)]},
+        "unit 'furlang'"),
     "not finite": (
         lambda: {"x": X, "ode": X}, {"states": [psa.State("x", "m", "", 1.0, math.nan)]},
         "not finite"),

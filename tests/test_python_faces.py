@@ -1,13 +1,16 @@
 """What Python users give and get: records in any form, results that show themselves."""
 
+import pickle
 import re
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 import psa_casadi as psa
+from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.records import records_given
 from tests.report_cases import diagnosis, identification
 from tests.tiers import slow
@@ -17,6 +20,11 @@ V = 50.0 - 50.0 * np.cos(40.0 * T)
 X = 0.1 * V + 0.01 * np.sin(7.0 * T)
 TABLE = {"time [ms]": 1e3 * T, "voltage [V]": V, "displacement [um]": X}
 NAMES = ("time", "voltage", "displacement")
+#: What is asked of a diagnosis, whether it was just made or is read back.
+ANSWERS = (
+    "verdict", "causes", "candidates", "base_errors", "extended_errors", "gain",
+    "noise_floor_rms_m", "blind_to", "remaining", "kept", "doubt", "notes",
+)  # fmt: skip
 
 
 def assert_same(record: psa.Record) -> None:
@@ -50,7 +58,7 @@ def test_a_missing_reading_of_a_frame_is_missing() -> None:
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"displacement [um]": X[:-1]}, "different lengths"),
+        ({"displacement [um]": X[:-1]}, "has 63 values"),
         ({"displacement [um]": ["a"] * 64}, "not all numbers"),
         ({"displacement [V]": X}, "displacement"),
         ({"time [ms]": T[::-1]}, "time"),
@@ -119,11 +127,79 @@ def test_results_are_data_frames() -> None:
     samples = d.to_frame()
     assert len(samples) == sum(e.record.n for e in d.experiments)
     rest = samples[samples.held_out]
-    rms = float(np.sqrt(np.nanmean((rest.measured - rest.base) ** 2)))
+    rms = float(np.sqrt(np.nanmean((rest["measured [m]"] - rest["base [m]"]) ** 2)))
     assert 0.0 < rms < 1e-6
     parameters = found.to_frame().set_index("parameter")
     assert parameters.value.to_dict() == dict(found.model.values)
     assert (parameters.low <= parameters.value)[parameters.low.notna()].all()
-    run = psa.simulate(found.model, T, V).to_frame()
-    np.testing.assert_array_equal(run.voltage, V)
-    assert "measured_displacement" in run
+    run = psa.simulate(found.model, T, V)
+    table = run.to_frame()
+    np.testing.assert_array_equal(table["voltage [V]"], V)
+    assert {"time [s]", "measured_displacement [m]", "f_H [N]"} <= {*table}
+    read = psa.record_from(table[["time [s]", "voltage [V]", "displacement [m]"]])
+    np.testing.assert_array_equal(read.displacement, run.outputs["displacement"])
+
+
+def test_a_record_is_a_table_that_reads_as_the_record() -> None:
+    record = psa.record_from({**TABLE, "current [mA]": V, "load_force [N]": 2.0 * V})
+    again = psa.record_from(record.to_frame())
+    assert {*record.to_frame()} == {
+        "time [s]", "voltage [V]", "displacement [m]", "current [A]", "load_force [N]"
+    }  # fmt: skip
+    for name in (*NAMES, "current", "load_force"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(record, name))
+
+
+def test_one_output_is_drawn_on_the_axes_that_are_given() -> None:
+    d, found = diagnosis("cause_named"), identification()
+    run, record = psa.simulate(found.model, T, V), d.experiments[0].record
+    axes = Figure().add_subplot()
+    assert run.plot(ax=axes, output="f_H") is axes.figure
+    (curve,) = axes.lines
+    np.testing.assert_array_equal(curve.get_ydata(), run.states["f_H"])
+    assert axes.get_ylabel() == "f_H [N]"
+    for result, curves in ((run, 1), (record, 1), (d, 3), (found, 2)):
+        (one,) = result.plot(output="displacement").axes
+        assert one.get_ylabel().startswith("displacement [")
+        assert len(one.lines) == curves
+    assert "residual" in d.plot(output="residual").axes[0].get_ylabel()
+    assert record.plot().axes[0].get_ylabel().startswith("displacement [")
+    with pytest.raises(psa.InputError, match=r"no output 'speed'.*displacement, residual"):
+        d.plot(output="speed")
+    with pytest.raises(psa.InputError, match=r"no output 'x_1'.*voltage, "):
+        run.plot(output="x_1")
+
+
+def test_models_and_records_are_cells_of_a_notebook() -> None:
+    model = psa.stack_model("P-885.51")
+    cell = model._repr_html_()
+    assert "<table>" in cell
+    assert cell.count("<tr>") == 1 + len(model.values)
+    assert "stiffness" in cell
+    record = psa.record_from(TABLE, name="<a&b>")._repr_html_()
+    assert "&lt;a&amp;b&gt;" in record
+    assert "data:image/png;base64," in record
+
+
+@pytest.mark.parametrize("verdict", ["cause_named", "adequate", "ambiguous"])
+def test_a_diagnosis_is_loaded_back(verdict: Verdict, tmp_path: Path) -> None:
+    d = diagnosis(verdict)
+    (tmp_path / "D.json").write_text(d.to_json(), encoding="utf-8")
+    again = psa.load_diagnosis(tmp_path / "D.json")
+    for other in (again, pickle.loads(pickle.dumps(again)), pickle.loads(pickle.dumps(d))):
+        for name in ANSWERS:
+            assert getattr(other, name) == getattr(d, name), name
+        assert other.to_json() == d.to_json()
+        assert repr(other) == repr(d)
+    assert verdict in again._repr_html_()
+
+
+def test_what_is_no_diagnosis_is_not_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    for text, said in (("{}", "no diagnosis"), ("[", "x.json"), (
+        '{"format": "psa_casadi.diagnosis/1"}', "'verdict' is missing")):  # fmt: skip
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(psa.InputError, match=said):
+            psa.load_diagnosis(path)
+    with pytest.raises(psa.InputError, match=r"none\.json"):
+        psa.load_diagnosis(tmp_path / "none.json")

@@ -257,6 +257,7 @@ def test_several_tables_are_listed_chosen_and_taken_together(
         first, second = read_records([path], columns="table=all")
         assert_is(first)
         assert_is(second, v=2 * V)
+        assert len({first.sha256, second.sha256}) == len({first.name, second.name}) == 2
         assert_is(read_record(path, columns="table=2"), v=2 * V)
 
 

@@ -14,7 +14,7 @@ from psa_casadi.any_model.runs import Run
 from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.model.compose import Model
-from psa_casadi.shown import StillReported, frame
+from psa_casadi.shown import StillReported, frame, with_units
 
 FloatArray = npt.NDArray[np.float64]
 FORMAT = "psa_casadi.own_model_diagnosis/1"
@@ -186,17 +186,24 @@ class OdeDiagnosis(StillReported):
         return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
     def to_frame(self) -> Any:
-        """Return the samples as a pandas DataFrame: measured, base and extended by output."""
+        """Return the samples as a pandas DataFrame: measured, base and extended by output.
+
+        Names carry units: `speed [m/s]`, `speed_base [m/s]`, `speed_extended [m/s]`.
+        """
         columns: dict[str, Any] = {
             "record": np.repeat([r.name for r in self.runs], [len(r.time) for r in self.runs]),
             "time": np.concatenate([r.signals.time for r in self.runs]),
             "held_out": np.concatenate([r.held_out for r in self.runs]),
         }
-        for k, name in enumerate(self.model.output_names):
+        units = {"time": "s"}
+        for k, (name, o) in enumerate(
+            zip(self.model.output_names, self.model.structure.outputs, strict=True)
+        ):
+            units |= dict.fromkeys((name, f"{name}_base", f"{name}_extended"), o.unit)
             columns[name] = np.concatenate([r.outputs[:, k] for r in self.runs])
             columns[f"{name}_base"] = np.concatenate([y[:, k] for y in self.base])
             columns[f"{name}_extended"] = np.concatenate([y[:, k] for y in self.extended])
-        return frame(columns)
+        return frame(with_units(columns, units))
 
 
 def _after(unit: str) -> str:

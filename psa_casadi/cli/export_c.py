@@ -14,7 +14,6 @@ from psa_casadi.cli.screen import (
     HistoryOption,
     LicenseOption,
     ModelVersionOption,
-    PartOption,
     Quiet,
     RestOption,
     StackOption,
@@ -50,7 +49,15 @@ def c(
     step: Annotated[str, typer.Option(help="Time of a step with its unit, such as 10us.")],
     model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
     stack: StackOption = None,
-    part: PartOption = None,
+    part: Annotated[
+        str | None,
+        typer.Option(
+            help="Part to export, tuned to the stack of --stack or --model where one is given:"
+            " position_controller, hysteresis_compensator, hysteresis_observer, feed_forward,"
+            " adaptive_feed_forward, online_identification. Others have their default values:"
+            " flexure_stage, voltage_amplifier, charge_amplifier, prestress_mechanism."
+        ),
+    ] = None,
     precision: Annotated[
         PrecisionName, typer.Option(help="Precision of all numbers.")
     ] = PrecisionName.DOUBLE,
@@ -80,11 +87,16 @@ def c(
 ) -> None:
     """Write a model as C99 for a controller: a step of fixed length and constant cost."""
     from psa_casadi.cli.inputs import Given, step_seconds
+    from psa_casadi.design.online.part_for import part_for
     from psa_casadi.export.fixed_step.export import export_c
 
     given = Given(effects)
     seconds = given.attempt(lambda: step_seconds(step))
-    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
+    base = chosen = None
+    if part is None or model or stack:
+        base = chosen = given.model_or_stack(model, stack, any_model=True)
+    if part is not None and seconds is not None and bool(model or stack) == (base is not None):
+        chosen = given.attempt(lambda: part_for(part, base, period=seconds))
     chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
     chosen = given.published(
         chosen, author=author, version=version, copyright=copyright_, license=license_
@@ -99,6 +111,8 @@ def c(
             include_sensor=include_sensor, hold=hold.value, substeps=substeps,
         )  # fmt: skip
     show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
+    for note in chosen.provenance.notes if part else ():
+        show(note, quiet)
     show(step_words(seconds, found.substeps, precision.value), quiet)
     show_table(error_table({e.voltage: e.error for e in found.errors}), quiet)
     tell_written(found.header, found.source, quiet=quiet)

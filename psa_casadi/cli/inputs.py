@@ -76,7 +76,7 @@ class Given:
                 read_records, files, need_excitation=fitted, columns=wanted, sample_time=sample_time
             )
             for record in (self.attempt(read) if files else None) or ():
-                twin = next((r for r in found if r.is_same(record)), None)
+                twin = next((r for r in found if r.sha256 == record.sha256), None)
                 if twin is not None:
                     self.add(
                         f"{record.source}: holds the same data as {twin.source}; a record counts"
@@ -265,7 +265,7 @@ def meant(word: str, known: Iterable[str]) -> str:
 
 
 def step_seconds(text: str) -> float:
-    """Return the time [s] of a step that is given as a number with a unit, s where it has none.
+    """Return the time [s] of a step that is given as a number with its unit; none is guessed.
 
     Raises InputError for anything else.
     """
@@ -274,7 +274,10 @@ def step_seconds(text: str) -> float:
         number = float(found["number"]) if found else 0.0
     except ValueError:
         found = None
-    unit = parse_unit(found["unit"] or "s", "time").name if found else ""
+    if found and not found["unit"].strip():
+        meant = " or ".join(f"{found['number']}{unit}" for unit in ("s", "ms", "us"))
+        raise InputError(f"--step is '{text}', without a unit; type --step {meant}.")
+    unit = parse_unit(found["unit"], "time").name if found else ""
     if unit not in units_of("time"):
         raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
     return float(to_si(number, unit))

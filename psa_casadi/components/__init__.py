@@ -15,6 +15,11 @@ from psa_casadi.components.prestress import (
     PRESTRESS_MOUNTS,
     PRESTRESS_PORT,
 )
+from psa_casadi.components.sampled_feed_forward import (
+    ADAPTIVE_FEED_FORWARD,
+    FEED_FORWARD,
+    HYSTERESIS_OBSERVER,
+)
 from psa_casadi.components.sensor import SENSOR
 from psa_casadi.components.validity import VALIDITY, VALIDITY_WITH_TEMPERATURE
 from psa_casadi.components.wafers import BOUC_WEN, CREEP_LAG, LINEAR_FORCE
@@ -39,6 +44,9 @@ COMPONENTS: dict[str, Component] = {
         VOLTAGE_AMPLIFIER,
         CHARGE_AMPLIFIER,
         ONLINE_IDENTIFICATION,
+        HYSTERESIS_OBSERVER,
+        FEED_FORWARD,
+        ADAPTIVE_FEED_FORWARD,
         PRESTRESS_MECHANISM,
         PRESTRESS_PORT,
         *PRESTRESS_MOUNTS.values(),

@@ -1,53 +1,52 @@
 """Recursive least squares of the hysteresis parameters, as a sampled block (paper eq. 38)."""
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.components.online_recursion import (
-    COUNT,
-    SHAPES,
-    TRACKED,
-    Memory,
-    advance,
-    constants,
-    estimates,
-)
+from psa_casadi.components.hysteresis_step import COUNT, SHAPES, TRACKED, constants, estimates
+from psa_casadi.components.online_recursion import Memory, advance
 from psa_casadi.scales import voltage_scale
 from psa_casadi.variables import Input, Output, Parameter, State, Values
 
 _SHAPED = tuple(TRACKED)[:SHAPES]
 
 
-def _force_scale(p: Values) -> float:
-    return abs(p["k_L"]) * p["u_rated"]
+def force_scale(p: Values) -> float:
+    """Return the size of a hysteresis force [N]."""
+    return 0.1 * abs(p["k_L"]) * p["u_rated"]
 
 
-def _tenth(p: Values) -> float:
-    return 0.1 * _force_scale(p)
+def stroke(p: Values) -> float:
+    """Return the displacement at the rated voltage, without hysteresis [m]."""
+    return abs(p["k_L"]) * p["u_rated"] / p["stiffness"]
 
 
-def _stroke(p: Values) -> float:
-    return _force_scale(p) / p["stiffness"]
+def estimate_outputs() -> tuple[Output, ...]:
+    """Return the outputs that show the estimates."""
+    return tuple(
+        Output(f"{name}_hat", unit, f"estimate of {name}", 1.0 if unit != "N" else force_scale)
+        for name, unit in TRACKED.items()
+    )
 
 
 def _sampled() -> tuple[State, ...]:
     """Return what the block keeps between instants, in the order of `flattened`."""
     z = [State(f"z_{n}", "1", f"deviation of {n} from its start, in spreads", 1.0) for n in TRACKED]
-    P = [
-        State(
-            f"P_{i + 1}_{j + 1}", "1", "covariance of the deviations", 1.0,
-            start=1.0 if i == j else 0.0,
-        )
-        for i in range(COUNT)
-        for j in range(i + 1)
-    ]  # fmt: skip
+    meaning = "of the covariance U D U' of the deviations"
+    factors = [
+        State(f"D_{j + 1}", "1", f"variance {meaning}", 1.0, start=1.0)
+        if i == j
+        else State(f"U_{i + 1}_{j + 1}", "1", f"factor {meaning}", 1.0)
+        for j in range(COUNT)
+        for i in range(j + 1)
+    ]
     units = {"A": "V", "beta": "V", "gamma": "V", "delta": "V.s", "n": "N"}
     return (
         *z,
-        *P,
+        *factors,
         State("u_last", "V", "voltage at the last instant", voltage_scale),
-        State("f_H", "N", "estimated hysteresis force", _tenth),
+        State("f_H", "N", "estimated hysteresis force", force_scale),
         *(State(f"s_{n}", units[n], f"derivative of f_H by {n}", 1.0) for n in _SHAPED),
         State("u_lag", "V", "voltage behind the lag", voltage_scale),
-        State("f_lag", "N", "estimated hysteresis force behind the lag", _tenth),
+        State("f_lag", "N", "estimated hysteresis force behind the lag", force_scale),
         *(State(f"l_{n}", units[n], f"s_{n} behind the lag", 1.0) for n in _SHAPED),
     )
 
@@ -57,8 +56,8 @@ SAMPLED = _sampled()
 
 def flattened(m: Memory) -> list[Expression]:
     """Return the memory as a list, in the order of the sampled states."""
-    P = [value for row in m.P for value in row]
-    return [*m.z, *P, m.u, m.f, *m.sigma, m.nu, m.phi, *m.psi]
+    factors = [value for column in m.factors for value in column]
+    return [*m.z, *factors, m.u, m.f, *m.sigma, m.nu, m.phi, *m.psi]
 
 
 def gathered(values: list[Expression]) -> Memory:
@@ -70,7 +69,7 @@ def gathered(values: list[Expression]) -> Memory:
 
     return Memory(
         z=take(COUNT),
-        P=[take(i + 1) for i in range(COUNT)],
+        factors=[take(j + 1) for j in range(COUNT)],
         u=next(left),
         f=next(left),
         sigma=take(SHAPES),
@@ -118,7 +117,7 @@ _PARAMETERS = (
         "standstill_rate", 1.0, "V/s", (0.0, 1e9), "voltage rate below which nothing is learnt"
     ),
     Parameter(
-        "noise", 1e-9, "m", (1e-15, 1.0), "rms error of the displacement and the model", "nm"
+        "noise", 3e-8, "m", (1e-15, 1.0), "rms error of the displacement and the model", "nm"
     ),
     Parameter("spread", 0.3, "1", (1e-6, 10.0), "how far the starts may be off, as a share"),
 )
@@ -129,7 +128,7 @@ ONLINE_IDENTIFICATION = Component(
     source="Yang and Zhu 2015, eq. 38; Ljung and Soderstrom 1983, chapter 3",
     equation_text=(
         "e = K x - (k_L u_lag + f_lag + offset);  z+ = z + P d e/(noise^2 + d'P d);"
-        "  P+ = D (P - P d d'P/(noise^2 + d'P d)) D;  d: derivatives of the prediction"
+        "  P+ = S (P - P d d'P/(noise^2 + d'P d)) S;  d: derivatives of the prediction"
     ),
     belongs_to="drive",
     equations=_equations,
@@ -138,15 +137,12 @@ ONLINE_IDENTIFICATION = Component(
     sample_period="period",
     inputs=(
         Input("voltage", "V", "voltage at the stack", nominal=voltage_scale),
-        Input("position", "m", "measured displacement", 0.0, _stroke, "um"),
+        Input("position", "m", "measured displacement", 0.0, stroke, "um"),
     ),
     outputs=(
-        *(
-            Output(f"{name}_hat", unit, f"estimate of {name}", 1.0 if unit != "N" else _tenth)
-            for name, unit in TRACKED.items()
-        ),
-        Output("hysteresis_force", "N", "estimated hysteresis force", _tenth),
+        *estimate_outputs(),
+        Output("hysteresis_force", "N", "estimated hysteresis force", force_scale),
         Output("correction", "V", "voltage to add so that the stack is linear", voltage_scale),
-        Output("prediction_error", "m", "measured minus predicted displacement", _stroke, "um"),
+        Output("prediction_error", "m", "measured minus predicted displacement", stroke, "um"),
     ),
 )

@@ -8,11 +8,11 @@ and its regressors hold the same noise, so that the estimates are biased. Here t
 is taken: the predicted displacement is compared with the measured one, and the regressors are the
 prediction's derivatives, which the same recursion carries along::
 
-    f+ = f + Heun step of (8) from u- to u,   sigma_j = df/dtheta_j by the derivative of that step
+    f+ = f after a step from u- to u (`hysteresis_step`),   sigma_j = df/dtheta_j by its derivative
     phi, psi_j, nu: f, sigma_j and u behind the stack's lag, exact for signals linear in between
     e = K x - (k_L nu + phi + offset),   d = (psi_A ... psi_n, nu, 1) in units of the spreads
-    g = P d,  s = noise^2 + d'g,  z+ = z + g e/s (at most 0.05 long),  P+ = D (P - g g'/s) D,
-    D = diag(sqrt(1 + (T/memory) (1 - P_ii)))
+    g = P d,  s = noise^2 + d'g,  z+ = z + g e/s (at most 0.05 long),  P+ = S (P - g g'/s) S,
+    S = diag(sqrt(1 + (T/memory) (1 - P_ii)))
 
 n enters like the others: no logarithm of data, no case distinction. For parameters that enter
 linearly this is recursive least squares. The force f and phi follow a change of the parameters by
@@ -23,43 +23,42 @@ voltage stands (|u'| below `standstill_rate`), z and P rest.
 Sources: Yang and Zhu 2015, eqs. 37, 38; L. Ljung and T. Soderstrom, "Theory and Practice of
 Recursive Identification", MIT Press 1983, chapter 3 (recursive prediction error method); on
 forgetting that is bounded (there by other terms): M. E. Salgado, G. C. Goodwin and R. H. Middleton,
-Int. J. Control 47 (1988) 477.
+Int. J. Control 47 (1988) 477; P by its factors: G. J. Bierman, "Factorization Methods for Discrete
+Sequential Estimation", Academic Press 1977, chapter V.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 
 from psa_casadi.component import Expression
+from psa_casadi.components.hysteresis_step import (
+    IMPLICIT,
+    Constants,
+    estimates,
+    slopes,
+    stages,
+    swept_over,
+)
 
-#: Parameters that are tracked, in the order of z, and the unit of each.
-TRACKED = {
-    "A": "N/V", "beta": "N/V", "gamma": "N/V", "delta": "N/(V.s)", "n": "1",
-    "k_L": "N/V", "offset": "N",
-}  # fmt: skip
-COUNT = len(TRACKED)
-SHAPES = 5
 #: Deviations stay within this many spreads; the bend n stays above its least value.
 _FARTHEST, _LEAST_N = 3.0, 1.0
 #: Largest change of z in one sample: what a reversal suddenly shows is taken in over some samples.
 _LARGEST_STEP = 0.05
-#: A parameter of the hysteresis is at least of this size, as a share of k_L, to change by shares.
-_LEAST_SIZE = 0.02
-#: The slope of force over voltage is taken as no smaller than this share of k_L.
-_LEAST_SLOPE = 0.2
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What is kept between samples: z (7), P (7 rows, lower triangle), signals and their lags.
+    """What is kept between samples: z (7), the factors of P, signals and their lags.
 
+    `factors` are 7 columns: what U has above its diagonal of ones, and D, of P = U D U'.
     `u` [V], `f` [N] and `sigma` (5) at the last sample; `nu` [V], `phi` [N], `psi` (5) behind the
     lag.
     """
 
     z: list[Expression]
-    P: list[list[Expression]]
+    factors: list[list[Expression]]
     u: Expression
     f: Expression
     sigma: list[Expression]
@@ -68,134 +67,26 @@ class Memory:
     psi: list[Expression]
 
 
-@dataclass(frozen=True)
-class Constants:
-    """What does not change from sample to sample: spreads (7), lag weights, noise [N], ...
-
-    `forget` is T/memory; `keep`, `old`, `new` step the lag.
-    """
-
-    start: tuple[Expression, ...]
-    spread: tuple[Expression, ...]
-    h_ref: Expression
-    hold_rate: Expression
-    stiffness: Expression
-    period: Expression
-    keep: Expression
-    old: Expression
-    new: Expression
-    noise_square: Expression
-    forget: Expression
-    standstill_rate: Expression
-
-
-def constants(p: Mapping[str, Expression]) -> Constants:
-    """Return the constants from parameters in SI units (`online_identification` lists them)."""
-    k, share, T = p["k_L"], p["spread"], p["period"]
-    bend, least = ca.fabs(p["beta"]) + ca.fabs(p["gamma"]), _LEAST_SIZE * k
-    sizes = (
-        ca.fabs(p["A"]) + least, bend + least, bend + least, ca.fabs(p["delta"]) + least,
-        1.0, k, 0.1 * k * p["u_rated"],
-    )  # fmt: skip
-    keep = ca.exp(-T / p["lag"])
-    held = (1.0 - keep) * p["lag"] / T
-    return Constants(
-        start=(p["A"], p["beta"], p["gamma"], p["delta"], p["n"], k, 0.0),
-        spread=tuple(share * size for size in sizes),
-        h_ref=p["h_ref"],
-        hold_rate=p["hold_rate"],
-        stiffness=p["stiffness"],
-        period=T,
-        keep=keep,
-        old=held - keep,
-        new=1.0 - held,
-        noise_square=(p["noise"] * p["stiffness"]) ** 2,
-        forget=T / p["memory"],
-        standstill_rate=p["standstill_rate"],
-    )
-
-
-def estimates(c: Constants, z: Sequence[Expression]) -> list[Expression]:
-    """Return A, beta, gamma, delta, n, k_L, offset in SI units."""
-    return [a + s * d for a, s, d in zip(c.start, c.spread, z, strict=True)]
-
-
-def slopes(
-    c: Constants, theta: Sequence[Expression], f: Expression, du: Expression, swept: Expression,
-    held: Expression,
-) -> tuple[Expression, Expression, list[Expression]]:  # fmt: skip
-    """Return the change of f over du at f, its derivative by f, and by A, beta, gamma, delta, n.
-
-    `swept` is |du| and `held` the integral of u sgn(u'), both with the smooth sign.
-    """
-    A, beta, gamma, delta, n = theta[:SHAPES]
-    ratio = f / c.h_ref
-    square = ratio * ratio + 1e-24
-    bare = square ** (0.5 * (n - 1.0))  # |ratio|^(n-1)
-    signed, power = ratio * bare, square * bare / ca.sqrt(square)
-    bend = beta * swept * signed + gamma * du * power
-    slope = -n * (beta * swept * bare + gamma * du * signed / ca.sqrt(square)) / c.h_ref
-    by = [du, -swept * signed, -du * power, held, -0.5 * ca.log(square) * bend]
-    return A * du - bend + delta * held, slope, by
-
-
-def swept_over(
-    c: Constants, last: Expression, u: Expression
-) -> tuple[Expression, Expression, Expression, Expression]:
-    """Return du [V], |du|, the integral of u sgn(u') over a period [V s], and u' [V/s]."""
-    du = u - last
-    rate = du / c.period
-    sign = rate / ca.sqrt(rate * rate + c.hold_rate * c.hold_rate)
-    return du, du * sign, 0.5 * (u + last) * sign * c.period, rate
-
-
-def force_after(
-    c: Constants, theta: Sequence[Expression], f: Expression, last: Expression, u: Expression
-) -> Expression:
-    """Return the hysteresis force [N] after the voltage has gone from `last` to u in one period."""
-    du, swept, held, _ = swept_over(c, last, u)
-    first = slopes(c, theta, f, du, swept, held)[0]
-    second = slopes(c, theta, f + first, du, swept, held)[0]
-    return f + 0.5 * (first + second)
-
-
-def linearising_voltage(
-    c: Constants, theta: Sequence[Expression], f: Expression, last: Expression, guess: Expression,
-    force: Expression,
-) -> Expression:  # fmt: skip
-    """Return the next voltage u [V] at which k_L u + f_H(u) is the wanted force [N] (eqs. 39-41).
-
-    The paper subtracts the observed force of the moment; here it is that of the next instant, so
-    that no sample is lost. From `guess`, three Newton steps with the slope of eq. (8) at f.
-    """
-    du, swept, held, _ = swept_over(c, last, guess)
-    change = slopes(c, theta, f, du, swept, held)[0]
-    slope = theta[5] + ca.if_else(ca.fabs(du) > 0.0, (change - theta[3] * held) / du, theta[0])
-    slope = ca.fmax(slope, _LEAST_SLOPE * theta[5])
-    u = guess
-    for _ in range(3):
-        u = u - (theta[5] * u + force_after(c, theta, f, last, u) - force) / slope
-    return u
-
-
-def heun(
+def stepped(
     c: Constants, theta: Sequence[Expression], m: Memory, u: Expression
 ) -> tuple[Expression, list[Expression], Expression]:
     """Return f and sigma after the voltage has gone from `m.u` to u in one period, and u'."""
     du, swept, held, rate = swept_over(c, m.u, u)
-    first, slope, by = slopes(c, theta, m.f, du, swept, held)
-    rises = [slope * s + b for s, b in zip(m.sigma, by, strict=True)]
-    second, slope, by = slopes(c, theta, m.f + first, du, swept, held)
+    first, last, _ = stages(c, theta, m.f, m.u, u)
+    _, slope, by = slopes(c, theta, first, du, swept, held)
+    rises = [(slope * s + b) / (1.0 - IMPLICIT * slope) for s, b in zip(m.sigma, by, strict=True)]
+    _, slope, by = slopes(c, theta, last, du, swept, held)
     sigma = [
-        s + 0.5 * (r + slope * (s + r) + b) for s, r, b in zip(m.sigma, rises, by, strict=True)
+        (s + (1.0 - IMPLICIT) * r + IMPLICIT * b) / (1.0 - IMPLICIT * slope)
+        for s, r, b in zip(m.sigma, rises, by, strict=True)
     ]
-    return m.f + 0.5 * (first + second), sigma, rate
+    return last, sigma, rate
 
 
 def advance(c: Constants, m: Memory, u: Expression, x: Expression) -> Memory:
     """Return the memory after a sample of voltage u [V] and displacement x [m]."""
     theta = estimates(c, m.z)
-    f, sigma, rate = heun(c, theta, m, u)
+    f, sigma, rate = stepped(c, theta, m, u)
     nu = c.keep * m.nu + c.old * m.u + c.new * u
     phi = c.keep * m.phi + c.old * m.f + c.new * f
     psi = [
@@ -205,31 +96,52 @@ def advance(c: Constants, m: Memory, u: Expression, x: Expression) -> Memory:
     d = [s * v for s, v in zip(c.spread, (*psi, nu, 1.0), strict=True)]
     error = c.stiffness * x - (theta[5] * nu + phi + theta[6])
     gate = rate * rate > c.standstill_rate * c.standstill_rate
-    z, P = correct(c, m, d, error, gate)
+    z, factors = correct(c, m, d, error, gate)
     moved = [s * (b - a) for s, a, b in zip(c.spread, m.z, z, strict=True)]
     f = f + sum(s * v for s, v in zip(sigma, moved, strict=False))
     phi = phi + sum(s * v for s, v in zip(psi, moved, strict=False))
-    return Memory(z, P, u, f, sigma, nu, phi, psi)
+    return Memory(z, factors, u, f, sigma, nu, phi, psi)
 
 
 def correct(
     c: Constants, m: Memory, d: Sequence[Expression], error: Expression, gate: Expression
 ) -> tuple[list[Expression], list[list[Expression]]]:
-    """Return z and P after an error [N] with the regressors d, where `gate` is 1, not 0."""
-    g = []
-    for i, row in enumerate(m.P):
-        value = sum(a * b for a, b in zip(row, d, strict=False))
-        g.append(value + sum(m.P[k][i] * d[k] for k in range(i + 1, COUNT)))
-    variance = c.noise_square + sum(a * b for a, b in zip(g, d, strict=True))
-    weight = gate / variance
-    step = weight * error
+    """Return z and the factors of P after an error [N] with regressors d, where `gate` is 1, not 0.
+
+    Bierman's update: the factors keep P positive and its small directions, which the difference of
+    the covariances would lose, in single precision within a second.
+    """
+    variance = c.noise_square
+    g: list[Expression] = []
+    new: list[list[Expression]] = []
+    for j, (*above, own) in enumerate(m.factors):
+        f = gate * (sum((u * b for u, b in zip(above, d, strict=False)), d[j]))
+        v, before = own * f, variance
+        variance += f * v
+        new.append(
+            [
+                *(u - f / before * k for u, k in zip(above, g, strict=True)),
+                own * (before / variance),
+            ]
+        )
+        g = [*(k + u * v for k, u in zip(g, above, strict=True)), v]
+    step = error / variance
     size = ca.fabs(step) * ca.sqrt(sum(b * b for b in g))
     step = step * _LARGEST_STEP / ca.fmax(size, _LARGEST_STEP)
     z = bounded(c, [a + step * b for a, b in zip(m.z, g, strict=True)])
-    new = [[v - weight * g[i] * g[j] for j, v in enumerate(row)] for i, row in enumerate(m.P)]
-    stretch = [ca.sqrt(1.0 + gate * c.forget * (1.0 - row[-1])) for row in new]
-    P = [[v * stretch[i] * stretch[j] for j, v in enumerate(row)] for i, row in enumerate(new)]
-    return z, P
+    stretch = [ca.sqrt(1.0 + gate * c.forget * (1.0 - p)) for p in variances(new)]
+    return z, [
+        [*(u * stretch[i] / stretch[j] for i, u in enumerate(above)), own * stretch[j] ** 2]
+        for j, (*above, own) in enumerate(new)
+    ]
+
+
+def variances(factors: Sequence[Sequence[Expression]]) -> list[Expression]:
+    """Return the diagonal of P from its factors."""
+    return [
+        column[-1] + sum(factors[j][i] ** 2 * factors[j][-1] for j in range(i + 1, len(factors)))
+        for i, column in enumerate(factors)
+    ]
 
 
 def bounded(c: Constants, z: Sequence[Expression]) -> list[Expression]:

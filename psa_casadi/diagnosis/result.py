@@ -18,7 +18,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
-from psa_casadi.shown import Reported, frame
+from psa_casadi.shown import Reported, frame, with_units
 
 FloatArray = npt.NDArray[np.float64]
 Verdict = Literal[
@@ -204,12 +204,10 @@ class Diagnosis(Reported):
     @property
     def kept(self) -> tuple[str, ...]:
         """Effects that the extended model holds and that are not named as causes."""
-        named = {c.effect for c in self.causes}
-        held = () if self.budget is None else self.budget.causes
-        return tuple(c.what for c in held if c.what not in named)
+        return unnamed_causes(self.budget, self.causes)
 
     def to_frame(self) -> Any:
-        """Return the samples as a pandas DataFrame: measured, base and extended, in metres."""
+        """Return the samples as a pandas DataFrame: `time [s]`, `measured [m]`, `base [m]`, ..."""
         rows = list(zip(self.experiments, self.base, self.extended, strict=True))
         columns = {
             "record": np.repeat(
@@ -222,7 +220,11 @@ class Diagnosis(Reported):
             "extended": np.concatenate([extended for _, _, extended in rows]),
             "held_out": np.concatenate([e.held_out for e, _, _ in rows]),
         }
-        return frame(columns)
+        length = self.experiments[0].record.displacement_unit
+        units = {"time": "s", "voltage": "V"} | dict.fromkeys(
+            ("measured", "base", "extended"), length
+        )
+        return frame(with_units(columns, units))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of DIAGNOSIS.json."""
@@ -260,6 +262,13 @@ class Diagnosis(Reported):
     def to_json(self) -> str:
         """Return the text of DIAGNOSIS.json."""
         return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def unnamed_causes(budget: Budget | None, causes: tuple[Cause, ...]) -> tuple[str, ...]:
+    """Return the causes in an error budget that are not named."""
+    named = {c.effect for c in causes}
+    held = () if budget is None else budget.causes
+    return tuple(c.what for c in held if c.what not in named)
 
 
 class DiagnosisInterrupted(KeyboardInterrupt):

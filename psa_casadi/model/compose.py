@@ -10,6 +10,7 @@ from psa_casadi.component import Component, Expression
 from psa_casadi.errors import InputError
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.structure import Structure, structure_of
+from psa_casadi.shown import Celled
 from psa_casadi.variables import (
     Input,
     Parameter,
@@ -23,7 +24,7 @@ __all__ = ["Model", "Structure", "compose"]
 
 
 @dataclass(frozen=True, repr=False)
-class Model:
+class Model(Celled):
     """A composed model with parameter values (SI units), their origin, and who publishes it.
 
     `evidence` speaks of these components with these values: a model with others has none, but the

@@ -20,7 +20,7 @@ from types import ModuleType
 
 import casadi as ca
 
-from psa_casadi.component import Component, Expression, Symbols
+from psa_casadi.component import Component, OnDemand
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import MODAL_SERIES
@@ -68,9 +68,7 @@ def known_effects(own: Iterable[Component] = ()) -> dict[str, Component]:
 
 def declaration_hash(component: Component) -> str:
     """Return the SHA-256 of what a component declares: names, values, bounds and equations."""
-    table: dict[str, Expression] = {}
-    symbols = _OnDemand(table)
-    written = component.equations(symbols)
+    written = component.equations(OnDemand())
     sums = (written.der, written.add, written.out, written.switches, written.next)
     equations = [sorted((name, str(ca.SX(e))) for name, e in part.items()) for part in sums]
     parameters = [
@@ -80,13 +78,6 @@ def declaration_hash(component: Component) -> str:
     inputs = [(i.name, i.unit, i.start) for i in component.inputs]
     text = repr((component.name, component.gain, parameters, states, inputs, equations))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-class _OnDemand(Symbols):
-    """Symbols of any name, made when they are asked for."""
-
-    def __getattr__(self, name: str) -> Expression:
-        return self._table.setdefault(name, ca.SX.sym(name))
 
 
 def _imported(module: str) -> ModuleType:

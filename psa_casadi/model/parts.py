@@ -58,6 +58,21 @@ PARTS: dict[str, PartKind] = {
             "recursive least squares of a stack's hysteresis parameters, sampled",
             ("online_identification",),
         ),
+        PartKind(
+            "hysteresis_observer",
+            "observer of a stack's hysteresis force, sampled",
+            ("hysteresis_observer",),
+        ),
+        PartKind(
+            "feed_forward",
+            "voltage for a wanted displacement, the stack's hysteresis taken off, sampled",
+            ("feed_forward",),
+        ),
+        PartKind(
+            "adaptive_feed_forward",
+            "feed_forward that follows the measured displacement, sampled",
+            ("adaptive_feed_forward",),
+        ),
     )
 }
 

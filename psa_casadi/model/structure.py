@@ -1,7 +1,7 @@
 """The equations of a composed model: the components' terms added up, ordered and substituted."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import casadi as ca
@@ -61,6 +61,11 @@ class Structure:
     z: Expression
     next: Mapping[str, Expression]
     znext: Expression
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle the components and the starts: the equations are composed again from them."""
+        starts = {q.name: q.start for q in self.states} | {i.name: i.start for i in self.inputs}
+        return _with_starts, (self.components, starts)
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
@@ -185,6 +190,15 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
         z=_column(table[s.name] for s in sampled),
         next=following,
         znext=resolved(following[s.name] for s in sampled),
+    )
+
+
+def _with_starts(components: tuple[Component, ...], starts: Mapping[str, float]) -> Structure:
+    s = structure_of(components)
+    states = tuple(replace(q, start=starts[q.name]) for q in s.states)
+    inputs = tuple(replace(q, start=starts[q.name]) for q in s.inputs)
+    return (
+        s if (states, inputs) == (s.states, s.inputs) else replace(s, states=states, inputs=inputs)
     )
 
 

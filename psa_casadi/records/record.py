@@ -3,13 +3,14 @@
 import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.checks import Located, check_complete, check_finite, check_time
+from psa_casadi.shown import Plotted, frame, with_units
 from psa_casadi.units import FloatArray
 
 #: Columns beside time and voltage that a record may have.
@@ -17,12 +18,17 @@ _OPTIONAL = (
     "displacement", "load_force", "current", "temperature", "monitor_voltage", "charge",
     "displacement_2", "strain",
 )  # fmt: skip
+#: Units of all columns but the displacement.
+_UNITS = {
+    "time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K",
+    "monitor_voltage": "V", "charge": "C", "displacement_2": "m", "strain": "1",
+}  # fmt: skip
 #: Columns whose absence is hashed too: those of the first version, so that its hashes stay.
 _HASHED = ("time", "voltage", "displacement", "load_force", "current", "temperature")
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Record:
+class Record(Plotted):
     """Samples of one experiment in SI units; the arrays have shape (n,) and cannot be changed.
 
         Record(name="loop", time=t, voltage=v, displacement=1e-6 * x_um)
@@ -104,6 +110,26 @@ class Record:
         )
 
     @property
+    def recorded(self) -> dict[str, FloatArray]:
+        """The columns that were recorded beside the time, by name, shape (n,) each."""
+        there = {c: getattr(self, c) for c in ("voltage", *_OPTIONAL)}
+        return {name: values for name, values in there.items() if values is not None}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The units of all columns."""
+        return {**_UNITS, "displacement": self.displacement_unit}
+
+    @property
+    def shown(self) -> str:
+        """The column to show: the displacement, or the voltage where there is none."""
+        return "voltage" if self.displacement is None else "displacement"
+
+    def to_frame(self) -> Any:
+        """Return the columns as a pandas DataFrame, which `record_from` reads: `time [s]`, ..."""
+        return frame(with_units({"time": self.time, **self.recorded}, self.units))
+
+    @property
     def n(self) -> int:
         """Number of samples."""
         return self.time.size
@@ -138,10 +164,6 @@ class Record:
                 f"a displacement column."
             )
         return float(np.nanmax(self.displacement) - np.nanmin(self.displacement))
-
-    def is_same(self, other: "Record") -> bool:
-        """Whether another record is the same samples of the same content."""
-        return self.sha256 == other.sha256 and np.array_equal(self.time, other.time)
 
     def slice(self, start: int, stop: int) -> "Record":
         """Return the samples `start <= k < stop`, counted as Python counts; `sha256` is kept.

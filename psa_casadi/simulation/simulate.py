@@ -1,7 +1,7 @@
 """Simulate a model on a record's voltage, or on any voltage given as samples."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from psa_casadi.errors import Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.shown import Shown, frame
+from psa_casadi.shown import Shown, frame, with_units
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import Steps
 from psa_casadi.simulation.ways import accurate
@@ -22,7 +22,8 @@ FloatArray = npt.NDArray[np.float64]
 class Trajectory(Shown):
     """A simulated experiment in SI units; arrays of shape (n,), one per state and output.
 
-    `way` tells how it was integrated, by exact steps of the linear part or by the stepper.
+    `way` tells how it was integrated, by exact steps of the linear part or by the stepper; `units`
+    are those of states and outputs.
     """
 
     time: FloatArray
@@ -31,16 +32,23 @@ class Trajectory(Shown):
     outputs: Mapping[str, FloatArray]
     steps: int
     way: str
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> str:
+        """The output that the sensor shows; without a sensor, the displacement."""
+        name = "measured_displacement"
+        return name if name in self.outputs else "displacement"
 
     @property
     def displacement(self) -> FloatArray:
         """Displacement that the sensor shows; without a sensor, that of the output [m]."""
-        name = "measured_displacement"
-        return self.outputs[name if name in self.outputs else "displacement"]
+        return self.outputs[self.shown]
 
     def to_frame(self) -> Any:
-        """Return time, voltage, states and outputs as a pandas DataFrame, in SI units."""
-        return frame({"time": self.time, "voltage": self.voltage, **self.states, **self.outputs})
+        """Return time, voltage, states and outputs as a pandas DataFrame: `time [s]`, ..."""
+        columns = {"time": self.time, "voltage": self.voltage, **self.states, **self.outputs}
+        return frame(with_units(columns, {"time": "s", "voltage": "V", **self.units}))
 
 
 def simulate(
@@ -154,4 +162,8 @@ def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps, way: s
         outputs=dict(zip(model.output_names, steps.y.T, strict=True)),
         steps=steps.steps,
         way=way,
+        units={
+            **{s.name: s.unit for s in (*model.structure.states, *model.structure.sampled)},
+            **{o.name: o.unit for o in model.structure.outputs},
+        },
     )

@@ -38,6 +38,10 @@ class Timings:
         self._thread, self._lock = get_ident(), Lock()
         self._since = (time.perf_counter(), time.process_time())
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle what every stage has taken so far."""
+        return _finished, (self.stages,)
+
     @property
     def stages(self) -> tuple[Stage, ...]:
         """What every stage has taken so far."""
@@ -80,6 +84,13 @@ class Timings:
             self._spent[stage.name] = replace(
                 stage, wall=stage.wall + wall, processor=stage.processor + processor
             )
+
+
+def _finished(stages: tuple[Stage, ...]) -> Timings:
+    """Return timings to which no thread adds."""
+    timings = Timings()
+    timings._spent, timings._thread = {s.name: s for s in stages}, -1
+    return timings
 
 
 _timings: ContextVar[Timings | None] = ContextVar("timings", default=None)

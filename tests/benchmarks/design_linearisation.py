@@ -87,9 +87,9 @@ def _time_table(progress: Progress, quick: bool) -> TitledTable:
     online, adaptive = OnlineIdentification(tuned), AdaptiveFeedForward(tuned)
     rows = [
         ("observer (37)", _microseconds(lambda k: observer.step(u[k]), count)),
-        ("feed-forward (39-41)", _microseconds(lambda k: forward.step(u[k]), count)),
+        ("feed-forward (39-41)", _microseconds(lambda k: forward.step_voltage(u[k]), count)),
         ("recursive least squares (38)", _microseconds(lambda k: online.step(u[k], x[k]), count)),
-        ("tracked feed-forward", _microseconds(lambda k: adaptive.step(u[k], x[k]), count)),
+        ("tracked feed-forward", _microseconds(lambda k: adaptive.step_voltage(u[k], x[k]), count)),
     ]
     return TitledTable(
         "Time per sample of the streaming objects, CPU [us]",

@@ -106,12 +106,14 @@ def driven(
         adaptive = AdaptiveFeedForward(tuned.values)
         x = 0.0
         for k in range(time.size):
-            voltage[k] = adaptive.step(float(wanted[k]), x + float(error[k - 1] if k else 0.0))
+            voltage[k] = adaptive.step_voltage(
+                float(wanted[k]), x + float(error[k - 1] if k else 0.0)
+            )
             moved[k] = x = stack.step(float(voltage[k]))
         estimate = adaptive.estimate
     else:
         plain = FeedForward(stack_values(known, period))
-        step = plain.step if control == "feed-forward" else float
+        step = plain.step_voltage if control == "feed-forward" else float
         voltage[:] = [step(w) for w in wanted.tolist()]
         moved[:] = [stack.step(u) for u in voltage.tolist()]
     return Drive(time, wanted, voltage, moved, _linear(plant, wanted, period), estimate)

@@ -1,11 +1,10 @@
 """The hysteresis observer (paper eq. 37) and the feed-forward that linearises (eqs. 39 to 41)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-from psa_casadi.component import Expression
 from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
-from psa_casadi.components.online_recursion import constants, force_after, linearising_voltage
-from psa_casadi.design.online.streams import Stream
+from psa_casadi.components.sampled_feed_forward import FEED_FORWARD, HYSTERESIS_OBSERVER
+from psa_casadi.design.online.streams import Block, Following
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
 
@@ -54,56 +53,42 @@ def stack_values(model: Model, period: float, *, at_electrodes: bool = False) ->
     }
 
 
-class HysteresisObserver:
+class HysteresisObserver(Block):
     """Runs eq. (8) on the known voltage (37): one sample in, one force out.
 
-    Between samples the voltage is taken as linear; a step of Heun's method covers it. `values` are
-    those of `stack_values`.
+    Between samples the voltage is taken as linear; one implicit step covers it, whatever its size.
+    `values` are those of `stack_values`.
     """
 
     def __init__(self, values: Mapping[str, float]) -> None:
-        c = constants(values)
-
-        def recursion(
-            kept: list[Expression], given: list[Expression]
-        ) -> tuple[Sequence[Expression], Sequence[Expression]]:
-            f = force_after(c, c.start, kept[1], kept[0], given[0])
-            return [given[0], f], [f]
-
-        self._stream = Stream(recursion, [0.0, 0.0], 1)
+        super().__init__(HYSTERESIS_OBSERVER, values)
 
     def step(self, voltage: float) -> float:
         """Take one sample of the voltage [V] and return the hysteresis force [N]."""
-        stream = self._stream
-        stream.given[0] = voltage
-        stream.step()
-        return float(stream.out[0])
+        self._given[0] = voltage
+        return self._advance()
 
 
-class FeedForward:
-    """Turns the voltage of a linear stack into the one that makes the stack linear (39 to 41).
+class FeedForward(Following):
+    """Turns a wanted displacement into the voltage that brings the stack there (39 to 41).
 
-    `k_L u + f_H(u) = k_L w`: the observed force is that of the instant for which the voltage is
-    returned, so that no sample is lost. `values` are those of `stack_values`.
+    `k_L u + f_H(u) = K w` with the stiffness K of the stack at rest: the observed force is that of
+    the instant for which the voltage is returned, so that no sample is lost. Displacements count
+    from where the stack rests at 0 V; creep, load and resonances are not in it. `values` are those
+    of `stack_values`.
     """
 
     def __init__(self, values: Mapping[str, float]) -> None:
-        c = constants(values)
-
-        def recursion(
-            kept: list[Expression], given: list[Expression]
-        ) -> tuple[Sequence[Expression], Sequence[Expression]]:
-            last, f, before = kept
-            wanted = given[0]
-            force = c.start[5] * wanted
-            u = linearising_voltage(c, c.start, f, last, last + wanted - before, force)
-            return [u, force_after(c, c.start, f, last, u), wanted], [u]
-
-        self._stream = Stream(recursion, [0.0, 0.0, 0.0], 1)
+        super().__init__(FEED_FORWARD, values)
 
     def step(self, wanted: float) -> float:
-        """Return the voltage for the wanted voltage of a linear stack [V]."""
-        stream = self._stream
-        stream.given[0] = wanted
-        stream.step()
-        return float(stream.out[0])
+        """Return the voltage [V] for a wanted displacement [m].
+
+        Raises InputError, and stays where it is, for what is no displacement of this stack: no
+        number, or beyond ten strokes.
+        """
+        return self._follow(wanted)
+
+    def step_voltage(self, wanted: float) -> float:
+        """Return the voltage for the wanted voltage of a linear stack [V]. Raises InputError."""
+        return self._follow(self._per_volt * wanted)

@@ -1,33 +1,18 @@
 """The hysteresis parameters tracked online: one sample in, one estimate out (paper eq. 38)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from psa_casadi.component import Expression
-from psa_casadi.components.online_identification import (
-    ONLINE_IDENTIFICATION,
-    SAMPLED,
-    flattened,
-    gathered,
-)
-from psa_casadi.components.online_recursion import (
-    COUNT,
-    TRACKED,
-    Constants,
-    advance,
-    constants,
-    estimates,
-    linearising_voltage,
-)
+from psa_casadi.components.hysteresis_step import COUNT, TRACKED, constants, estimates
+from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
+from psa_casadi.components.online_recursion import variances
+from psa_casadi.components.sampled_feed_forward import ADAPTIVE_FEED_FORWARD
 from psa_casadi.design.online.observer import stack_values
-from psa_casadi.design.online.streams import Stream
+from psa_casadi.design.online.streams import Block, Following
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
 
 __all__ = ["AdaptiveFeedForward", "Estimate", "OnlineIdentification", "identifier_for"]
-
-_TRIANGLE = COUNT * (COUNT + 1) // 2
-_FORCE = COUNT + _TRIANGLE + 1
 
 
 def identifier_for(
@@ -67,7 +52,28 @@ class Estimate:
     uncertainty: Mapping[str, float]
 
 
-class OnlineIdentification:
+class _Learning(Block):
+    """A block that learns."""
+
+    @property
+    def estimate(self) -> Estimate:
+        """Parameters, force and what is left of their uncertainty after the last sample."""
+        kept, p = self.kept, self.model.values
+        c = constants(p)
+        found = [float(v) for v in estimates(c, [kept[f"z_{n}"] for n in TRACKED])]
+        left = variances(
+            [
+                [*(kept[f"U_{i + 1}_{j + 1}"] for i in range(j)), kept[f"D_{j + 1}"]]
+                for j in range(COUNT)
+            ]
+        )
+        names = tuple(TRACKED)
+        return Estimate(
+            dict(zip(names, found, strict=True)), kept["f_H"], dict(zip(names, left, strict=True))
+        )
+
+
+class OnlineIdentification(_Learning):
     """Recursive least squares of A, beta, gamma, delta and n, of k_L and of the sensor's offset.
 
     A streaming object: one sample in, one out. `values` are the parameters of the component of the
@@ -77,78 +83,37 @@ class OnlineIdentification:
     """
 
     def __init__(self, values: Mapping[str, float]) -> None:
-        c = constants(values)
-
-        def recursion(
-            kept: list[Expression], given: list[Expression]
-        ) -> tuple[Sequence[Expression], Sequence[Expression]]:
-            after = advance(c, gathered(kept), given[0], given[1])
-            return flattened(after), [after.f]
-
-        self._constants = c
-        self._stream = Stream(recursion, [state.start for state in SAMPLED], 2)
+        super().__init__(ONLINE_IDENTIFICATION, values)
 
     def step(self, voltage: float, displacement: float) -> float:
         """Take one sample [V], [m] and return the estimated hysteresis force [N]."""
-        stream = self._stream
-        given = stream.given
-        given[0], given[1] = voltage, displacement
-        stream.step()
-        return float(stream.out[0])
-
-    @property
-    def estimate(self) -> Estimate:
-        """Parameters, force and what is left of their uncertainty after the last sample."""
-        return _estimate(self._constants, self._stream.kept)
+        self._given[0], self._given[1] = voltage, displacement
+        self._advance()
+        return float(self._out[COUNT])
 
 
-class AdaptiveFeedForward:
+class AdaptiveFeedForward(_Learning, Following):
     """Feed-forward whose observer follows the stack: the linearising voltage, tracked online.
 
     Each step learns from the displacement measured at the voltage that was returned last, and
-    returns the next one. The wanted force is that of the model's own k_L, so that the gain from
-    command to displacement is held too while k_L drifts.
+    returns the next one. The wanted force is the wanted displacement times the model's own
+    stiffness, so that the gain from wish to displacement is held too while k_L drifts.
     """
 
     def __init__(self, values: Mapping[str, float]) -> None:
-        c = constants(values)
-        count = len(SAMPLED)
-
-        def recursion(
-            kept: list[Expression], given: list[Expression]
-        ) -> tuple[Sequence[Expression], Sequence[Expression]]:
-            wanted, measured = given
-            applied, last = kept[count:]
-            m = advance(c, gathered(kept[:count]), applied, measured)
-            theta = estimates(c, m.z)
-            force = c.start[5] * wanted
-            u = linearising_voltage(c, theta, m.f, m.u, applied + wanted - last, force)
-            return [*flattened(m), u, wanted], [u]
-
-        self._constants = c
-        self._stream = Stream(recursion, [*(state.start for state in SAMPLED), 0.0, 0.0], 2)
+        super().__init__(ADAPTIVE_FEED_FORWARD, values)
 
     def step(self, wanted: float, measured: float) -> float:
-        """Return the voltage for the next wanted voltage of a linear stack [V].
+        """Return the voltage [V] for the next wanted displacement [m].
 
         `measured` [m] is the displacement at the voltage that was returned last.
+        Raises InputError, and stays where it is, for a wish that is no displacement of this stack:
+        no number, or beyond ten strokes.
         """
-        stream = self._stream
-        given = stream.given
-        given[0], given[1] = wanted, measured
-        stream.step()
-        return float(stream.out[0])
+        self._given[1] = measured
+        return self._follow(wanted)
 
-    @property
-    def estimate(self) -> Estimate:
-        """Parameters, force and what is left of their uncertainty after the last sample."""
-        return _estimate(self._constants, self._stream.kept)
-
-
-def _estimate(c: Constants, kept: Sequence[float]) -> Estimate:
-    found = [float(v) for v in estimates(c, kept[:COUNT])]
-    left = [kept[COUNT + i * (i + 3) // 2] for i in range(COUNT)]
-    names = tuple(TRACKED)
-    return Estimate(
-        dict(zip(names, found, strict=True)), kept[_FORCE], dict(zip(names, left, strict=True))
-    )
+    def step_voltage(self, wanted: float, measured: float) -> float:
+        """Return the next voltage for the wanted voltage of a linear stack [V], as `step` does."""
+        self._given[1] = measured
+        return self._follow(self._per_volt * wanted)

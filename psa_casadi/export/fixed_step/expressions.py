@@ -1,5 +1,6 @@
 """Expressions as C99: one assignment for each number, in double or single precision."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -47,6 +48,8 @@ PRECISIONS = {
 class Printer:
     """Prints expressions of named places; equal numbers are computed once.
 
+    A number stands in a variable until its last use, which is free for another one then: however
+    long the code, its stack frame stays small, whatever the compiler optimises.
     `places` names the letters of symbols ("x", "v", "t") and gives the C text of their elements.
     """
 
@@ -54,20 +57,30 @@ class Printer:
     symbols: Mapping[str, Expression]
     places: Mapping[str, Sequence[str]]
     used: set[tuple[str, int]] = field(default_factory=set)
+    _variables: dict[int, int] = field(default_factory=dict)
 
     def lines(self, outputs: Sequence[Expression]) -> tuple[list[str], list[str]]:
-        """Return assignments in their order, and the C text of each output."""
+        """Return a declaration and assignments in their order, and the C text of each output."""
         graph = Graph()
         numbers = graph.read(self.symbols, outputs)
         folded: dict[int, float] = {}
-        needed = self._needed(graph, numbers, folded)
-        ctype = self.precision.ctype
-        lines = [
-            f"const {ctype} s{n} = {self._value(graph, folded, n)};"
-            for n in needed
-            if graph.nodes[n][0] not in _LOGICAL
+        needed = [
+            n for n in self._needed(graph, numbers, folded) if graph.nodes[n][0] not in _LOGICAL
         ]
-        return lines, [self._name(graph, folded, n) for n in numbers]
+        self._variables = {}
+        lines, free, count = [], list[int](), 0
+        ends = _last_uses(graph, needed, numbers)
+        for n in needed:
+            value = self._value(graph, folded, n)
+            free += sorted((self._variables[q] for q in ends.get(n, ())), reverse=True)
+            if not free:
+                free.append(count)
+                count += 1
+            self._variables[n] = free.pop()
+            lines.append(f"s{self._variables[n]} = {value};")
+        names = ", ".join(f"s{k}" for k in range(count))
+        declared = textwrap.wrap(f"{self.precision.ctype} {names};", 90) if count else []
+        return declared + lines, [self._name(graph, folded, n) for n in numbers]
 
     def _needed(self, graph: Graph, numbers: Sequence[int], folded: dict[int, float]) -> list[int]:
         """Return the numbers to compute, sorted; constants are computed here."""
@@ -94,7 +107,7 @@ class Printer:
         if kind in _LOGICAL:
             one, none = self.precision.literal(1.0), self.precision.literal(0.0)
             return f"({self._condition(graph, folded, n)} ? {one} : {none})"
-        return f"s{n}"
+        return f"s{self._variables[n]}"
 
     def _condition(self, graph: Graph, folded: Mapping[int, float], n: int) -> str:
         kind, *arguments = graph.nodes[n]
@@ -127,6 +140,30 @@ class Printer:
             one = self.precision.literal(1.0)
             return f"{given[0]} > {none} ? {one} : ({given[0]} < {none} ? -{one} : {none})"
         return f"{_FUNCTIONS[kind]}{self.precision.suffix}({', '.join(given)})"
+
+
+def _last_uses(
+    graph: Graph, computed: Sequence[int], outputs: Sequence[int]
+) -> dict[int, list[int]]:
+    """Return the numbers of which each of `computed` is the last user, by it.
+
+    Logical ones have no variable: who uses them uses what they compare.
+    """
+    places = set(computed)
+
+    def used_by(n: int) -> set[int]:
+        found = set[int]()
+        for a in graph.nodes[n][1:] if graph.nodes[n][0] not in LEAVES else ():
+            found |= {a} if a in places else used_by(a)
+        return found
+
+    kept = {n for q in outputs for n in ({q} if q in places else used_by(q))}
+    last = {a: n for n in computed for a in used_by(n)}
+    ends: dict[int, list[int]] = {}
+    for a, n in last.items():
+        if a not in kept:
+            ends.setdefault(n, []).append(a)
+    return ends
 
 
 def _known(graph: Graph, folded: Mapping[int, float], n: int) -> float:

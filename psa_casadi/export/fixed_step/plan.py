@@ -7,7 +7,7 @@ import casadi as ca
 from psa_casadi.component import Expression
 from psa_casadi.errors import InputError
 from psa_casadi.export.fixed_step.expressions import Precision
-from psa_casadi.export.fixed_step.step import StepExpression
+from psa_casadi.export.fixed_step.step import StepExpression, with_numbers
 from psa_casadi.model.compose import Model
 
 #: Words that C keeps for itself.
@@ -24,7 +24,8 @@ class CodePlan:
 
     `step` is the time between two calls [s], `substeps` how many `expression`s it takes. With
     `held` inputs a value holds over the step that it is given for; else it is reached at its end,
-    along a line from the value before.
+    along a line from the value before. An instant of the sampled states ends `every` so many
+    calls, 0 where there are none.
     """
 
     model: Model
@@ -34,18 +35,29 @@ class CodePlan:
     substeps: int
     held: bool
     precision: Precision
+    every: int = 0
 
 
 def timed(plan: CodePlan) -> bool:
     """Whether the equations depend on the time itself."""
     e, s = plan.expression, plan.model.structure
-    return bool(ca.depends_on(ca.vertcat(e.change, e.port_end, outputs_of(plan.model)), s.time))
+    every = (e.change, e.port_end, outputs_of(plan.model), sampled_of(plan.model))
+    return bool(ca.depends_on(ca.vertcat(*every), s.time))
+
+
+def moves(plan: CodePlan) -> bool:
+    """Whether there is something to do between sample instants: states, or the clock."""
+    return bool(plan.model.structure.states) or timed(plan)
 
 
 def outputs_of(model: Model) -> Expression:
     """Return the outputs of a model with its values."""
-    s = model.structure
-    return ca.substitute([s.y], [s.p], [ca.DM(model.parameter_vector())])[0]
+    return with_numbers(model, model.structure.y)
+
+
+def sampled_of(model: Model) -> Expression:
+    """Return the sampled states of a model after an instant, with its values."""
+    return with_numbers(model, model.structure.znext)
 
 
 def check_names(plan: CodePlan) -> None:
@@ -55,10 +67,10 @@ def check_names(plan: CodePlan) -> None:
         InputError: a state, an input or an output has the name of a keyword or of another field.
     """
     s = plan.model.structure
-    own = ["last_input", "steps_done", "unused"]
+    own = ["last_input", "steps_done", "steps_to_instant", "unused"]
     own += [f"low_of_{q.name}" for q in s.states]
     own += [f"port_of_{q}" for q in plan.expression.port_names]
-    names = [q.name for table in (s.states, s.inputs, s.outputs) for q in table]
+    names = [q.name for table in (s.states, s.sampled, s.inputs, s.outputs) for q in table]
     wrong = sorted({n for n in names if n in _KEYWORDS.split() or n in own})
     if wrong:
         raise InputError(

@@ -10,17 +10,18 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
 from psa_casadi.export.fixed_step.header import header_code
 from psa_casadi.export.fixed_step.plan import CodePlan, check_names, timed
-from psa_casadi.export.fixed_step.probe import VoltageError, errors
+from psa_casadi.export.fixed_step.probe import VoltageError, errors, shown_output
 from psa_casadi.export.fixed_step.source import source_code
-from psa_casadi.export.fixed_step.step import step_expression
+from psa_casadi.export.fixed_step.whole import step_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.graph import Unprintable
-from psa_casadi.simulation.exact.split import split_of
 
 #: Substeps that are tried where none are asked for, and the error that is good enough.
 SUBSTEPS, GOOD = (1, 2, 4, 8), 1e-3
 #: Error beyond which a step is of no use.
 USELESS = 0.1
+#: Two times that differ by less than this share are one.
+_SAME = 1e-9
 _HELD = {"linear": False, "zero": True}
 
 
@@ -56,9 +57,15 @@ def fixed_step(
     reason, and for a step that is too long; MachineError if the compiler fails.
     """
     _check(name, step, precision, hold, substeps)
+    if model.structure.sampled and _HELD[hold]:
+        raise InputError(
+            f"The model '{model.name}' reads its inputs at sample instants; --hold zero is for"
+            " inputs of continuous models: leave it out."
+        )
     chosen = PRECISIONS[precision]
     found: list[FixedStep] = []
-    for count in SUBSTEPS if substeps is None else (substeps,):
+    counts = SUBSTEPS if model.structure.states else SUBSTEPS[:1]
+    for count in counts if substeps is None else (substeps,):
         plan, source = _planned(model, _Wish(name, step, count, _HELD[hold], chosen))
         texts = {f"{name}.h": header_code(plan), f"{name}.c": source}
         measured = errors(plan, texts)
@@ -69,12 +76,20 @@ def fixed_step(
     good = [f for f in found if f.worst.error <= GOOD]
     best = (good or sorted(found, key=lambda f: f.worst.error))[0]
     if not best.worst.error <= USELESS:
-        raise InputError(
-            f"With a step of {step:g} s in {best.plan.substeps} substeps the displacement errs by"
-            f" {100 * best.worst.error:.3g} % of its range on {best.worst.voltage}; the step is too"
-            " long for this model: take a shorter one, or more --substeps."
-        )
+        raise InputError(_useless(best))
     return best
+
+
+def _useless(best: FixedStep) -> str:
+    plan, worst = best.plan, best.worst
+    cure = "the step is too long for this model: take a shorter one, or more --substeps"
+    if not plan.model.structure.states:
+        cure = f"{plan.precision.name} precision is too coarse for this model: take double"
+    return (
+        f"With a step of {plan.step:g} s in {plan.substeps} substeps the"
+        f" {shown_output(plan.model)} errs by {100 * worst.error:.3g} % of its range on"
+        f" {worst.voltage}; {cure}."
+    )
 
 
 def _check(name: str, step: float, precision: str, hold: str, substeps: int | None) -> None:
@@ -130,15 +145,15 @@ def _planned(model: Model, wish: _Wish) -> tuple[CodePlan, str]:
 
 
 def _plan_or_reason(model: Model, wish: _Wish) -> tuple[CodePlan, str] | str:
-    split = split_of(model.structure)
-    if isinstance(split, str):
-        return split
     if not model.output_names:
         return "it has no outputs"
-    expression = step_expression(model, split, wish.step / wish.substeps)
+    expression = step_of(model, wish.step / wish.substeps)
+    if isinstance(expression, str):
+        return expression
     plan = CodePlan(
-        model, expression, wish.name, wish.step, wish.substeps, wish.held, wish.precision
-    )
+        model, expression, wish.name, wish.step, wish.substeps, wish.held, wish.precision,
+        _steps_of_a_period(model, wish.step),
+    )  # fmt: skip
     if wish.precision.single and timed(plan):
         return (
             "its equations depend on the time itself, which single precision knows to 0.2 ms after"
@@ -148,6 +163,21 @@ def _plan_or_reason(model: Model, wish: _Wish) -> tuple[CodePlan, str] | str:
         return plan, source_code(plan)
     except Unprintable as reason:
         return f"its equations have what the code cannot express, {reason}"
+
+
+def _steps_of_a_period(model: Model, step: float) -> int:
+    """Return how many steps a sample period has; 0 where nothing is sampled."""
+    name = model.structure.period
+    if name is None:
+        return 0
+    period = model.values[name]
+    count = round(period / step)
+    if count < 1 or abs(count * step - period) > _SAME * period:
+        raise InputError(
+            f"The model '{model.name}' is sampled every {period:g} s ({name}), which is no multiple"
+            f" of the step of {step:g} s; give a step of {period / max(count, 1):.12g} s."
+        )
+    return count
 
 
 def _fits_without(model: Model, name: str, wish: _Wish) -> bool:

@@ -7,16 +7,16 @@ import numpy as np
 
 from psa_casadi.component import Expression
 from psa_casadi.export.fixed_step.expressions import Printer
-from psa_casadi.export.fixed_step.plan import CodePlan, outputs_of, timed
+from psa_casadi.export.fixed_step.plan import CodePlan, moves, outputs_of, sampled_of, timed
 
 #: Size over a state's usual one below which it counts as 0: next to it numbers become slow ones.
-_NOTHING = 1e-15
+NOTHING = 1e-15
 
 
 def source_code(plan: CodePlan) -> str:
     """Return the source: the start, the step and the outputs."""
     name = plan.name
-    rounded = _rounding(plan) if plan.precision.single else []
+    rounded = _rounding(plan) if plan.precision.single and plan.model.structure.states else []
     return "\n".join(
         [
             f"/* {name}.h tells what this is */",
@@ -27,8 +27,8 @@ def source_code(plan: CodePlan) -> str:
             *rounded,
             *_init(plan),
             "",
-            *_advance(plan),
-            "",
+            *(_advance(plan) if moves(plan) else []),
+            *_sample(plan),
             *_output(plan),
             "",
             *_step(plan),
@@ -41,8 +41,9 @@ def _init(plan: CodePlan) -> list[str]:
     s, literal = plan.model.structure, plan.precision.literal
     inputs = [q.start for q in s.inputs]
     start = [0.0, [q.start for q in s.states], inputs, plan.model.parameter_vector()]
-    ports = ca.Function("ports", [s.time, s.x, s.u, s.p], [plan.expression.port_start])
-    values = np.array(ports(*start)).ravel().tolist()
+    start += [[q.start for q in s.sampled]] if s.sampled else []
+    at_start = ca.Function("start", s.arguments, [plan.expression.port_start, s.znext])
+    values, sampled = (np.array(q).ravel().tolist() for q in at_start(*start))
     lines = [f"void {plan.name}_init({plan.name}_state *state) {{"]
     lines += [f"    state->{q.name} = {literal(q.start)};" for q in s.states]
     if plan.precision.single:
@@ -51,6 +52,11 @@ def _init(plan: CodePlan) -> list[str]:
         f"    state->port_of_{q} = {literal(v)};"
         for q, v in zip(plan.expression.port_names, values, strict=True)
     ]
+    lines += [
+        f"    state->{q.name} = {literal(v)};" for q, v in zip(s.sampled, sampled, strict=True)
+    ]
+    if plan.every > 1:
+        lines.append(f"    state->steps_to_instant = {plan.every};")
     lines += [f"    state->last_input.{q.name} = {literal(q.start)};" for q in s.inputs]
     if timed(plan):
         lines.append(f"    state->steps_done = {literal(0.0)};")
@@ -77,7 +83,7 @@ def _printer(plan: CodePlan, states: str) -> Printer:
     step = plan.precision.literal(plan.step / plan.substeps)
     return Printer(
         plan.precision,
-        {"t": s.time, "x": s.x, "v": ca.vertcat(e.low, s.u, e.du, e.port)},
+        {"t": s.time, "x": s.x, "v": ca.vertcat(e.low, s.u, e.du, e.port, s.z)},
         {
             "t": [f"({step} * {states}->steps_done)"],
             "x": [f"{states}->{q.name}" for q in s.states],
@@ -86,6 +92,7 @@ def _printer(plan: CodePlan, states: str) -> Printer:
                 *(f"{last}.{q.name}" for q in s.inputs),
                 *(f"{du}->{q.name}" for q in s.inputs),
                 *(f"{states}->port_of_{q}" for q in e.port_names),
+                *(f"{states}->{q.name}" for q in s.sampled),
             ],
         },
     )
@@ -104,7 +111,7 @@ def _advance(plan: CodePlan) -> list[str]:
     body = [f"    {line}" for line in lines]
     body += [f"    const {p.ctype} end{k} = {text};" for k, text in enumerate(texts)]
     for k, q in enumerate(s.states):
-        nothing = p.literal(_NOTHING * abs(nominal[k]))
+        nothing = p.literal(NOTHING * abs(nominal[k]))
         body.append(
             f"    gain(&state->{q.name}, &state->low_of_{q.name}, end{k}, {nothing});"
             if p.single
@@ -115,7 +122,8 @@ def _advance(plan: CodePlan) -> list[str]:
         body.append(f"    state->steps_done += {p.literal(1.0)};")
     used = " ".join([*lines, *texts])
     unused = [] if plan.held or "change->" in used else ["    (void)change;"]
-    return ["/* One step, from last_input along its change */", head + ") {", *unused, *body, "}"]
+    told = "/* One step, from last_input along its change */"
+    return [told, head + ") {", *unused, *body, "}", ""]
 
 
 def _held(
@@ -123,17 +131,37 @@ def _held(
 ) -> list[Expression]:
     """Return a step's expressions as they are needed: without the change of inputs that hold.
 
-    Ports that read such an input jump with it, so that they are evaluated at the start.
+    Ports that read such an input or a sampled state jump with it, so that they are evaluated at the
+    start.
     """
     e, s = plan.expression, plan.model.structure
     away = [*gone, *([e.du] if plan.held else [])]
     given = [ca.SX.zeros(q.numel()) for q in away]
-    if plan.held:
-        jump = [k for k in range(e.port.numel()) if ca.depends_on(e.port_start[k], s.u)]
+    still = ca.vertcat(s.u, s.z) if plan.held else s.z
+    if still.numel():
+        jump = [k for k in range(e.port.numel()) if ca.depends_on(e.port_start[k], still)]
         values = [e.port_start[k] if k in jump else e.port[k] for k in range(e.port.numel())]
         away.append(e.port)
         given.append(ca.vertcat(ca.SX(0, 1), *values))
     return list(ca.substitute(list(expressions), away, given)) if away else list(expressions)
+
+
+def _sample(plan: CodePlan) -> list[str]:
+    """Return the function that takes a sample instant, where there are any."""
+    s = plan.model.structure
+    if not s.sampled:
+        return []
+    lines, texts = _printer(plan, "state").lines([sampled_of(plan.model)])
+    ctype = plan.precision.ctype
+    return [
+        "/* A sample instant */",
+        f"static void sample({plan.name}_state *state) {{",
+        *(f"    {line}" for line in lines),
+        *(f"    const {ctype} next{k} = {text};" for k, text in enumerate(texts)),
+        *(f"    state->{q.name} = next{k};" for k, q in enumerate(s.sampled)),
+        "}",
+        "",
+    ]
 
 
 def _output(plan: CodePlan) -> list[str]:
@@ -157,7 +185,9 @@ def _step(plan: CodePlan) -> list[str]:
         f"void {name}_step({name}_state *state, const {name}_input *input, {name}_output *output)"
     )
     loop = f"    for (int k = 0; k < {count}; ++k) " if count > 1 else "    "
-    if not s.inputs:
+    if not moves(plan):
+        lines = ["    state->last_input = *input;" if s.inputs else "    (void)input;"]
+    elif not s.inputs:
         call = "advance(state);" if plan.held else "advance(state, input);"
         lines = ["    (void)input;", loop + call]
     elif plan.held:
@@ -175,52 +205,13 @@ def _step(plan: CodePlan) -> list[str]:
         else:
             lines.append("    advance(state, &change);")
         lines.append("    state->last_input = *input;")
-    return [head + " {", *lines, "    outputs(state, output);", "}"]
-
-
-def function_code(plan: CodePlan, function: str) -> str:
-    """Return `void function(t, x, u, change)`: a step of states that remembers nothing else.
-
-    The ports are evaluated at the start of every substep, so that the states are all there is.
-    """
-    e, s = plan.expression, plan.model.structure
-    (change,) = ca.substitute(
-        [e.change], [e.low, e.port], [ca.SX.zeros(e.low.numel()), e.port_start]
-    )
-    printer = Printer(
-        plan.precision,
-        {"t": s.time, "x": s.x, "v": ca.vertcat(s.u, e.du)},
-        {
-            "t": ["t"],
-            "x": [f"x[{k}]" for k in range(len(s.states))],
-            "v": [f"{of}[{k}]" for of in ("u", "change") for k in range(len(s.inputs))],
-        },
-    )
-    lines, texts = printer.lines([change])
-    given = "double t, double *x, const double *u, const double *change"
-    nothing = [plan.precision.literal(_NOTHING * abs(q)) for q in plan.model.state_nominals()]
-    body = [f"    {line}" for line in lines]
-    body += [f"    const double end{k} = {text};" for k, text in enumerate(texts)]
-    body += [f"    x[{k}] = (x[{k}] + end{k} + {q}) - {q};" for k, q in enumerate(nothing)]
-    inputs, count = max(1, len(s.inputs)), plan.substeps
-    return "\n".join(
-        [
-            "",
-            f"static void {function}_part({given}) {{",
-            "    (void)t, (void)u, (void)change;",
-            *body,
-            "}",
-            "",
-            f"void {function}({given}) {{",
-            f"    double now[{inputs}] = {{0.0}}, part[{inputs}] = {{0.0}};",
-            f"    for (int k = 0; k < {count}; ++k) {{",
-            f"        for (int i = 0; i < {len(s.inputs)}; ++i) {{",
-            f"            part[i] = change[i] * {1.0 / count!r};",
-            "            now[i] = u[i] + k * part[i];",
-            "        }",
-            f"        {function}_part(t + k * {plan.step / count!r}, x, now, part);",
+    if plan.every == 1:
+        lines.append("    sample(state);")
+    elif plan.every:
+        lines += [
+            "    if (--state->steps_to_instant == 0) {",
+            "        sample(state);",
+            f"        state->steps_to_instant = {plan.every};",
             "    }",
-            "}",
-            "",
         ]
-    )
+    return [head + " {", *lines, "    outputs(state, output);", "}"]

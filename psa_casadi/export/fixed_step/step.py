@@ -48,10 +48,11 @@ class StepExpression:
     port_start: Expression
     port_names: tuple[str, ...]
 
-    @property
-    def symbols(self) -> list[Expression]:
-        """Return all symbols, in the order of the fields."""
-        return [self.time, self.x, self.low, self.u, self.du, self.port]
+
+def with_numbers(model: Model, expression: Expression) -> Expression:
+    """Return an expression with a model's values in place of its parameters."""
+    p = model.structure.p
+    return ca.substitute([ca.SX(expression)], [p], [ca.DM(model.parameter_vector())])[0]
 
 
 def step_expression(model: Model, split: Split, step: float) -> StepExpression:
@@ -99,8 +100,7 @@ class _Builder:
         )  # fmt: skip
 
     def _numbers(self, expression: Expression) -> Expression:
-        s = self.split.structure
-        return ca.substitute([ca.SX(expression)], [s.p], [ca.DM(self.model.parameter_vector())])[0]
+        return with_numbers(self.model, expression)
 
     def _first_slopes(self) -> Expression:
         """Return L' at the start; the diagonal is taken out, so that rest is rest when rounded."""

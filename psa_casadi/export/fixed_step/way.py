@@ -145,7 +145,18 @@ def _leg(
     when = begin + theta * share
     x = _shifted(_towards(origin, target, theta, leaving.states), leaving.states, gone)
     given = (ends.time + when * ends.step, x, ends.u + when * ends.du, rate)
-    value = duration * leaving.slopes(*given)
+    start, change = rosenbrock(duration * leaving.slopes(*given), theta, gone)
+    return _Leg(way, change, start)
+
+
+def rosenbrock(
+    value: Expression, theta: Expression, gone: Expression
+) -> tuple[Expression, Expression]:
+    """Return the change of states at their slopes of the begin, and over one Rosenbrock step.
+
+    `value` (n,) are the derivatives by a share `theta` of the step, of which a change `gone` (n,)
+    of the states has been made.
+    """
     by_states, by_time = ca.jacobian(value, gone), ca.jacobian(value, theta)
 
     def at(share_of_leg: float, change: Expression, *wanted: Expression) -> list[Expression]:
@@ -160,7 +171,7 @@ def _leg(
         if 0 < i < len(_STATES):
             (last,) = at(_AT[i], _weighted(_STATES[i], stages), value)
         stages.append(solved(system, last + _weighted(right, stages) + _BY_TIME[i] * slope))
-    return _Leg(way, _weighted(_END, stages), start)
+    return start, _weighted(_END, stages)
 
 
 def _towards(

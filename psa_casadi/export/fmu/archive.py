@@ -98,6 +98,11 @@ def planned_step(model: Model, identifier: str, fmi: int, step: float) -> FixedS
     They hold inputs over a step in FMI 3.0, which has no derivatives of inputs. Raises as
     `fixed_step`.
     """
+    if model.structure.sampled:
+        raise InputError(
+            f"The model '{model.name}' has sampled states, for which an FMU has no fixed step;"
+            " export it with the adaptive solver, which takes their instants exactly."
+        )
     hold = "zero" if fmi == 3 else "linear"
     return fixed_step(model, name=identifier, step=step, hold=hold)
 

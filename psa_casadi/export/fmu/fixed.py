@@ -12,9 +12,9 @@ from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import number, xml_text
 from psa_casadi.export.common.variable_table import OPTIONS
+from psa_casadi.export.fixed_step.function import function_code
 from psa_casadi.export.fixed_step.planning import FixedStep
 from psa_casadi.export.fixed_step.probe import STEPS, shown_output
-from psa_casadi.export.fixed_step.source import function_code
 
 #: Where an FMU carries the step [s], its substeps and the measured errors by voltage.
 FIXED_ENTRY = "resources/fixed_step.json"

@@ -1,10 +1,8 @@
 """A model-exchange FMU as a model: simulated, identified and diagnosed like any other."""
 
-import atexit
-import hashlib
 import os
-from collections.abc import Callable, Iterable, Mapping
-from functools import cache
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import casadi as ca
@@ -12,14 +10,19 @@ import numpy as np
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_variables import (
     Free,
     Read,
     plain_name,
     read_variables,
 )
-from psa_casadi.export.importer.imported import Imported, Selected, states_of
+from psa_casadi.export.importer.imported import (
+    Imported,
+    digest_of,
+    imported_of,
+    opened,
+    states_of,
+)
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.variables import nominal_value
 
@@ -58,16 +61,16 @@ def fmu_model(
     that are no real numbers, or only one instance for each process, and for wrong names or bounds.
     """
     file = Path(path)
-    digest = _digest(file)
-    fmu = _opened(file.resolve(), digest)
+    digest = digest_of(file)
+    fmu = opened(file.resolve(), digest)
     read = read_variables(fmu, free, values or {})
-    imported = _imported(fmu, digest, read.selected, _sizes(read))
+    imported = imported_of(fmu, digest, read.selected, _sizes(read))
     own = name or plain_name(str(fmu.description.modelName))
     component = Component(
         name=own,
         description=str(fmu.description.description or f"the FMU '{own}'"),
         source=f"{file.name}, sha256 {digest}",
-        equations=_equations(imported, read),
+        equations=_FmuEquations(imported, read, _definitions(imported, read)),
         parameters=read.parameters,
         states=read.states,
         inputs=read.inputs,
@@ -76,30 +79,6 @@ def fmu_model(
     )
     starts = zip((s.name for s in read.states), _starts(imported, read), strict=True)
     return compose([component], name=own).with_starts(dict(starts))
-
-
-def _digest(file: Path) -> str:
-    try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); give an FMU.") from error
-
-
-@cache
-def _opened(file: Path, digest: str) -> Fmu:
-    """Return an FMU, unpacked and loaded while the process lives; once for each content."""
-    del digest
-    fmu = Fmu(file)
-    atexit.register(fmu.__exit__)
-    return fmu
-
-
-@cache
-def _imported(fmu: Fmu, digest: str, selected: Selected, sizes: tuple[float, ...]) -> Imported:
-    """Return the function of an FMU; one for models with the same variables and fixed values."""
-    told = repr((digest, str(fmu.path), selected, sizes))
-    name = f"fmu_{hashlib.sha256(told.encode()).hexdigest()[:16]}"
-    return Imported(fmu, name, selected, sizes)
 
 
 def _sizes(read: Read) -> tuple[float, ...]:
@@ -123,25 +102,30 @@ def _starts(imported: Imported, read: Read) -> list[float]:
         ) from error
 
 
-def _equations(imported: Imported, read: Read) -> Callable[[Symbols], Equations]:
-    same = _definitions(imported, read)
+@dataclass(frozen=True, eq=False)
+class _FmuEquations:
+    """The equations of an FMU: calls of its function; `same` are rows that are a state."""
 
-    def column(s: Symbols, names: Iterable[str]) -> Expression:
-        return ca.vertcat(ca.SX(0, 1), *(getattr(s, n) for n in names))
+    imported: Imported
+    read: Read
+    same: Mapping[int, int]
 
-    def equations(s: Symbols) -> Equations:
+    def __call__(self, s: Symbols) -> Equations:
+        read = self.read
+
+        def column(names: Iterable[str]) -> Expression:
+            return ca.vertcat(ca.SX(0, 1), *(getattr(s, n) for n in names))
+
         moving = [*(v.name for v in read.states), *(v.name for v in read.inputs)]
-        w = imported.function(
-            s.time, column(s, moving), column(s, (p.name for p in read.parameters))
-        )
-        rows = [getattr(s, moving[same[k]]) if k in same else w[k] for k in range(w.numel())]
+        w = self.imported.function(s.time, column(moving), column(p.name for p in read.parameters))
+        rows = [
+            getattr(s, moving[self.same[k]]) if k in self.same else w[k] for k in range(w.numel())
+        ]
         count = len(read.states)
         return Equations(
             der={q.name: rows[k] for k, q in enumerate(read.states)},
             out={o.name: rows[count + k] for k, o in enumerate(read.outputs)},
         )
-
-    return equations
 
 
 def _definitions(imported: Imported, read: Read) -> dict[int, int]:

@@ -7,11 +7,14 @@ it has one, else a central difference; by p, whose values an FMU takes before it
 only, a central difference of instances that were initialised with other values.
 """
 
+import atexit
 import ctypes
+import hashlib
 from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_int, c_size_t, c_uint, c_void_p
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -19,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Foreign
-from psa_casadi.errors import PsaError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.importer.calls import FmuError, Instance
 from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu
 from psa_casadi.simulation.compiler import shared_library
@@ -83,6 +86,11 @@ class Imported:
     instances: dict[tuple[int, int], Instance] = field(default_factory=dict)
     #: What the FMU said when it could not be initialised.
     refused: str = ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle where the FMU is and what is in it: it is opened again, if it is the same."""
+        path = Path(self.fmu.path).resolve()
+        return _again, (path, digest_of(path), self.selected, self.sizes)
 
     @cached_property
     def path(self) -> str:
@@ -187,3 +195,36 @@ def states_of(instance: Instance, count: int) -> FloatArray:
     values = (c_double * count)()
     instance.require("GetContinuousStates", values, c_size_t(count))
     return np.array(values)
+
+
+def digest_of(file: Path) -> str:
+    """Return the SHA-256 of a file. Raises InputError."""
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); give an FMU.") from error
+
+
+@cache
+def opened(file: Path, digest: str) -> Fmu:
+    """Return an FMU, unpacked and loaded while the process lives; once for each content."""
+    del digest
+    fmu = Fmu(file)
+    atexit.register(fmu.__exit__)
+    return fmu
+
+
+@cache
+def imported_of(fmu: Fmu, digest: str, selected: Selected, sizes: tuple[float, ...]) -> Imported:
+    """Return the function of an FMU; one for models with the same variables and fixed values."""
+    told = repr((digest, str(fmu.path), selected, sizes))
+    name = f"fmu_{hashlib.sha256(told.encode()).hexdigest()[:16]}"
+    return Imported(fmu, name, selected, sizes)
+
+
+def _again(file: Path, digest: str, selected: Selected, sizes: tuple[float, ...]) -> Imported:
+    if digest_of(file) != digest:
+        raise InputError(
+            f"{file}: is another FMU than the one of the pickled model; put that one back."
+        )
+    return imported_of(opened(file, digest), digest, selected, sizes)

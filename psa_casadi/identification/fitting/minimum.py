@@ -128,33 +128,44 @@ def objective(
 
     Those of the displacement, then those of the further columns. None where the model diverges.
     """
-    target = np.concatenate([measured(e.record)[e.used] for e in experiments])
-    reach = float(np.max(np.ptp(target) / weights)) if np.ptp(target) > 0.0 else np.inf
-    used = [e.used[: e.stop] for e in experiments]
-    prior, samples, share = 1.0 / unknowns.prior, len(target), 1.0 / weights
+    return _Objective(model, tuple(experiments), unknowns, weights, way)
 
-    def evaluate(theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+
+class _Objective:
+    """What `objective` returns; it can be pickled with the posterior that it is part of."""
+
+    def __init__(
+        self, model: Model, experiments: tuple[Experiment, ...], unknowns: Unknowns,
+        weights: FloatArray, way: Way,
+    ) -> None:  # fmt: skip
+        self._of, self._way = (model, experiments, unknowns), way
+        self._target = np.concatenate([measured(e.record)[e.used] for e in experiments])
+        span = float(np.ptp(self._target))
+        self._reach = float(np.max(span / weights)) if span > 0.0 else np.inf
+        self._used = [e.used[: e.stop] for e in experiments]
+        self._prior, self._share = 1.0 / unknowns.prior, 1.0 / weights
+
+    def __call__(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         try:
-            parts = predict(model, experiments, unknowns, theta, way=way)
-            beside = further_of(model, experiments, unknowns, theta, way=way)
+            parts = predict(*self._of, theta, way=self._way)
+            beside = further_of(*self._of, theta, way=self._way)
         except PsaError:
             return None
+        used, samples = self._used, len(self._target)
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
         more = [b.jacobian / b.level for b in beside]
-        residual = np.concatenate(
-            [(y - target) * share, *(-b.residuals / b.level for b in beside), theta * prior]
-        )
+        given = (-b.residuals / b.level for b in beside)
+        residual = np.concatenate([(y - self._target) * self._share, *given, theta * self._prior])
         jacobian = np.empty((len(residual), len(theta)))
         first = 0
         for part, u in zip(parts, used, strict=True):  # no copy but this one
             last = first + int(np.count_nonzero(u))
             np.compress(u, part.jacobian, axis=0, out=jacobian[first:last])
             first = last
-        jacobian[:samples] *= share[:, None]
-        jacobian[samples:] = np.vstack([*more, np.diag(prior)])
+        jacobian[:samples] *= self._share[:, None]
+        jacobian[samples:] = np.vstack([*more, np.diag(self._prior)])
         with np.errstate(over="ignore", invalid="ignore"):
             finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
-            near = np.linalg.norm(residual[:samples]) < _DIVERGED * reach * np.sqrt(samples)
+            far = _DIVERGED * self._reach * np.sqrt(samples)
+            near = np.linalg.norm(residual[:samples]) < far
         return (residual, jacobian) if finite and near else None
-
-    return evaluate

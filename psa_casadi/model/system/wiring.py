@@ -195,13 +195,15 @@ def _sizes(name: str, model: Model, period: str | None) -> Callable[[Nominal], N
     if model.structure.period is not None and period is not None:
         places[model.structure.period] = period
 
-    def size(own: Nominal) -> Nominal:
-        if not callable(own):
-            return own
+    return lambda own: _BySystem(own, places) if callable(own) else own
 
-        def by_system(values: Values) -> float:
-            return nominal_value(own, {n: values[place] for n, place in places.items()})
 
-        return by_system
+@dataclass(frozen=True)
+class _BySystem:
+    """A size of a part by the system's values; `places` are its parameters' names there."""
 
-    return size
+    own: Nominal
+    places: Mapping[str, str]
+
+    def __call__(self, values: Values) -> float:
+        return nominal_value(self.own, {n: values[place] for n, place in self.places.items()})

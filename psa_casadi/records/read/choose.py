@@ -35,11 +35,6 @@ class Choice:
     open: Sequence[str]
     sources: ColumnMap
 
-    @property
-    def guess(self) -> set[str]:
-        """The columns that are there or that one is suggested for."""
-        return set(self.fields) | set(self.sources)
-
 
 def choose(table: Table, required: Sequence[str], wanted: ColumnMap, problems: Problems) -> Choice:
     """Return the columns that the header of a table names.

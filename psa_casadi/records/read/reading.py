@@ -21,7 +21,7 @@ from psa_casadi.records.read import apart
 from psa_casadi.records.read.column_map import ALL, TABLE, columns_of, parse_columns
 from psa_casadi.records.read.columns import ColumnMap, Source
 from psa_casadi.records.read.join import joined, parts_of
-from psa_casadi.records.read.samples import Outcome, Request, Samples, samples_of
+from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Columns
 from psa_casadi.records.read.table import Table as FileTable
 from psa_casadi.records.record import Record
@@ -77,8 +77,7 @@ def read_record(
         columns, Path(path).name, sample_time, displacement=need_displacement,
         excitation=need_excitation,
     )  # fmt: skip
-    outcome, digest = _read(str(path), request)
-    return _record(str(path), outcome, digest)
+    return _record(str(path), *_read(str(path), request), table=request.table)
 
 
 def read_records(
@@ -108,9 +107,8 @@ def read_records(
             excitation=need_excitation,
         )  # fmt: skip
         try:
-            for one in _each(path, request) if request.table == ALL else (request,):
-                outcome, digest = _read(path, one)
-                records.append(_record(path, outcome, digest))
+            each = _each(path, request) if request.table == ALL else (request,)
+            records += [_record(path, *_read(path, one), table=one.table) for one in each]
         except InputError as error:
             failed += 1
             problems.extend(error.problems)
@@ -269,14 +267,14 @@ def _is_table(given: object) -> TypeGuard[Table]:
     return isinstance(given, Mapping) or hasattr(given, "columns")
 
 
-def _record(path: str, outcome: Outcome, digest: str, source: str | None = None) -> Record:
+def _record(
+    path: str, outcome: Outcome, digest: str, *, source: str | None = None, table: str = ""
+) -> Record:
+    """Return the record in SI units; one of several is named and hashed with its table."""
     outcome.problems.raise_if_any()
-    if outcome.samples is None:
+    samples = outcome.samples
+    if samples is None:
         raise InputError(f"{path}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
-    return _in_si(path, outcome.samples, digest, source)
-
-
-def _in_si(path: str, samples: Samples, digest: str, source: str | None) -> Record:
     columns = {
         name: to_si(samples.values[:, k], unit)
         for k, (name, unit) in enumerate(samples.units.items())
@@ -289,10 +287,11 @@ def _in_si(path: str, samples: Samples, digest: str, source: str | None) -> Reco
             " the record, in a unit in which neighbours differ by more than the last digit."
         )
     in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
+    stem = "+".join(Path(part).stem for part in parts_of(path)) if source is None else path
     return Record(
-        name=plain("+".join(Path(p).stem for p in parts_of(path)) if source is None else path),
+        name=plain(f"{stem}_{table}" if table else stem),
         **columns,
-        sha256=digest,
+        sha256=hashlib.sha256(f"{digest} {table}".encode()).hexdigest() if table else digest,
         source=path if source is None else source,
         displacement_unit="counts" if in_counts else "m",
         notes=tuple(f"{path}: {note}" for note in samples.notes),

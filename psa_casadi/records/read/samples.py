@@ -192,7 +192,8 @@ def _offer(
 
 def _tried(table: Table, request: Request, segment: str) -> tuple[Outcome, Choice, list[str]]:
     """Return what a table is read to, the choice of its columns, and what that leaves open."""
-    problems, notes = Problems(), [*table.notes]
+    problems = Problems()
+    notes: list[str] = []
     choice = choose(table, request.required, request.columns, problems)
     if table.step and "time" not in choice.fields and request.sample_time is None:
         again = replace(request, sample_time=table.step)
@@ -379,11 +380,11 @@ def _lengths_differ(
     sizes = [len(cells) for cells in columns.cells]
     if not sizes:
         return True
-    first = next(iter(fields))
+    first, kind = next(iter(fields)), "array" if table.sizes else "column"
     for (name, own), size in zip(fields.items(), sizes, strict=True):
         if size != sizes[0]:
             problems.add(
-                f"{table.path}: array '{table.labels[own.index]}' ({name}) has {size} values,"
+                f"{table.path}: {kind} '{table.labels[own.index]}' ({name}) has {size} values,"
                 f" '{first}' has {sizes[0]}; give every column one value for each instant."
             )
     return len(set(sizes)) > 1

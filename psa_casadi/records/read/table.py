@@ -1,7 +1,7 @@
 """What every file is read to: tables of named columns, whose cells are numbers or text."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -37,8 +37,7 @@ class Table:
     them. `where` (file and line) begins the sentences about the header, `place` is what holds one
     sample: a "line", a "row", a "sample". `sizes` are the lengths of the columns where they differ.
     `step` [s] is the time between samples that the file states beside its columns. `headless` has
-    the first numbers of a table without a header, whose columns are counted from 1. `mark` and
-    `point` are the delimiter and the decimal sign of text.
+    the first numbers of a table without a header, whose columns are counted from 1.
     """
 
     path: str
@@ -51,7 +50,6 @@ class Table:
     step: float | None = None
     sizes: Sequence[int] = ()
     headless: str = ""
-    notes: Sequence[str] = field(default=())
 
     @cached_property
     def glance(self) -> Sequence[Cells]:

@@ -1,8 +1,9 @@
 """What DIAGNOSIS.json holds (`Diagnosis.to_dict` makes it)."""
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 from psa_casadi.diagnosis.budget import Budget
 from psa_casadi.diagnosis.held_out.errors import Errors, Gain
@@ -14,7 +15,22 @@ from psa_casadi.diagnosis.result import (
     NextExperiment,
     Remaining,
     Verdict,
+    unnamed_causes,
 )
+from psa_casadi.shown import Lined
+
+
+class Told(Lined):
+    """A diagnosis as its file tells it: shows itself, and is written again as it was read."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of the file; what this version does not know is left out."""
+        found: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
+        return found
+
+    def to_json(self) -> str:
+        """Return the text of the file."""
+        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 @dataclass(frozen=True)
@@ -77,9 +93,12 @@ class RecordUsed:
     sha256: str
 
 
-@dataclass(frozen=True)
-class DiagnosisFile:
-    """A diagnosis: verdict, causes, errors before and after, and what remains."""
+@dataclass(frozen=True, repr=False)
+class DiagnosisFile(Told):
+    """A diagnosis: verdict, causes, errors before and after, and what remains.
+
+    It answers by the names of a `Diagnosis` what needs no samples and no model.
+    """
 
     format: Literal["psa_casadi.diagnosis/1"]
     verdict: Verdict
@@ -100,3 +119,23 @@ class DiagnosisFile:
     misfit: tuple[RecordMisfit, ...]
     remainder: tuple[RecordMisfit, ...]
     records: tuple[RecordUsed, ...]
+
+    @property
+    def noise_floor_rms_m(self) -> float:
+        """The noise floor [m]."""
+        return self.errors.noise_floor_rms_m
+
+    @property
+    def base_errors(self) -> Errors:
+        """The errors of the base model."""
+        return self.errors.base
+
+    @property
+    def extended_errors(self) -> Errors:
+        """The errors of the extended model."""
+        return self.errors.extended
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Effects that the extended model holds and that are not named as causes."""
+        return unnamed_causes(self.budget, self.causes)

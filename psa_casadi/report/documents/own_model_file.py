@@ -7,7 +7,7 @@ from typing import Literal
 from psa_casadi.any_model.budget import OdeBudget
 from psa_casadi.any_model.result import OutputError, PortCause
 from psa_casadi.diagnosis.result import Candidate, Remaining, Verdict
-from psa_casadi.report.documents.diagnosis_file import RecordUsed
+from psa_casadi.report.documents.diagnosis_file import RecordUsed, Told
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class FreeCorrection:
     variable: str
 
 
-@dataclass(frozen=True)
-class OwnModelFile:
+@dataclass(frozen=True, repr=False)
+class OwnModelFile(Told):
     """A diagnosis of a model of one's own: verdict, causes, errors of every output, what remains.
 
     `values` are the parameters of the extended model in the model's units. Files of older versions

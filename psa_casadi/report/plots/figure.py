@@ -74,7 +74,7 @@ def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figur
     shown = most_telling(series)
     figure, grid = _sheet()
     _record(figure, grid, shown, origin)
-    _residual(figure.add_subplot(grid[1, :2]), shown, "measured")
+    draw_residual(figure.add_subplot(grid[1, :2]), shown, "measured")
     _evidence(figure.add_subplot(grid[1, 2]), diagnosis)
     figure.suptitle(_title(diagnosis, series, shown, origin), fontsize=FONT + 3)
     return figure
@@ -87,10 +87,10 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
     above = grid[0, :2] if s.against else grid[0, :]
-    _time(figure.add_subplot(above), s, slice(None), origin, None, beside=True)
+    draw_time(figure.add_subplot(above), s, slice(None), origin, None, beside=True)
     if s.against:
         _loop(figure.add_subplot(grid[0, 2]), s, origin, told=True)
-    _residual(figure.add_subplot(grid[1, :]), s, origin)
+    draw_residual(figure.add_subplot(grid[1, :]), s, origin)
     return figure
 
 
@@ -100,7 +100,7 @@ def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
     shown = most_telling(series)
     figure, grid = _sheet()
     _record(figure, grid, shown, origin)
-    _residual(figure.add_subplot(grid[1, :]), shown, "measured")
+    draw_residual(figure.add_subplot(grid[1, :]), shown, "measured")
     which = f"{origin} record: {shown.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the model misses most)"
@@ -143,8 +143,8 @@ def _sheet() -> tuple[Figure, GridSpec]:
 
 def _record(figure: Figure, grid: GridSpec, s: Series, origin: str) -> None:
     window = telling_window(s)
-    _time(figure.add_subplot(grid[0, 0]), s, slice(None), origin, window)
-    _time(figure.add_subplot(grid[0, 1]), s, window, origin, None)
+    draw_time(figure.add_subplot(grid[0, 0]), s, slice(None), origin, window)
+    draw_time(figure.add_subplot(grid[0, 1]), s, window, origin, None)
     _loop(figure.add_subplot(grid[0, 2]), s, origin)
 
 
@@ -171,7 +171,7 @@ def _shade_held_out(axes: Axes, s: Series) -> None:
         axes.axvspan(s.time[first], s.time[last], color=HELD_OUT_COLOUR, label=label, zorder=0)
 
 
-def _time(
+def draw_time(
     axes: Axes, s: Series, part: slice, origin: str, zoom: slice | None, *, beside: bool = False
 ) -> None:
     """Draw a record or a part of it; its legend stands `beside` the title, or on the curves."""
@@ -223,7 +223,8 @@ def _loop(axes: Axes, s: Series, origin: str, *, told: bool = False) -> None:
         axes.legend(fontsize=FONT - 1, framealpha=0.85, loc="upper left")
 
 
-def _residual(axes: Axes, s: Series, origin: str) -> None:
+def draw_residual(axes: Axes, s: Series, origin: str) -> None:
+    """Draw what the models leave of a record."""
     scale = s.residual_scale
     _shade_held_out(axes, s)
     for curve in s.curves:

@@ -40,7 +40,7 @@ def posterior_figure(found: Posterior) -> Figure:
     _posterior(after, found, shown)
     axes = np.atleast_1d(below.subplots(rows, min(_COLUMNS, len(figures)))).ravel()
     for each, f in zip(axes, figures, strict=False):
-        _parameter(each, found, f)
+        draw_parameter(each, found, f)
     for each in axes[len(figures) :]:
         each.set_axis_off()
     name = found.task.experiments[shown].record.name
@@ -99,7 +99,8 @@ def _posterior(axes: Axes, found: Posterior, record: int) -> None:
     axes.legend(fontsize=FONT - 1, loc="upper right")
 
 
-def _parameter(axes: Axes, found: Posterior, f: Figures) -> None:
+def draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
+    """Draw the posterior of a parameter, and its prior."""
     unit, display = shown_in(found.model, f.name)
     values, before = (
         np.array([convert(v, unit, display) for v in found.tree[g][f.name].to_numpy().ravel()])

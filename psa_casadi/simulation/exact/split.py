@@ -73,7 +73,8 @@ def _split(s: Structure) -> Split:
         raise NoSplit("it has sampled states")
     if not s.states:
         raise NoSplit("it has no states")
-    _check_smooth(s)
+    if jumps(s):
+        raise NoSplit("its equations jump")
     depends = dependence(s.xdot, s.x)  # [k, j]: x_k' depends on x_j
     reach = closure(depends)
     moving = [i for i in range(len(s.states)) if not _constant_slopes(s, i)]
@@ -93,12 +94,13 @@ def _split(s: Structure) -> Split:
     return Split(s, linear, groups, ports, order_of(s, groups, ports, reach), matrices)
 
 
-def _check_smooth(s: Structure) -> None:
-    """Refuse operations that jump: their derivatives do not tell that anything depends on them."""
+def jumps(s: Structure) -> bool:
+    """Whether derivatives have operations that jump: their slopes do not tell what they depend on.
+
+    Of equations without sampled states.
+    """
     equations = ca.Function("f", s.arguments, [s.xdot])
-    for k in range(equations.n_instructions()):
-        if equations.instruction_id(k) in _JUMPS:
-            raise NoSplit("its equations jump")
+    return any(equations.instruction_id(k) in _JUMPS for k in range(equations.n_instructions()))
 
 
 def _constant_slopes(s: Structure, i: int) -> bool:

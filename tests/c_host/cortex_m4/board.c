@@ -1,6 +1,13 @@
 /* Runs a generated step named `stack` on a bare Cortex-M4: the memory map of MPS2 with AN386, output by
-   semihosting. Each line has the displacement's bits and the ticks of the step, both as hexadecimal digits. */
+   semihosting. Each line has the bits of the output SHOWN and the ticks of the step, both as hexadecimal
+   digits. The input GIVEN moves in units of SIZE. */
 #include "stack.h"
+
+#ifndef GIVEN
+#define GIVEN voltage
+#define SHOWN displacement
+#define SIZE 1.0f
+#endif
 
 #define STEPS 600
 #define CPACR (*(volatile unsigned *)0xE000ED88u)
@@ -23,9 +30,9 @@ static char *put(char *text, const void *number, int bytes) {
     return text;
 }
 
-/* Ramps, and jumps of 60 V */
-static void set_voltage(stack_input *input, int k) {
-    input->voltage += k % 150 == 149 ? -60 : k % 100 < 70 ? 1 : -1;
+/* Ramps, and jumps of 60 SIZE */
+static void set_input(stack_input *input, int k) {
+    input->GIVEN += SIZE * (k % 150 == 149 ? -60.0f : k % 100 < 70 ? 1.0f : -1.0f);
 }
 
 static void run(void) {
@@ -37,15 +44,15 @@ static void run(void) {
     stack_init(&state);
     for (int k = 0; k < STEPS; ++k) {
         char line[40], *end = line;
-        set_voltage(&input, k);
+        set_input(&input, k);
         saved = state;
         const unsigned before = SYSTICK_NOW;
         stack_step(&state, &input, &output);
         const unsigned ticks = (before - SYSTICK_NOW) & 0xFFFFFFu;
         state = saved; /* a copy is a saved state */
         stack_step(&state, &input, &again);
-        end = put(end, &again.displacement, sizeof again.displacement);
-        *end++ = again.displacement == output.displacement ? ' ' : '!';
+        end = put(end, &again.SHOWN, sizeof again.SHOWN);
+        *end++ = again.SHOWN == output.SHOWN ? ' ' : '!';
         end = put(end, &ticks, sizeof ticks);
         *end++ = '\n';
         *end = 0;

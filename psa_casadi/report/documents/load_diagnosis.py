@@ -1,0 +1,36 @@
+"""A diagnosis read back from the JSON file that `psa diagnose` or `to_json` wrote."""
+
+import os
+
+from psa_casadi.errors import InputError
+from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
+from psa_casadi.report.documents.own_model_file import OwnModelFile
+from psa_casadi.report.documents.read_document import read_document
+from psa_casadi.strict_json import parse_json, read_json_text, shown
+
+_ADVICE = "give a file that `psa diagnose --json` or `Diagnosis.to_json` wrote"
+_KINDS: dict[str, type[DiagnosisFile | OwnModelFile]] = {
+    "psa_casadi.diagnosis/1": DiagnosisFile,
+    "psa_casadi.own_model_diagnosis/1": OwnModelFile,
+}
+
+
+def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile:
+    """Return what DIAGNOSIS.json holds: verdict, causes, errors by the names of a `Diagnosis`.
+
+    The file has no samples and no model (`load_model` reads that); to keep a whole result, pickle
+    it. A diagnosis of an own model gives what `OdeDiagnosis` names so.
+
+    Raises InputError for a file that cannot be read, is none of a diagnosis, or lacks something.
+    """
+    source = os.fspath(path)
+    try:
+        content = parse_json(read_json_text(source), source, f"{_ADVICE}.")
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{source}: cannot be read ({error}); {_ADVICE}.") from error
+    found = content.get("format") if isinstance(content, dict) else None
+    if found not in _KINDS:
+        raise InputError(f"{source}: its format is {shown(found)}, no diagnosis; {_ADVICE}.")
+    return read_document(_KINDS[found], content, source)
