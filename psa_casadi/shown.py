@@ -55,7 +55,7 @@ class Reported(Shown):
     """What a result can show of itself that has a page of its own."""
 
     def report(self, path: str | os.PathLike[str], *, still: bool = False) -> None:
-        """Write the page, one HTML file below 1.5 MB that needs no network.
+        """Write the page, one HTML file below 3 MB that needs no network.
 
         The model runs in the page unless it is to be `still`.
 
@@ -69,7 +69,7 @@ class StillReported(Shown):
     """What a result can show of itself whose page holds no model that runs."""
 
     def report(self, path: str | os.PathLike[str]) -> None:
-        """Write the page, one HTML file below 1.5 MB that needs no network.
+        """Write the page, one HTML file below 3 MB that needs no network.
 
         Raises:
             InputError: `path` cannot be written to.

@@ -49,6 +49,13 @@ setTimeout(function () {
   found.effect = box.querySelector('output').textContent;
   found.values = box.psa.values.slice();
   found.csv = box.psa.csv();
+  numbers[1].value = '900'; numbers[1].dispatchEvent(new Event('input'));
+  box.psa.csv();
+  found.beyond = box.querySelector('.warnings').textContent;
+  numbers[1].value = '-120'; numbers[1].dispatchEvent(new Event('input'));
+  box.psa.csv();
+  found.within = box.querySelector('.warnings').hidden;
+  numbers[1].value = '120'; numbers[1].dispatchEvent(new Event('input'));
   found.file = box.psa.file();
   found.knobs = Array.prototype.filter.call(box.querySelectorAll('.knob'), function (k) {
     return !k.hidden && !k.closest('details'); }).length;
@@ -65,6 +72,9 @@ setTimeout(function () {
       found.corners = psaLive.voltages.corners('0 0, 0.1 100; 0.2:50', 5).v;
       found.read = psaLive.voltages.read(
         'Zeit;t (ms);U [kV]\\n1;0,0;0,1\\n2;1,0;0,2\\n3;2,0;0,3\\n4;3,5;0,1\\n');
+      found.even = psaLive.voltages.read('t,v\\n' + Array.from({length: 20}, function (_, k) {
+        var t = k % 2 ? 1.01 * k : k;
+        return t + ',' + 2 * t; }).join('\\n'));
       found.none = [psaLive.voltages.corners('1 0, 0 5', 5), psaLive.voltages.read('a,b\\n1,2\\n')];
       found.spent = box.psa.last();
       var knob = Array.prototype.find.call(box.querySelectorAll('.knob'), function (k) {
@@ -188,6 +198,17 @@ def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) ->
     assert list(played["read"]["t"].values()) == pytest.approx([0.0, 1e-3, 2e-3, 3.5e-3])
     assert list(played["read"]["v"].values()) == pytest.approx([100.0, 200.0, 300.0, 100.0])
     assert played["none"] == [None, None]
+
+
+@slow
+def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_said(played: dict[str, Any]) -> None:
+    said = "The voltage reaches 900 V; P-885.51 is rated for 120 V."
+    assert played["beyond"].startswith(said)
+    assert played["within"]
+    even = {k: list(played["even"][k].values()) for k in ("t", "v")}
+    assert even["t"] == pytest.approx(np.linspace(0.0, 19.19, 20))
+    assert even["v"] == pytest.approx(2.0 * np.array(even["t"]))
+    assert "even grid" in played["even"]["note"]
 
 
 @slow

@@ -24,7 +24,6 @@ DATA = (
     "psa_casadi/py.typed",
     "psa_casadi/report/page/page.css",
     "psa_casadi/report/page/page.js",
-    "psa_casadi/report/page/plotly-basic.min.js.gz",
     "psa_casadi/report/page/live_model.js",
     "psa_casadi/examples/recipes/simulink.md",
     "psa_casadi/fmu_src/instance.c",

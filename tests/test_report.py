@@ -16,7 +16,8 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport, CheckRow
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.plots.figure import save_figure
-from psa_casadi.report.words.phrases import length_scale, listing, number, share_text
+from psa_casadi.report.plots.finding_plots import evidence_plot
+from psa_casadi.report.words.phrases import length_scale, listing, number, plain, share_text
 from psa_casadi.report.words.residuals import noise_density, spectrum
 from psa_casadi.report.words.series import series_of, telling_window
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
@@ -29,7 +30,7 @@ from tests.tiers import slow
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 SENTENCES = {
     "adequate": "Nothing beyond the noise is missing",
-    "cause_named": "The cause is slow creep (plant, confidence 97 %)",
+    "cause_named": "The cause is slow creep (plant, confidence 97 %: extremely likely)",
     "partly_explained": "The closest known cause is slow creep",
     "ambiguous": "do not decide whether it is slow creep or offset drift",
     "unexplained": "no effect in the table explains",
@@ -53,7 +54,7 @@ def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict
     assert page.loaded == []
     assert page.targets <= page.names
     assert not re.search(r"@import|url\(", text.split("<script>", 1)[0])
-    assert len(text) < 1.5e6
+    assert len(text) < 3e6
     assert SENTENCES[verdict] in page.text
     assert "synthetic data" in page.text
     assert "measured" not in page.text
@@ -76,6 +77,9 @@ def test_the_picture_has_its_size_and_shows_something(tmp_path: Path, verdict: V
     save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic")
     assert png_size(path) == (1600, 1000)
     assert path.stat().st_size > 50_000
+    save_figure(diagnosis(verdict, ("a", "b")), tmp_path / "n.png", origin="synthetic", narrow=True)
+    assert png_size(tmp_path / "n.png") == (720, 880)
+    (tmp_path / "n.png").unlink()
     assert [p.name for p in tmp_path.iterdir()] == ["d.png"]
 
 
@@ -90,7 +94,7 @@ def test_long_records_stay_small(tmp_path: Path) -> None:
     write_report(
         diagnosis("cause_named", tuple("abcdefgh"), 60_000), tmp_path / "r.html", still=True
     )
-    assert (tmp_path / "r.html").stat().st_size < 1.5e6
+    assert (tmp_path / "r.html").stat().st_size < 3e6
 
 
 def test_the_window_shows_where_the_error_falls_most() -> None:
@@ -115,7 +119,8 @@ def test_the_verdict_names_the_rival_of_a_later_cause_and_weights_as_what_they_a
     second = Cause(memory.name, "plant", 0.6, {"memory_threshold": size} |
                    dict.fromkeys(memory.linear, size), ("backlash",), 0.2)  # fmt: skip
     d = replace(d, causes=(*d.causes, second), model=d.model.with_effect(memory))
-    assert "hysteresis memory (plant, confidence 60 %; or backlash)" in verdict_sentence(d)
+    said = "hysteresis memory (plant, confidence 60 %: more likely than not; or backlash)"
+    assert said in verdict_sentence(d)
     said = cause_size(d, second)
     assert "memory_threshold = 0.100" in said
     assert said.endswith("9 weights, which shape its loop together")
@@ -133,6 +138,17 @@ def test_the_share_of_a_named_cause_among_several_is_told_beside_that_of_it_alon
     d = replace(d, budget=spent, causes=(*d.causes, hum))
     assert share_text(first, d) == "93 %; with others 60 %"
     assert share_text(d.candidates[2], d) == "0 % (screened)"
+
+
+def test_the_bars_of_named_causes_come_first_with_their_confidence() -> None:
+    d = diagnosis("partly_explained")
+    last = d.candidates[-1].effect
+    d = replace(d, causes=(*d.causes, replace(d.causes[0], effect=last, confidence=0.5)))
+    bars, figures_ = evidence_plot(d, 2).data
+    assert list(bars.y)[::-1] == [plain(n) for n in (d.candidates[0].effect, last)]
+    assert [t.split("; ")[1] for t in figures_.text][::-1] == ["named, 97 %", "named, 50 %"]
+    shares = evidence_plot(diagnosis("unexplained"), 2).data[1].text
+    assert not any("named" in t for t in shares)
 
 
 def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:

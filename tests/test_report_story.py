@@ -52,15 +52,26 @@ def test_the_page_tells_the_story_in_its_order(tmp_path: Path) -> None:
         "Noise", "Records",
     ]  # fmt: skip
     top = text[: text.index("<h2")]
-    assert "confidence 97\u00a0%</span>" in top
+    assert "(plant, confidence 97\u00a0%: extremely likely)" in top
     assert top.count('class="drawing"') == 1
-    for label in ("base model, held-out rms", "extended model, held-out rms", "noise, rms"):
-        assert f"<dt>{label}</dt>" in top
-    assert re.search(r"falls by</dt><dd>83\s%<small>95\s% interval 79 to 86\s%", top)
+    # the noise is the floor of the errors' bars
+    assert re.findall(r'<i style="width:([\d.]+)%', top) == ["100.0", "17.0", "10.0"]
+    assert "--floor:10.0%" in top
+    assert "falls by 83 % (95 % interval 79 to 86 %)" in page.text.replace("\u00a0", " ")
     assert "holds for these voltages only" in page.text
     for sentence in diagnosis("cause_named").misfit[0].sentences:
         assert sentence in page.text.replace("\u00a0", " ")
     assert diagnosis("cause_named").noise[0].sentence in page.text.replace("\u00a0", " ")
+
+
+def test_what_the_records_do_not_determine_is_folded_away(tmp_path: Path) -> None:
+    text, _ = page_of(diagnosis("cause_named"), tmp_path)
+    shown = text[text.index("Parameters of the extended model</h2>") :]
+    above, folded = shown.split("<details><summary>Not determined by these records", 1)
+    assert "<td>k_L</td>" in above
+    for name in ("tau", "m_P"):  # over seven decades, and not fitted
+        assert f"<td>{name}</td>" not in above
+        assert f"<td>{name}</td>" in folded.split("</details>")[0]
 
 
 def test_the_view_is_drawn_before_and_after_the_extension(tmp_path: Path) -> None:
@@ -90,7 +101,8 @@ def test_an_effect_without_a_name_is_said_to_be_in_the_extended_model(tmp_path: 
     assert not models(d, Path("MODEL.json"))
     text, page = page_of(d, tmp_path)
     assert "Every effect that was tried" in headings(text)
-    assert "extended model, held-out rms" in page.text
+    assert "Error on held-out samples, rms; the displacement's range is" in page.text
+    assert "base model 50.0 nm extended model 8.50 nm noise 5.00 nm" in page.text
     assert diagnosis("cause_named").kept == ()
 
 
@@ -205,7 +217,8 @@ def test_only_a_named_cause_has_its_confidence_at_the_top(tmp_path: Path) -> Non
     )
     for verdict, shown in rows:
         text, _ = page_of(diagnosis(verdict), tmp_path)
-        assert ('class="badge confidence"' in text) is shown
+        (verdict_words,) = re.findall(r'<p class="verdict">(.*?)</p>', text)
+        assert ("confidence 97" in verdict_words) is shown
 
 
 @pytest.mark.parametrize("width", range(60, 100, 3))
@@ -243,7 +256,7 @@ def test_probabilities_are_in_table_and_bars_where_a_cause_is_named(tmp_path: Pa
     assert [row[-1] for row in table.rows] == ["91 %", "8 %", "< 1 %"]
     assert len(candidate_table(diagnosis("unexplained")).head) == 3
     text, page = page_of(diagnosis("cause_named"), tmp_path)
-    assert "1,250; 91 %" in text
+    assert "1,250; named, 97 %" in text
     assert "the probability that it is the cause" in page.text
     assert "1,250; 93 %" in page_of(diagnosis("unexplained"), tmp_path)[0]
     assert probability_text(1.0) == "> 99 %"

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from psa_casadi.report.plots.residual_plots import distribution_plot
 from psa_casadi.report.words.fit_words import residual_sentence
 from psa_casadi.report.words.phrases import Scale
 from psa_casadi.report.words.residuals import (
@@ -102,6 +103,23 @@ def test_the_shares_of_a_distribution_add_up(samples: int) -> None:
     assert found.shares.sum() == pytest.approx(100.0)
     assert 15 <= len(found.shares) <= 61
     assert found.width == pytest.approx(float(np.diff(found.centres).mean()))
+
+
+def test_a_residual_can_be_read_beside_one_that_is_far_off() -> None:
+    narrow, none = 1e-9 * white(5000), np.zeros(5000, dtype=bool)
+    wide, time = 3e-8 * np.linspace(-1.0, 1.0, 5000), np.arange(5000) / 1000.0
+    curves = (Curve("base", "#d55e00", -wide), Curve("extended", "#0072b2", -narrow))
+    s = Series("r", time, time, 0.0 * time, curves, none, 1e-9, False)
+    base, extended, normal = distribution_plot(s).data
+    span = np.ptp(narrow)
+    assert np.ptp(normal.x) == pytest.approx(2e9 * span, rel=1e-5)
+    assert extended.name == "extended"
+    assert np.sum(extended.y) == pytest.approx(100.0)
+    outside = 100.0 - 100.0 * 2e9 * span / 60.0
+    assert base.name == f"base ({outside:.0f} % outside)"
+    assert np.sum(base.y) == pytest.approx(100.0 - outside, abs=0.1)
+    near = Series("r", time, time, 0.0 * time, (curves[1], curves[1]), none, 1e-9, False)
+    assert np.ptp(distribution_plot(near).data[-1].x) == pytest.approx(1e9 * span, rel=1e-5)
 
 
 def test_a_spectrum_of_many_lines_is_thinned_and_keeps_its_peaks() -> None:

@@ -18,6 +18,14 @@ pytestmark = pytest.mark.xdist_group("browser")
 DEMO = Path(__file__).parents[1] / "psa_casadi" / "data" / "demo.csv"
 #: A name that is markup where somebody takes it for that.
 HOSTILE = "<img src=x onerror=document.title=1>.csv"
+#: Leaves of the page what was tried, the verdict, and the top of the report.
+_FROM_THE_SEARCH = """
+  var away = 'main > :not(section), section:has(#h-files, #h-columns), #h-run ~ :not(#search),'
+    + ' #h-run, #said, #downloads, #result .bar';
+  document.querySelectorAll(away).forEach(n => { n.style.display = 'none'; });
+  document.querySelector('#report').style.height = '740px';
+  scrollTo(0, 0);
+"""
 PICTURES = os.environ.get("PSA_CASADI_PICTURES", "")
 
 
@@ -41,6 +49,18 @@ def address(tmp_path: Path) -> Iterator[str]:
 def picture(tab: Steered, name: str, width: int = 1100, height: int = 1500, **how: bool) -> None:
     if PICTURES:
         tab.look(Path(PICTURES) / f"{name}.png", width, height, **how)
+
+
+def pictures_of_the_result(tab: Steered) -> None:
+    """Save the page as it is, and from the search on: docs/pictures/web_diagnose_result.png."""
+    picture(tab, "result", height=3000)
+    picture(tab, "phone", 390, 2600)
+    picture(tab, "night", height=2200, dark=True)
+    if PICTURES:
+        tab.call("Emulation.setScrollbarsHidden", hidden=True)
+        tab.run(_FROM_THE_SEARCH)
+        for _ in range(3):  # the report is drawn again for another width, which takes a second
+            picture(tab, "web_diagnose_result", 500, 1350)
 
 
 def drop(tab: Steered, path: Path) -> None:
@@ -140,9 +160,7 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         assert tab.run("document.title") == "Diagnose records"
         assert not tab.run("document.querySelector('img')")
         assert faults(tab, axe) == []
-        picture(tab, "result", height=3000)
-        picture(tab, "phone", 390, 2600)
-        picture(tab, "night", height=2200, dark=True)
+        pictures_of_the_result(tab)
         narrow(tab)
         report_runs(tab, address)
         nothing_outside_nor_wrong(tab, address)

@@ -19,7 +19,7 @@ _FRAMES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         (DARK,),
     ),
 )
-_WIDTH, _HEIGHT = 900, 1180
+_WIDTH, _HEIGHT = 1000, 800
 _ACT = """<script>
 document.querySelectorAll('h1, nav, h2, .live ~ *').forEach(function (n) {{ n.hidden = true; }});
 var box = document.querySelector('.live');
@@ -35,11 +35,11 @@ function start(name) {{
 
 
 def strip(page: str) -> Figure:
-    """Return pictures of a page with a model that has two effects, side by side."""
-    drawn, axes = plt.subplots(1, len(_FRAMES), figsize=(16.0, 5.9), layout="constrained")
+    """Return pictures of a page with a model that has two effects, two by two."""
+    drawn, axes = plt.subplots(2, 2, figsize=(12.0, 10.0), layout="constrained")
     with tempfile.TemporaryDirectory() as folder:
         browser = find_browser(Path(folder))
-        for k, ((act, caption, flags), ax) in enumerate(zip(_FRAMES, axes, strict=True)):
+        for k, ((act, caption, flags), ax) in enumerate(zip(_FRAMES, axes.flat, strict=True)):
             path = Path(folder) / f"frame{k}.html"
             text = _ACT.format(act=act).join(without_policy(page).rsplit("</body>", 1))
             path.write_text(text, encoding="utf-8")

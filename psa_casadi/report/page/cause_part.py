@@ -41,6 +41,8 @@ def add_evidence_of_all(
         f"Figures: the evidence, and {said}. Blue: named; orange: fitted in full; grey: screened"
         " only."
     )
+    if len(d.causes) > 1:
+        note += " Alone, a cause may have little evidence that has much beside the others."
     if most is not None and len(d.candidates) > most:
         note += f" {most} of {len(d.candidates)}; the table below has all."
     page.picture(

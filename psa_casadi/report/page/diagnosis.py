@@ -6,21 +6,21 @@ from collections.abc import Sequence
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_write
+from psa_casadi.report.page.blocks import FLOOR, Bar
 from psa_casadi.report.page.budget_part import add_budget
 from psa_casadi.report.page.cause_part import add_causes, add_evidence
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import add_live, live_diagnosis
 from psa_casadi.report.page.misfit_part import add_misfit, add_remainder
 from psa_casadi.report.page.own_model_page import write_own_report
+from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.page.remedy_part import add_what_now
-from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.phrases import (
+    handy_scale,
     in_page_unit,
     listing,
-    number,
     one_unit,
-    percent,
     rest_sentence,
     scale_of,
 )
@@ -31,7 +31,6 @@ from psa_casadi.report.words.tables import (
     candidate_table,
     column_table,
     error_table,
-    parameter_table,
     record_table,
 )
 from psa_casadi.report.words.verdict_words import (
@@ -56,7 +55,7 @@ def write_report(
     `origin`, "measured" or "synthetic", is what the page calls the records; `model_file` is where
     the extended model was written, which the commands of the page read. Unless it is to be
     `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
-    page is below 1.5 MB; where scripts are off it has one still picture. That of a model of one's
+    page is below 3 MB; where scripts are off it has one still picture. That of a model of one's
     own holds no model that runs.
 
     Raises InputError when `path` cannot be written to.
@@ -70,8 +69,8 @@ def write_report(
     with one_unit(scale_of(d.experiments, d.base_errors.holdout_rms_m)):
         page.paragraph(verdict_sentence(d), "verdict")
         add_what_now(page, d, model_file)
+        _add_floor(page, d)
         page.bullets(_answers(d))
-        page.tiles(_tiles(d))
         add_worst(page, series, origin)
         add_budget(page, d)
         if live is not None:
@@ -89,39 +88,34 @@ def write_report(
 
 def _badges(d: Diagnosis, origin: str) -> list[str]:
     count = len(d.experiments)
-    sure = d.causes[:1] if d.verdict != "ambiguous" else ()
-    badges = [f"confidence {percent(c.confidence)}" for c in sure]
-    return [*badges, f"{origin} data", f"{count} record{'s' if count > 1 else ''}"]
+    return [f"{origin} data", f"{count} record{'s' if count > 1 else ''}"]
 
 
 def _answers(d: Diagnosis) -> list[str]:
-    """Return where the error goes, what remains and what to do next, in a sentence each."""
-    told = [("Remains", rest_sentence(d)), ("Next", d.next_experiment.why)]
-    if d.budget is not None and d.verdict not in ("adequate", "not_driven"):
-        scale = scale_of(d.experiments, d.budget.excess_rms_m)
-        told.insert(0, ("Where the error goes", f"{budget_sentence(d, scale)}."))
+    """Return what remains and what to do next, in a sentence each."""
+    told = (("Remains", rest_sentence(d)), ("Next", d.next_experiment.why))
     return [f"{label}: {text}" for label, text in told if text]
 
 
-def _tiles(d: Diagnosis) -> list[tuple[str, str, str]]:
-    """Return the main figures: held-out errors, noise, gain."""
+def _add_floor(page: Document, d: Diagnosis) -> None:
+    """Add the held-out errors as bars over the noise, which no model can go below."""
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
-    models = [("base model, held-out rms", d.base_errors)]
-    models += [("extended model, held-out rms", d.extended_errors)] if added(d) else []
-    tiles = [
-        (label, scale.text(e.holdout_rms_m), f"{number(e.holdout_nrmse_percent, 2)} % of the range")
-        for label, e in models
-    ]
-    sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
-    tiles.append(
-        ("noise, rms", scale.text(d.noise_floor_rms_m), f"from {sources}" if sources else "")
-    )
+    models = [("base model", "--base", d.base_errors.holdout_rms_m)]
     if added(d):
-        low, high = d.gain.interval
-        gain = f"{d.gain.holdout_rms_reduction_percent:.0f} %"
-        interval = f"95 % interval {low:.0f} to {high:.0f} %"
-        tiles.append(("held-out error falls by", gain, interval))
-    return tiles
+        models.append(("extended model", "--extended", d.extended_errors.holdout_rms_m))
+    rows = [Bar(name, rms, colour, scale.text(rms)) for name, colour, rms in models]
+    noise = d.noise_floor_rms_m
+    rows.append(Bar("noise", noise, "--noise", scale.text(noise)))
+    span = max(e.record.range_m for e in d.experiments)
+    text = handy_scale(span, counts=scale.unit == "counts").text(span)
+    sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
+    found = f" Found from {sources}." if sources else ""
+    page.bars(
+        f"Error on held-out samples, rms; the displacement's range is {text}",
+        rows,
+        noise,
+        f"{FLOOR}{found}",
+    )
 
 
 def _columns(page: Document, d: Diagnosis) -> None:
@@ -164,7 +158,7 @@ def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str
     page.table(candidate_table(d))
     which = "extended" if added(d) else "base"
     page.section(f"Parameters of the {which} model")
-    page.table(parameter_table(d.model))
+    add_parameters(page, d.model)
     for note in d.notes:
         page.paragraph(note, "note")
     if d.noise:

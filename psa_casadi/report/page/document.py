@@ -4,7 +4,6 @@ import base64
 import io
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.resources import files
@@ -16,15 +15,14 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
 from psa_casadi.command_line import typed
+from psa_casadi.report.page import blocks
+from psa_casadi.report.page.blocks import Bar
 from psa_casadi.report.page.packed import Drawings, Picture, library_hash, script_hash
 from psa_casadi.report.page.packed import words as _text
 from psa_casadi.report.plots.theme import DARK
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
 
-_FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
-_HASH = re.compile(r"[0-9a-f]{64}")
-_WIDE = 28
 #: Levels of red, green and blue of a still picture: lines on paper take few, and it is small.
 _LEVELS = 16
 #: The scripts of a model that runs in a page, by what it does there, in their order.
@@ -67,51 +65,41 @@ class Document:
 
     def bullets(self, texts: Iterable[str]) -> None:
         """Add a list."""
-        self._parts.append(_list(texts))
+        self._parts.append(blocks.bullets(texts))
 
     def warnings(self, texts: Sequence[str]) -> None:
         """Add a box that nobody overlooks; nothing if there is nothing to warn of."""
         if texts:
             word = "Warning" if len(texts) == 1 else "Warnings"
             self._parts.append(
-                f'<div class="warnings" role="alert"><p>{word}</p>{_list(texts)}</div>'
+                f'<div class="warnings" role="alert"><p>{word}</p>{blocks.bullets(texts)}</div>'
             )
 
     def advice(self, title: str, texts: Sequence[str], commands: Sequence[str]) -> None:
         """Add a box that says what to do, and what to type."""
         typed_text = "\n".join(commands)
         block = f'<pre tabindex="0">{_text(typed_text)}</pre>' if commands else ""
-        self._parts.append(f'<div class="advice"><p>{_text(title)}</p>{_list(texts)}{block}</div>')
+        self._parts.append(
+            f'<div class="advice"><p>{_text(title)}</p>{blocks.bullets(texts)}{block}</div>'
+        )
 
     def tiles(self, figures: Iterable[tuple[str, str, str]]) -> None:
         """Add the main figures in a row: label, figure, and a remark that may be empty."""
-        cells = "".join(
-            f"<div><dt>{_text(label)}</dt><dd>{_text(figure)}"
-            f"{f'<small>{_text(remark)}</small>' if remark else ''}</dd></div>"
-            for label, figure, remark in figures
-        )
-        self._parts.append(f'<dl class="tiles">{cells}</dl>')
+        self._parts.append(blocks.tiles(figures))
 
-    def table(self, table: Table, marks: Mapping[str, str] | None = None) -> None:
-        """Add a table that scrolls on its own where the page is too narrow for it.
+    def bars(self, caption: str, rows: Sequence[Bar], floor: float, note: str) -> None:
+        """Add bars of one scale, with a line across them at `floor`."""
+        self._parts.append(blocks.bars(caption, rows, floor, note))
 
-        Columns of figures are set flush right; a cell whose text is in `marks` gets that style.
+    def table(
+        self, table: Table, marks: Mapping[str, str] | None = None, *, folded: str = ""
+    ) -> None:
+        """Add a table; a cell whose text is in `marks` gets that style.
+
+        It is `folded` away behind these words, where they are given.
         """
-        styles = [_column_style(column) for column in zip(*table.rows, strict=True)]
-        styles = styles or [""] * len(table.head)
-
-        def row(tag: str, cells: Sequence[str]) -> str:
-            texts = (
-                f"<{tag}{_class(style, (marks or {}).get(cell, ''))}>{_text(cell)}</{tag}>"
-                for cell, style in zip(cells, styles, strict=True)
-            )
-            return f"<tr>{''.join(texts)}</tr>"
-
-        body = "".join(row("td", cells) for cells in table.rows)
-        self._parts.append(
-            f'<div class="scroll" tabindex="0"><table><thead>{row("th", table.head)}</thead>'
-            f"<tbody>{body}</tbody></table></div>"
-        )
+        content = blocks.table(table, marks)
+        self._parts.append(blocks.folded(folded, content) if folded else content)
 
     def picture(self, picture: Picture) -> None:
         """Add a plot over the whole width."""
@@ -212,21 +200,3 @@ def _made() -> str:
     when = datetime.fromtimestamp(int(stated), UTC) if stated.isdecimal() else datetime.now(UTC)
     command = f" Command: {typed.get()}" if typed.get() else ""
     return f"Written {when:%Y-%m-%d %H:%M} UTC by psa_casadi {__version__}.{command}"
-
-
-def _list(texts: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{_text(t)}</li>' for t in texts)}</ul>"
-
-
-def _class(*names: str) -> str:
-    given = " ".join(n for n in names if n)
-    return f' class="{given}"' if given else ""
-
-
-def _column_style(cells: Sequence[str]) -> str:
-    filled = [c for c in cells if c]
-    if filled and all(_FIGURE.fullmatch(c) for c in filled):
-        return "figure"
-    if filled and all(_HASH.fullmatch(c) for c in filled):
-        return "hash"
-    return "wide" if any(len(c) > _WIDE for c in filled) else ""

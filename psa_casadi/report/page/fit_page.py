@@ -13,6 +13,7 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import LiveModel, add_live, live_fit
 from psa_casadi.report.page.own_model_page import write_own_fit_report
 from psa_casadi.report.page.packed import Picture
+from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_still
 from psa_casadi.report.plots.finding_plots import correlation_plot, determinacy_plot
 from psa_casadi.report.plots.profile_plot import profile_plot
@@ -28,7 +29,6 @@ from psa_casadi.report.words.residuals import ResidualFigures, residual_figures
 from psa_casadi.report.words.series import Series, most_telling, series_of_fit
 from psa_casadi.report.words.tables import (
     fit_error_table,
-    parameter_table,
     record_table,
     starts_table,
 )
@@ -98,7 +98,7 @@ def fit_page(
         page.paragraph("Where the search ended from each of its starts.")
         page.table(starts_table(found.starts, _scale(series)), {"another minimum": "weak"})
     page.section("Parameters")
-    page.table(parameter_table(found.model, found), _STATUS_STYLES)
+    add_parameters(page, found.model, found, _STATUS_STYLES)
     for note in found.model.provenance.notes:
         page.paragraph(note, "note")
     _records(page, series, figures, origin)

@@ -88,8 +88,15 @@ psaLive.report = function (box, told, run) {
       return;
     }
     var text = (record.judged.any ? 'Error on held-out samples' : 'Error') + ': ' + length(size) + ' rms, ' +
-      +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise: ' + length(record.floor) + '.';
-    if (record.base > record.floor && told.extended) {
+      +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise, the floor: ' + length(record.floor) + '.';
+    var off = told.effects.filter(function (e) { return values[index[e.gain]] === 0 && fitted[index[e.gain]] !== 0; });
+    if (off.length) {
+      text += ' With ' + off.map(function (e) { return e.title; }).join(' and ') +
+        ' off nothing is fitted again: all other values were found together with ' + (off.length > 1 ? 'them' : 'it') + '.';
+    }
+    if (off.length && off.length === told.effects.length) {
+      text += ' The base model, fitted without any effect, leaves ' + length(record.base) + '.';
+    } else if (record.base > record.floor && told.extended) {
       var left = Math.max(0, size * size - record.floor * record.floor) / (record.base * record.base - record.floor * record.floor);
       text += left < 1
         ? ' Of the base model\u2019s error above the noise (in power) ' + Math.round(100 * (1 - left)) + ' % is removed.'
@@ -214,8 +221,10 @@ psaLive.report = function (box, told, run) {
     ? [make('label', {className: 'field', text: 'Record'}, [chosen])] : [];
   [
     make('div', {className: 'bar'}, choice.concat(buttons, [status])), legend,
-    make('div', {className: 'large'}, [figure(0)]), make('div', {className: 'pair'}, [figure(1), figure(2)]), output, budget, note
-  ].concat(knobs.nodes(function (p) { return p.free || p.interval; }, switches)).forEach(function (n) { box.appendChild(n); });
+    psaLive.board([
+      make('div', {className: 'large'}, [figure(0)]), make('div', {className: 'pair'}, [figure(1), figure(2)]), output, budget, note
+    ], plots[2], knobs.nodes(function (p) { return p.determined; }, switches))
+  ].forEach(function (n) { box.appendChild(n); });
   choose();
   window.addEventListener('resize', later);
   window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', later);

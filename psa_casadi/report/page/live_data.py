@@ -12,6 +12,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.report.page.packed import packed
+from psa_casadi.report.words.grades import determined
 from psa_casadi.report.words.phrases import plain, shown_in
 from psa_casadi.simulation.ways import output_of
 from psa_casadi.units import convert
@@ -45,11 +46,11 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
     """
     shown = output_of(model)
     outputs = model.output_names
-    s = model.structure
+    s, known = model.structure, determined(model)
     return {
         "name": model.name,
         "wasm": packed(module),
-        "parameters": [_parameter(model, p) for p in s.parameters],
+        "parameters": [_parameter(model, p, p.name in known) for p in s.parameters],
         "effects": [_effect(model, c) for c in model.effects],
         "inputs": [{"name": i.name, "unit": i.unit, "start": i.start} for i in s.inputs],
         "outputs": [_variable(o.name, o.unit, o.display_unit, o.description) for o in s.outputs],
@@ -86,7 +87,7 @@ def _scale(unit: str, display: str) -> dict[str, Any]:
     return {"unit": display, "factor": convert(1.0, unit, display) - shift, "shift": shift}
 
 
-def _parameter(model: Model, p: Parameter) -> dict[str, Any]:
+def _parameter(model: Model, p: Parameter, known: bool) -> dict[str, Any]:
     unit, display = shown_in(model, p.name)
     interval = model.provenance.intervals.get(p.name)
     sure = [interval.low, interval.high] if interval is not None else []
@@ -100,7 +101,7 @@ def _parameter(model: Model, p: Parameter) -> dict[str, Any]:
         "ends": list(ends),
         "log": p.log and ends[0] > 0.0,
         "interval": sure if np.isfinite(sure).all() and sure else None,
-        "free": p.name in model.provenance.free,
+        "determined": known,
     }
 
 

@@ -114,6 +114,15 @@ psaLive.knobs = function (told, values, changed) {
   };
 };
 
+// What is moved beside what it changes: the plots stay in sight, on a phone the one on this canvas does.
+psaLive.board = function (plots, kept, knobs) {
+  'use strict';
+  kept.parentNode.classList.add('kept');
+  return psaLive.make('div', {className: 'board'}, [
+    psaLive.make('div', {className: 'plots'}, plots), psaLive.make('div', {className: 'knobs'}, knobs)
+  ]);
+};
+
 // Copying and saving, also where the browser has no clipboard for a file from disk.
 psaLive.save = function (name, text, type) {
   'use strict';

@@ -7,16 +7,17 @@ from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.component import Component
 from psa_casadi.files import atomic_write
+from psa_casadi.report.page.blocks import FLOOR, Bar
 from psa_casadi.report.page.cause_part import add_evidence_of_all, add_rivals
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
+from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.plots.patch_plot import free_plot
 from psa_casadi.report.words.fit_words import whiteness_sentence
 from psa_casadi.report.words.own_series import own_fit_series, own_series
 from psa_casadi.report.words.own_words import (
-    fall_of,
     own_budget_table,
     own_error_table,
     own_fit_sentence,
@@ -31,8 +32,8 @@ from psa_casadi.report.words.series import Series, most_telling
 from psa_casadi.report.words.tables import candidate_table, parameter_table, record_table
 from psa_casadi.report.words.verdict_words import VERDICTS, added
 
-#: Outputs that have a tile of their own, series whose residual is told at once, effects with bars.
-_TILES, _TOLD, _BARS = 4, 4, 16
+#: Outputs whose errors are drawn as bars, series whose residual is told at once, effects with bars.
+_DRAWN, _TOLD, _BARS = 4, 4, 16
 _ORIGIN = "measured"
 
 
@@ -54,15 +55,11 @@ def write_own_fit_report(found: OdeIdentification, path: str | os.PathLike[str])
 
 def _page(d: OdeDiagnosis) -> str:
     series = own_series(d)
-    sure = d.causes[:1] if d.verdict != "ambiguous" else ()
-    badges = [f"confidence {percent(c.confidence)}" for c in sure]
-    page = Document(
-        f"Diagnosis of {plain(d.model.name)}: {VERDICTS[d.verdict]}", [*badges, *_badges(d.runs)]
-    )
+    page = Document(f"Diagnosis of {plain(d.model.name)}: {VERDICTS[d.verdict]}", _badges(d.runs))
     page.paragraph(own_verdict_sentence(d), "verdict")
     add_what_now(page, d)
+    _add_floors(page, d)
     add_worst(page, series, _ORIGIN)
-    page.tiles(_tiles(d))
     _budget(page, d)
     _missed(page, d, series)
     add_evidence_of_all(page, d, _BARS)
@@ -79,7 +76,7 @@ def _page(d: OdeDiagnosis) -> str:
     page.section("Every effect that was tried: figures")
     page.table(candidate_table(d))
     page.section(f"Parameters of the {'extended' if added(d) else 'base'} model")
-    page.table(parameter_table(d.model))
+    add_parameters(page, d.model)
     for note in d.notes:
         page.paragraph(note, "note")
     page.section("Records")
@@ -91,21 +88,18 @@ def _badges(runs: Sequence[object]) -> list[str]:
     return [f"{_ORIGIN} data", f"{len(runs)} record{'s' if len(runs) > 1 else ''}"]
 
 
-def _tiles(d: OdeDiagnosis) -> list[tuple[str, str, str]]:
-    """Return the main figures: what is missed of every output, and what the causes remove."""
-    tiles = []
-    for e in d.errors[:_TILES]:
-        noise = f"noise {with_its_unit(e.noise, e.unit)}"
-        if added(d):
-            remark = f"{fall_of(e):.0f} % below the base model's {with_its_unit(e.base, e.unit)}"
-            noise = f"{remark}; {noise}"
-        error = with_its_unit(e.extended, e.unit)
-        tiles.append((f"{e.output}: held-out rms", error, noise))
-    if added(d):
-        share, low, high = d.budget.together.percents
-        said = f"of its power above the noise, held out ({low} to {high} %)"
-        tiles.append(("removed of the error", f"{share} %", said))
-    return tiles
+def _add_floors(page: Document, d: OdeDiagnosis) -> None:
+    """Add the held-out errors of every output as bars over its noise."""
+    for e in d.errors[:_DRAWN]:
+        models = [("base model", e.base, "--base")]
+        models += [("extended model", e.extended, "--extended")] if added(d) else []
+        page.bars(
+            f"{e.output}: error on held-out samples, rms",
+            [Bar(n, v, c, with_its_unit(v, e.unit))
+             for n, v, c in (*models, ("noise", e.noise, "--noise"))],
+            e.noise,
+            FLOOR,
+        )  # fmt: skip
 
 
 def _budget(page: Document, d: OdeDiagnosis) -> None:
@@ -172,7 +166,7 @@ def _fit_page(found: OdeIdentification) -> str:
     add_worst(page, series, _ORIGIN)
     page.warnings(found.warnings)
     page.section("Parameters")
-    page.table(parameter_table(found.model))
+    add_parameters(page, found.model)
     if len(found.costs) > 1:
         page.paragraph(f"Of {len(found.costs)} starts {found.agreed} led to this minimum.", "note")
     page.section(f"Record by record: {_ORIGIN} and model")

@@ -58,7 +58,10 @@
     document.head.appendChild(script);
     all(scheme.matches, false);
     scheme.addEventListener('change', function () { all(scheme.matches, false); });
-    window.addEventListener('beforeprint', function () { all(false, true); });
+    window.addEventListener('beforeprint', function () {
+      document.querySelectorAll('details').forEach(function (fold) { fold.open = true; }); // paper has no folds
+      all(false, true);
+    });
     window.addEventListener('afterprint', function () { all(scheme.matches, false); });
   }
 

@@ -3,7 +3,7 @@ psaLive.playground = function (box, told, run) {
   'use strict';
   var make = psaLive.make, values = told.parameters.map(function (p) { return p.value; });
   var how = {kind: 'triangle', low: 0, high: 1, frequency: 5, cycles: 3, samples: 2000};
-  var stack = told.stacks[0], own = null, played = null, without = {key: ''}, waiting = false, idle = 0, last = null;
+  var stack = told.stacks[0], own = null, played = null, without = {key: ''}, waiting = false, idle = 0, last = null, drawn = null;
   var gains = told.effects.map(function (e) { return told.parameters.findIndex(function (p) { return p.name === e.gain; }); });
   var shown = told.outputs.find(function (o) { return o.name === told.shown; });
   var UM = {unit: '\u00b5m', factor: 1e6};
@@ -18,10 +18,10 @@ psaLive.playground = function (box, told, run) {
   }
 
   // --- what is seen
-  var CAPTIONS = ['Voltage', 'Displacement', 'Loop: displacement over voltage', 'What the effects add', 'Current', 'Answer to a small step: gain over frequency'];
+  var CAPTIONS = ['Voltage', 'Displacement', 'Loop: displacement over voltage', 'What the effects add', 'Current', 'Gain over frequency, small steps'];
   var plots = CAPTIONS.map(function (caption) { return make('canvas', {role: 'img', 'aria-label': caption}); });
   var figures = plots.map(function (canvas, k) { return make('figure', {}, [make('figcaption', {text: CAPTIONS[k]}), canvas]); });
-  var output = make('output', {}), status = make('span', {role: 'status'});
+  var output = make('output', {}), status = make('span', {role: 'status'}), beyond = make('p', {className: 'warnings', role: 'alert', hidden: true});
   var legend = make('div', {className: 'legend'});
   [['--model', 'with the effects'], ['--measured', 'without any']].forEach(function (row) {
     var span = make('span', {text: row[1]});
@@ -32,10 +32,19 @@ psaLive.playground = function (box, told, run) {
   function scaled(y, factor) { return y.map(function (x) { return factor * x; }); }
   function span(y) { return Math.max.apply(null, y) - Math.min.apply(null, y); }
 
+  function warn(v) {
+    var largest = Math.max(Math.max.apply(null, v), -Math.min.apply(null, v));
+    beyond.hidden = !(largest > 1.001 * stack.rated);
+    beyond.textContent = beyond.hidden ? '' : 'The voltage reaches ' + +largest.toPrecision(3) + ' V; ' + stack.name + ' is rated for ' +
+      +stack.rated.toPrecision(3) + ' V. What is shown beyond that is extrapolated: a stack would saturate, depole or break down.';
+  }
+
   function redraw() {
     if (!waiting) { return; }
     waiting = false;
     var began = performance.now(), base = bare(), t = played.t, v = played.v;
+    drawn = null;
+    warn(v);
     var now = asked(values, t, v, true), key = JSON.stringify([base, stack.name]);
     if (without.key !== key || without.t !== t || without.v !== v) {
       without = {key: key, t: t, v: v, found: asked(base, t, v, true)};
@@ -45,6 +54,7 @@ psaLive.playground = function (box, told, run) {
       output.textContent = 'With these values the model cannot be run: ' + (now.reason || without.found.reason) + '.';
       return;
     }
+    drawn = now;
     var y = now.outputs[told.shown], y0 = without.found.outputs[told.shown];
     var time = scaled(t, 1e3), um = scaled(y, UM.factor), um0 = scaled(y0, UM.factor);
     var added = y.map(function (x, k) { return 1e9 * (x - y0[k]); });
@@ -125,7 +135,7 @@ psaLive.playground = function (box, told, run) {
     return node;
   }
   function take(found, what) {
-    status.textContent = found ? '' : what;
+    status.textContent = found ? found.note || '' : what;
     if (found) { own = found; play(); }
   }
   var fields = {low: number('low'), high: number('high'), frequency: number('frequency', 1e-6), cycles: number('cycles', 0.01), samples: number('samples', 10)};
@@ -183,13 +193,14 @@ psaLive.playground = function (box, told, run) {
     ['pointerup', 'pointercancel'].forEach(function (name) { plots[0].addEventListener(name, function () { from = null; }); });
   })();
 
+  // The trajectory that is drawn: another run to a tighter tolerance takes half a minute where the voltage jumps.
   function csv() {
-    var now = asked(values, played.t, played.v, false);
-    if (now.status) { return ''; }
+    redraw();
+    if (!drawn) { return ''; }
     var names = told.outputs.map(function (o) { return o.name; });
     var head = ['time [s]', 'voltage [V]'].concat(told.outputs.map(function (o) { return o.name + ' [' + o.si + ']'; })).join(',');
     var rows = Array.prototype.map.call(played.t, function (t, k) {
-      return [t, played.v[k]].concat(names.map(function (n) { return now.outputs[n][k]; })).join(',');
+      return [t, played.v[k]].concat(names.map(function (n) { return drawn.outputs[n][k]; })).join(',');
     });
     return [head].concat(rows).join('\n') + '\n';
   }
@@ -216,9 +227,11 @@ psaLive.playground = function (box, told, run) {
       psaLive.save('MODEL.json', psaLive.file(told, values, stack), 'application/json');
     })] : [], [status]))
   ];
-  bars.concat([about, make('p', {className: 'note', text: 'Draw over the voltage to change it.'}), legend,
-    make('div', {className: 'pair'}, figures.slice(0, 2)), make('div', {className: 'pair'}, figures.slice(2, 4)),
-    make('div', {className: 'pair'}, figures.slice(4)), output]).concat(nodes).forEach(function (n) { box.appendChild(n); });
+  bars.concat([about, make('p', {className: 'note', text: 'Draw over the voltage to change it.'}), beyond, legend,
+    psaLive.board([
+      make('div', {className: 'pair'}, figures.slice(0, 2)), make('div', {className: 'pair'}, figures.slice(2, 4)),
+      make('div', {className: 'pair'}, figures.slice(4)), output
+    ], plots[2], nodes)]).forEach(function (n) { box.appendChild(n); });
   setStack(0);
   told.effects.forEach(function (e, k) { // page.html#slow_creep begins with that effect
     if (decodeURIComponent(location.hash.slice(1)) !== e.name) { return; }

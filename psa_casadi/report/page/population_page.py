@@ -88,11 +88,11 @@ def _plots(page: Document, p: Population) -> None:
     shown = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
     page.paragraph(
         "Bars are 95 % intervals of each device; lines are the mean and where 95 % of the devices"
-        " lie.",
+        " lie. Devices that stand out are those of the table, with their names.",
         "note",
     )
     page.pictures(
-        [Picture(s.estimates.name, spread_plot(s, p.findings), s.estimates.meaning) for s in shown]
+        [Picture(s.estimates.name, spread_plot(p, s), s.estimates.meaning) for s in shown]
     )
 
 
@@ -105,7 +105,7 @@ def _batches(page: Document, p: Population) -> None:
         page.table(drift_table(p))
         page.pictures(
             [
-                Picture(f"{s.estimates.name} over the date", drift_plot(s, p.findings))
+                Picture(f"{s.estimates.name} over the date", drift_plot(p, s))
                 for s in p.spreads
                 if s.estimates.name in p.drifting
             ]

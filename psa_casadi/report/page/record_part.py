@@ -66,7 +66,7 @@ def add_still(page: Document, shown: Series, origin: str) -> None:
 
 
 def points_each(records: int) -> int:
-    """Return how many samples of each record may be drawn, so that the page stays below 1.5 MB."""
+    """Return how many samples of each record may be drawn, so that the page stays below 3 MB."""
     return _MOST_POINTS // min(MOST_RECORDS, max(1, records))
 
 

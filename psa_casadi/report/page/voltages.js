@@ -28,6 +28,12 @@ psaLive.voltages = {
     var rows = text.split(/[,;\n]/).map(function (part) { return part.trim().split(/\s+|:/).map(Number); })
       .filter(function (row) { return row.length === 2 && row.every(isFinite); });
     if (rows.length < 2 || rows.some(function (row, i) { return i > 0 && !(row[0] > rows[i - 1][0]); })) { return null; }
+    return psaLive.voltages.sampled(rows, samples);
+  },
+
+  // So many even samples of the straight lines between rows of [time, voltage].
+  sampled: function (rows, samples) {
+    'use strict';
     var first = rows[0][0], span = rows[rows.length - 1][0] - first, at = 0;
     var t = new Float64Array(samples), v = new Float64Array(samples);
     for (var k = 0; k < samples; k += 1) {
@@ -60,6 +66,14 @@ psaLive.voltages = {
     });
     if (rows.length < 4) { return null; }
     rows = rows.slice(0, 20000);
+    var steps = []; // exact steps know eight lengths; a jitter, or times of few digits, have more
+    rows.forEach(function (r, k) {
+      var step = k ? r[0] - rows[k - 1][0] : 0;
+      if (k && steps.length < 9 && !steps.some(function (s) { return Math.abs(step - s) <= 1e-6 * s; })) { steps.push(step); }
+    });
+    if (steps.length > 8) {
+      return Object.assign(psaLive.voltages.sampled(rows, rows.length), {note: 'Its uneven times were put on an even grid.'});
+    }
     return {
       t: Float64Array.from(rows, function (r) { return r[0] - rows[0][0]; }), v: Float64Array.from(rows, function (r) { return r[1]; })
     };

@@ -12,7 +12,7 @@ from psa_casadi.population.difference import Difference
 from psa_casadi.population.finding import NORMAL_95, Finding, Trace
 from psa_casadi.population.mixed_regression import mixed_regression
 from psa_casadi.population.parameters import display_unit
-from psa_casadi.population.population import Spread
+from psa_casadi.population.population import Population, Spread
 from psa_casadi.report.plots.theme import BOUND_COLOUR, GRID, INK, WEAK_COLOUR, Plot, styled
 from psa_casadi.report.words.phrases import handy_scale, length_scale, plain
 from psa_casadi.report.words.series import (
@@ -30,6 +30,8 @@ _COLOURS = (EXTENDED_COLOUR, BASE_COLOUR, WEAK_COLOUR, BOUND_COLOUR, MEASURED_CO
 _DASHES = ("solid", "dash", "dot", "dashdot")
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up")
 _HEIGHT = 340
+#: Devices that stand out and are named in a picture, those furthest out.
+_MOST_NAMED = 6
 
 
 def label(name: str) -> str:
@@ -139,26 +141,28 @@ def _error(t: Trace) -> FloatArray:
     return np.asarray(np.array(t.measured) - np.array(t.model))
 
 
-def spread_plot(s: Spread, findings: Sequence[Finding]) -> Plot:
+def spread_plot(p: Population, s: Spread) -> Plot:
     """A parameter over the devices in the order of its values, with intervals and the others' band.
 
-    Devices that stand out have another colour and symbol.
+    Devices that stand out, as the population has them, have another colour and symbol, and their
+    names.
     """
     order = np.argsort(s.estimates.theta)
-    return _over_devices(s, findings, np.arange(order.size), order, "devices, in order")
+    return _over_devices(p, s, np.arange(order.size), order, "devices, in order")
 
 
-def drift_plot(s: Spread, findings: Sequence[Finding]) -> Plot:
+def drift_plot(p: Population, s: Spread) -> Plot:
     """A parameter over the date of the devices."""
+    findings = p.findings
     order = np.arange(len(s.estimates.places))
     days = [d for k in s.estimates.places if (d := findings[k].day) is not None]
-    plot = _over_devices(s, findings, [d.isoformat() for d in days], order, "date", band=False)
+    plot = _over_devices(p, s, [d.isoformat() for d in days], order, "date", band=False)
     return plot.update_xaxes(type="date")
 
 
 def _over_devices(
+    p: Population,
     s: Spread,
-    findings: Sequence[Finding],
     x: Any,
     order: Any,
     title: str,
@@ -171,7 +175,13 @@ def _over_devices(
     shown = _shown(e.value, e.unit, unit)
     middle, low, high = (shown(e.theta[order] + sign * half) for sign in (0.0, -1.0, 1.0))
     plot = go.Figure()
-    far = s.far.found[order]
+    devices = [p.findings[e.places[k]].device for k in order]
+    apart = {o.device: abs(o.z) for o in p.outliers if o.parameter == e.name}
+    named = set(sorted(apart, key=apart.__getitem__, reverse=True)[:_MOST_NAMED])
+    far = np.array([d in apart for d in devices])
+    names = np.array([label(d) for d in devices], dtype=object)
+    # names lie towards the middle of the plot
+    sides = np.where(np.arange(order.size) < 0.5 * order.size, "middle right", "middle left")
     for name, which, colour, symbol in (
         ("belongs to the others", ~far, EXTENDED_COLOUR, "circle"),
         ("stands out", far, BASE_COLOUR, "diamond"),
@@ -179,13 +189,17 @@ def _over_devices(
         if not which.any():
             continue
         plot.add_scatter(
-            x=np.asarray(x)[which].tolist(), y=compact(middle[which]), mode="markers", name=name,
+            x=np.asarray(x)[which].tolist(), y=compact(middle[which]), name=name,
+            mode="markers+text" if which is far else "markers",
+            text=[f" {n} " if d in named else "" for d, n in zip(devices, names, strict=True)
+                  if (d in apart) == (which is far)],
+            textposition=sides[which].tolist(), cliponaxis=False,
             marker={"color": colour, "symbol": symbol, "size": 7},
             error_y={"type": "data", "symmetric": False, "array": compact((high - middle)[which]),
                      "arrayminus": compact((middle - low)[which]), "thickness": 1.2, "width": 0,
                      "color": colour},
-            text=[label(findings[e.places[k]].device) for k in order[which]],
-            hovertemplate="%{text}: %{y:.4g}<extra></extra>",
+            hovertext=names[which].tolist(),
+            hovertemplate="%{hovertext}: %{y:.4g}<extra></extra>",
         )  # fmt: skip
     if band:
         mean = float(c.b[0])

@@ -15,6 +15,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.files import atomic_path
 from psa_casadi.identification.identify import Identification
+from psa_casadi.report.plots.narrow_figure import narrow_figure
 from psa_casadi.report.words.phrases import in_brackets, length_scale, plain, share_text
 from psa_casadi.report.words.series import (
     EXTENDED_COLOUR,
@@ -50,15 +51,21 @@ _STILL_ROOM = {
 
 
 def save_figure(
-    diagnosis: Diagnosis, path: str | os.PathLike[str], *, origin: str = "measured"
+    diagnosis: Diagnosis,
+    path: str | os.PathLike[str],
+    *,
+    origin: str = "measured",
+    narrow: bool = False,
 ) -> None:
     """Write the picture of a diagnosis as a PNG of 1600 x 1000 points, whole or not at all.
 
     Of several records it shows the one that the base model misses most. `origin`, "measured" or
-    "synthetic", names the record's curve. Raises InputError when `path` cannot be written to.
+    "synthetic", names the record's curve. A `narrow` one has two panels and 720 x 880 points, for
+    a phone. Raises InputError when `path` cannot be written to.
     """
+    make = narrow_figure if narrow else diagnosis_figure
     with atomic_path(path) as temporary:
-        diagnosis_figure(diagnosis, origin=origin).savefig(temporary, format="png", dpi=DPI)
+        make(diagnosis, origin=origin).savefig(temporary, format="png")
 
 
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:

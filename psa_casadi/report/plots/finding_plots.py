@@ -131,14 +131,16 @@ def _correlation_text(value: float) -> str:
 def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Plot:
     """One bar for every effect that was tried; text says the share of the excess it explains.
 
-    Of many, the first and most telling ones where only so many are to be drawn.
+    Named causes come first, with their confidence. Of many, the first and most telling ones where
+    only so many are to be drawn.
     """
-    rows = d.candidates[:most][::-1]
-    causes = {c.effect for c in d.causes}
+    causes = {c.effect: c.confidence for c in d.causes}
+    order = sorted(d.candidates, key=lambda c: c.effect not in causes)  # keeps the others' order
+    rows = order[: None if most is None else max(most, len(causes))][::-1]
     # asinh shows small, large and negative evidence in one picture; the labels give the figures
     values = [float(np.arcsinh(c.evidence / 10.0)) for c in rows]
     names = [plain(c.effect).replace("independent ", "independent<br>") for c in rows]
-    colours = [bar_colour(c, causes) for c in rows]
+    colours = [bar_colour(c, set(causes)) for c in rows]
     plot = go.Figure(
         go.Bar(x=values, y=names, orientation="h", marker={"color": colours}, hoverinfo="skip")
     )
@@ -155,14 +157,17 @@ def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Plo
         title_text="evidence [ln units], compressed",
         showticklabels=False,
         ticks="",
-        range=[min([0.0, *values]) * 1.1, 1.75 * largest],
+        range=[min([0.0, *values]) * 1.1, (2.3 if causes else 1.75) * largest],
     )
     plot.update_layout(showlegend=False)
     return plot.update_yaxes(showgrid=False, ticks="", automargin=True)
 
 
 def _figure(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
-    """Return the probability of an effect; where nothing is named, the share it explains."""
+    """Return how sure a named cause is, the probability of others; else the share it explains."""
+    named = next((c for c in d.causes if c.effect == candidate.effect), None)
+    if named is not None:
+        return f"named, {probability_text(named.confidence)}"
     if d.causes:
         return probability_text(candidate.probability)
     share = candidate.explained_share

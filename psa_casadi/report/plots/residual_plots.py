@@ -32,6 +32,8 @@ from psa_casadi.report.words.series import (
 #: Points of a part of a record, measured samples shown one by one, and of a spectrum.
 _ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
 _FULL, _HALF = 500, 330
+#: A residual is far off if it is so many times wider than the one that is to be read.
+_FAR = 6.0
 
 
 def _shown(s: Series, limit: int) -> IndexArray:
@@ -175,16 +177,21 @@ def autocorrelation_plot(s: Series) -> Plot:
 
 
 def distribution_plot(s: Series) -> Plot:
-    """Share of samples over the size of every curve's residual, beside a normal distribution."""
+    """Share of samples over the size of every curve's residual, beside a normal distribution.
+
+    Where the others are far off, the axis is that of the last one; their names say how much of
+    them lies outside.
+    """
     plot, small = go.Figure(), s.residual_scale
     residuals = [s.residual(c) for c in s.curves]
-    low = min(float(np.nanmin(r)) for r in residuals)
-    high = max(float(np.nanmax(r)) for r in residuals)
+    low, high = _readable(residuals)
     for curve, residual in zip(s.curves, residuals, strict=True):
         d = distribution(residual, low, high)
+        beyond = 100.0 - float(np.sum(d.shares))
+        said = f" ({beyond:.0f} % outside)" if beyond >= 0.5 else ""
         plot.add_scatter(
             x=compact(small.factor * d.centres), y=compact(d.shares), mode="lines",
-            name=curve.label, fill="tozeroy" if curve is s.curves[-1] else "none",
+            name=f"{curve.label}{said}", fill="tozeroy" if curve is s.curves[-1] else "none",
             line={"color": curve.colour, "width": 1.4, "shape": "hvh"},
         )  # fmt: skip
     mean, spread = float(np.nanmean(residuals[-1])), float(np.nanstd(residuals[-1]))
@@ -196,6 +203,15 @@ def distribution_plot(s: Series) -> Plot:
             name="normal", line={"color": INK, "dash": "dash", "width": 1.4},
         )  # fmt: skip
     return _labelled(plot, in_brackets("residual", small.unit), "samples in a bin [%]")
+
+
+def _readable(residuals: list[FloatArray]) -> tuple[float, float]:
+    """Return the ends of an axis on which the last residual can be read: all, unless far wider."""
+    low, high = (np.array([f(r) for r in residuals]) for f in (np.nanmin, np.nanmax))
+    span = float(high[-1] - low[-1])
+    if 0.0 < span * _FAR < float(high.max() - low.min()):
+        return float(low[-1] - 0.5 * span), float(high[-1] + 0.5 * span)
+    return float(low.min()), float(high.max())
 
 
 def _labelled(plot: Plot, x: str, y: str) -> Plot:

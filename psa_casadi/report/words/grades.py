@@ -1,9 +1,12 @@
 """How well the records determine each parameter, in one word each."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from psa_casadi.identification.certainty.determinacy import DETERMINED_WIDTH
 from psa_casadi.identification.identify import Identification
+from psa_casadi.model.compose import Model
 
 Degree = Literal["determined", "weak", "undetermined", "on its bound", "fixed"]
 DEGREES: tuple[Degree, ...] = get_args(Degree)
@@ -12,6 +15,7 @@ DEGREES: tuple[Degree, ...] = get_args(Degree)
 WEAK_ERROR = 0.1
 #: Two parameters whose estimates correlate by more than this are known only together.
 STRONG_CORRELATION = 0.95
+_NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,27 @@ def grade(found: Identification, name: str) -> Grade:
     elif name in known.undetermined:
         degree = "undetermined"
     return Grade(name, error, degree, by_change=not parameter.log)
+
+
+def determined(model: Model, found: Identification | None = None) -> frozenset[str]:
+    """Return the parameters that the records determine, if only weakly.
+
+    Without the identification that found them they are those whose 95 % interval is that of a
+    standard error below `DETERMINED_WIDTH`.
+    """
+    if found is not None:
+        known = {g.name for g in grades(found) if g.degree in ("determined", "weak")}
+        return frozenset(known | set(found.read_off))
+    return frozenset(n for n in model.provenance.intervals if _is_narrow(model, n))
+
+
+def _is_narrow(model: Model, name: str) -> bool:
+    interval, parameter = model.provenance.intervals[name], model.parameter(name)
+    if parameter.log:
+        width = math.log(interval.high / interval.low) if interval.low > 0.0 else math.inf
+    else:
+        width = (interval.high - interval.low) / (parameter.typical(model.values) or math.inf)
+    return width <= 2.0 * _NORMAL_95 * DETERMINED_WIDTH
 
 
 def named(graded: tuple[Grade, ...], degree: Degree) -> list[str]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from psa_casadi.any_model.identify import OdeIdentification
-from psa_casadi.any_model.result import OdeDiagnosis, OutputError
+from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
@@ -51,25 +51,7 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
             f" {words}{_base_errors(d)}."
         )
     named = [named_cause(c, c.port) for c in d.causes]
-    return naming_sentence(d, named, own_gain(d), percent(within(d.explained_share)))
-
-
-def own_gain(d: OdeDiagnosis) -> str:
-    """Say how far the held-out error of every output falls."""
-    falls = [fall_of(e) for e in d.errors]
-    if len(falls) > _NAMED:
-        low, high = min(falls), max(falls)
-        return f"the held-out errors of {len(falls)} outputs fall by {low:.0f} to {high:.0f} %"
-    if len(falls) == 1:
-        return f"the held-out error falls by {falls[0]:.0f} %"
-    (first, own), *others = zip(d.errors, falls, strict=True)
-    each = [f"that of {e.output} by {f:.0f} %" for e, f in others]
-    return listing([f"the held-out error of {first.output} falls by {own:.0f} %", *each])
-
-
-def fall_of(e: OutputError) -> float:
-    """Return by how much an output's held-out error falls [%]."""
-    return 100.0 * (1.0 - e.extended / e.base) if e.base > 0 else 0.0
+    return naming_sentence(d, named)
 
 
 def _base_errors(d: OdeDiagnosis) -> str:

@@ -147,6 +147,20 @@ def probability_text(probability: float) -> str:
     return percent(probability) if probability < 0.995 else "> 99 %"
 
 
+#: Words for a probability from so much on (IPCC, Mastrandrea et al. 2010, table 1).
+_LIKELIHOOD = (
+    (0.99, "virtually certain"), (0.95, "extremely likely"), (0.9, "very likely"),
+    (0.66, "likely"), (0.51, "more likely than not"), (0.33, "about as likely as not"),
+)  # fmt: skip
+
+
+def confidence_text(confidence: float) -> str:
+    """Return how sure a cause is, as a number and in words."""
+    shown = round(confidence, 2)
+    words = next((w for least, w in _LIKELIHOOD if shown >= least), "unlikely")
+    return f"confidence {percent(confidence)}: {words}"
+
+
 def share_text(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
     """Return the share of the excess that an effect explains alone, or that it was only screened.
 

@@ -118,7 +118,7 @@ def candidate_table(d: "Diagnosis | OdeDiagnosis") -> Table:
     head = ["effect", "evidence over the base [ln]", "explains of the excess, alone"]
     rows = [[plain(c.effect), number(round(c.evidence, 6)), share_text(c, d)] for c in d.candidates]
     if added(d):
-        head.append("probability")
+        head.append("probability" if len(d.causes) < 2 else "probability as the first cause")
         for row, c in zip(rows, d.candidates, strict=True):
             row.append(probability_text(c.probability))
     return _table(head, rows)

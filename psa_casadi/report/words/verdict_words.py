@@ -7,6 +7,7 @@ from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words.phrases import (
+    confidence_text,
     either,
     interval_text,
     listing,
@@ -87,33 +88,38 @@ def verdict_sentence(d: Diagnosis) -> str:
             "Something is missing, and no effect in the table explains it: no cause is named; "
             f"{_kept(d)}{_unnamed(d)}{error}."
         )
-    share = None if d.budget is None else f"{d.budget.together.percents[0]} %"
     named = [named_cause(c, c.belongs_to) for c in d.causes]
-    return naming_sentence(d, named, gain_sentence(d), share)
+    return naming_sentence(d, named)
 
 
-def naming_sentence(
-    d: "Diagnosis | OdeDiagnosis", causes: Sequence[str], gain: str, share: str | None
-) -> str:
+def naming_sentence(d: "Diagnosis | OdeDiagnosis", causes: Sequence[str]) -> str:
     """Say the verdict of a diagnosis that names: its `causes` in words, and what they remove.
 
-    `gain` is what they do to the error, `share` what they remove of its power above the noise.
+    Without a budget it says how far the error falls, noise included.
     """
+    gain = gain_sentence(d) if isinstance(d, Diagnosis) and d.budget is None else ""
+    removal = "" if d.budget is None else _removal(d, d.budget.together)
     if d.verdict == "ambiguous":
         first = d.causes[0]
         rivals = either((first.effect, *first.cannot_be_told_from))
         together = listing([plain(c.effect) for c in d.causes])
-        return (
-            f"Something is missing, and these data do not decide whether it is {rivals}; with"
-            f" {together}, {gain}."
-        )
+        gone = f"with {together}, {gain}" if gain else f"{together} {removal}"
+        return f"Something is missing, and these data do not decide whether it is {rivals}; {gone}."
     are = f"{'cause is' if len(causes) == 1 else 'causes are'} {listing(causes)}"
+    subject = "it" if len(causes) == 1 else "together they"
+    gone = gain or f"{subject} {removal}"
     if d.verdict == "partly_explained":
-        # where something remains, what is removed is never all of it
-        most = "nearly all" if share is not None and share.startswith("100") else share
-        of = "" if share is None else f", {most} of its power above the noise"
-        return f"The closest known {are}: {gain}{of}; more than noise remains."
-    return f"The {are}: {gain}."
+        return f"The closest known {are}: {gone}; more than noise remains."
+    return f"The {are}: {gone}."
+
+
+def _removal(d: "Diagnosis | OdeDiagnosis", together: Share) -> str:
+    """Say what the causes take off the base model's error above the noise, which is the floor."""
+    share = f"{together.percents[0]} %"
+    if d.verdict == "partly_explained" and share.startswith("100"):
+        share = "nearly all"  # something remains
+    verb = "removes" if len(d.causes) == 1 else "remove"
+    return f"{verb} {share} of the base model's held-out error above the noise (in power)"
 
 
 def within(share: float) -> float:
@@ -145,7 +151,7 @@ def _unnamed(d: Diagnosis) -> str:
 
 def named_cause(cause: "Cause | PortCause", where: str) -> str:
     """Name a cause with its place, how sure it is, and what it cannot be told from."""
-    sure = f"{where}, confidence {percent(cause.confidence)}"
+    sure = f"{where}, {confidence_text(cause.confidence)}"
     if cause.cannot_be_told_from:
         sure += f"; or {either(cause.cannot_be_told_from)}"
     return f"{plain(cause.effect)} ({sure})"
