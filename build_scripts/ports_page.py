@@ -44,6 +44,7 @@ POSITIVE = {
     "prestress_force": _RESISTS,
     "reaction_force": _RESISTS,
     "dissipated_energy": "never negative",
+    "wanted": "the stack is to grow",
     "stage_position": "the stage has moved outward",
     "stack_displacement": _LONGER,
     "reference": "the stage is to move outward",
