@@ -199,7 +199,8 @@ def _tried(table: Table, request: Request, segment: str) -> tuple[Outcome, Choic
             outcome.samples = _converted(table, choice.fields, request, segment, problems, notes)
         except _Segments as several:
             outcome.tables = several.keys
-            problems.add(str(several))
+            if not told:  # what is open is asked first: no table alone would be read
+                problems.add(str(several))
         except _NoTime as error:
             told.append(str(error))
     return outcome, choice, told
