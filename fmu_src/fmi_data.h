@@ -63,14 +63,14 @@ void psa_fixed_step(double t, double *x, const double *u, const double *change);
 #endif
 
 /* Derivative of (x', y, z) along a direction (dt, dx, du, dp) at the point (t, x, u, p): exact, by
-   automatic differentiation. A result that is NULL is left out. */
+   automatic differentiation. A result that is NULL is left out; w are PSA_DERIVATIVES_SZ_W numbers to work in. */
 int psa_model_directional(double t, const double *x, const double *u, const double *p, double dt,
                           const double *dx, const double *du, const double *dp, double *dxdot,
-                          double *dy, double *dz);
+                          double *dy, double *dz, double *w);
 /* Gradient of wxdot . x' + wy . y + wz . z with respect to (t, x, u, p): the transposed of the same
    matrix, by automatic differentiation backwards. */
 int psa_model_adjoint(double t, const double *x, const double *u, const double *p,
                       const double *wxdot, const double *wy, const double *wz, double *dt,
-                      double *dx, double *du, double *dp);
+                      double *dx, double *du, double *dp, double *w);
 
 #endif

@@ -114,9 +114,34 @@ typedef void psa_reporter(void *owner, psa_result severity, const char *sentence
    communication step earlier, at the time written to `end`. */
 typedef int psa_update(void *owner, double time, int more, double *end);
 
+#define PSA_DIRECTIONS 8 /* at most so many of a step's sensitivities at once */
+
+/* One number for each variable that can be known: a direction, or a gradient. */
+typedef struct {
+    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1], option; /* the option: of no effect */
+} psa_knowns;
+
+/* One number for each variable that can be unknown: a change, or a weight. */
+typedef struct {
+    double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1];
+    double x[PSA_NX + 1]; /* states at the end of the last step */
+    int through_step;     /* 1: one of them is asked for, 2: they are known, too */
+} psa_unknowns;
+
+/* Numbers of one call for derivatives, or for a settled start; nothing in here is needed after it. */
+typedef struct {
+    double w[PSA_DERIVATIVES_SZ_W];
+    psa_knowns in, along[PSA_DIRECTIONS];
+    psa_unknowns out;
+    psa_solver solver;
+    double moved[PSA_NX * PSA_DIRECTIONS], slope[PSA_NX * PSA_DIRECTIONS], base[PSA_NX * PSA_DIRECTIONS];
+    double stage[PSA_STAGES * PSA_NX * PSA_DIRECTIONS], f[PSA_NX + 1];
+} psa_calculus;
+
 typedef struct {
     psa_state state;
     psa_work work;
+    psa_calculus calculus;
     double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1]; /* valid while `fresh` */
     int fresh;
     psa_update *update; /* during a communication step; may be NULL */
@@ -226,13 +251,6 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
                                   double *sensitivity);
 
 /* step_derivatives.c */
-#define PSA_DIRECTIONS 8 /* at most so many at once */
-
-/* One number for each variable that can be known: a direction, or a gradient. */
-typedef struct {
-    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1], option; /* the option: of no effect */
-} psa_knowns;
-
 /* Change of the states at the end of the last communication step along each direction: moved is
    [PSA_NX][count]. */
 psa_result psa_step_sensitivity(psa_instance *instance, int count, const psa_knowns *directions,

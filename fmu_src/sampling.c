@@ -41,7 +41,7 @@ psa_result psa_sample_now(psa_instance *instance) {
     if (PSA_NS == 0 || !state->at_instant) return PSA_FINE;
     memcpy(state->p + PSA_NP, state->before, sizeof(double) * PSA_NS);
     psa_input_at(&state->input, state->solver.since, u);
-    if (psa_take_sample(state->solver.t, state->solver.x, u, state->p))
+    if (psa_take_sample(state->solver.t, state->solver.x, u, state->p, instance->work.w))
         return psa_say(instance, PSA_DISCARD, "The sampled states cannot be evaluated at t = %.9g s.",
                        state->solver.t);
     return PSA_FINE;

@@ -96,25 +96,29 @@ psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, void
 
 psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t size, void **snapshot) {
     psa_stamp found;
-    psa_state state;
+    void *read = NULL;
     if (psa_lacks(instance, 1, bytes, snapshot)) return PSA_ERROR;
     if (size != psa_snapshot_size())
         return psa_say(instance, PSA_ERROR, "These %lu bytes are no snapshot of this model, which has %lu.",
                        (unsigned long)size, (unsigned long)psa_snapshot_size());
     memcpy(&found, bytes, sizeof found);
-    memcpy(&state, (const char *)bytes + sizeof found, sizeof state);
-    const psa_stamp expected = stamp_of(&state);
+    const psa_stamp expected = stamp_of((const char *)bytes + sizeof found);
     if (memcmp(found.magic, expected.magic, sizeof found.magic) || found.version != expected.version ||
         found.size != expected.size || found.model != expected.model)
         return psa_say(instance, PSA_ERROR,
                        "The snapshot was written by another model, version or kind of machine.");
     if (found.checksum != expected.checksum)
         return psa_say(instance, PSA_ERROR, "The snapshot is damaged: its checksum does not match.");
-    const char *const fault = psa_state_fault(&state);
+    psa_result result = provide(instance, &read);
+    if (result != PSA_FINE) return result;
+    psa_state *const state = &((psa_snapshot *)read)->state;
+    memcpy(state, (const char *)bytes + sizeof found, sizeof *state);
+    const char *const fault = psa_state_fault(state);
     if (fault)
-        return psa_say(instance, PSA_ERROR,
-                       "The snapshot was altered: %s cannot be what this model wrote.", fault);
-    const psa_result result = provide(instance, snapshot);
-    if (result == PSA_FINE) ((psa_snapshot *)*snapshot)->state = state;
+        result = psa_say(instance, PSA_ERROR,
+                         "The snapshot was altered: %s cannot be what this model wrote.", fault);
+    else if ((result = provide(instance, snapshot)) == PSA_FINE)
+        ((psa_snapshot *)*snapshot)->state = *state;
+    psa_snapshot_release(instance, &read);
     return result;
 }

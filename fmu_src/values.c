@@ -5,16 +5,16 @@
 
 psa_result psa_refresh(psa_instance *instance) {
     const psa_state *const state = &instance->state;
-    double u[PSA_NU + 1];
+    double u[PSA_NU + 1], *const w = instance->work.w;
     if (instance->fresh) return PSA_FINE;
     psa_result result = psa_begin(instance);
     if (result == PSA_FINE) result = psa_sample_now(instance);
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.since, u);
     psa_watch_range(instance, u, NULL);
-    if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
-        psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y) ||
-        psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z))
+    if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot, w) ||
+        psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y, w) ||
+        psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z, w))
         return psa_say(instance, PSA_DISCARD, "The model cannot be evaluated at t = %.9g s.",
                        state->solver.t);
     for (int i = 0; i < PSA_NZ; ++i)
@@ -253,7 +253,7 @@ psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_
 psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size_t count,
                                 const int *order, double *rate) {
     const psa_state *const state = &instance->state;
-    const double none[PSA_HELD + 1] = {0.0};
+    static const double none[PSA_HELD + 1] = {0.0};
     double dy[PSA_NY + 1], u[PSA_NU + 1];
     if (psa_lacks(instance, count, vr, rate) || psa_lacks(instance, count, order, order))
         return PSA_ERROR;
@@ -261,7 +261,7 @@ psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, 1.0, instance->xdot,
-                              state->input.rate, none, NULL, dy, NULL))
+                              state->input.rate, none, NULL, dy, NULL, instance->calculus.w))
         return psa_say(instance, PSA_DISCARD, "The outputs cannot be differentiated here.");
     for (size_t i = 0; i < count; ++i) {
         const psa_variable *const v = psa_variable_of(instance, vr[i]);
