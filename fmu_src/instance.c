@@ -108,7 +108,7 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     state->phase = PSA_INSTANTIATED;
     state->interface = interface;
     instance->start_time = 0.0;
-    instance->outside_told = 0;
+    instance->outside_told = instance->limit_told = 0;
     psa_schedule(instance);
     instance->fresh = 0;
 }
@@ -240,15 +240,34 @@ static void remember(psa_state *state, psa_end end) {
 }
 
 #ifdef PSA_FIXED_STEP
+/* Keep the voltage, over a step from u along its change, where the step is as good as it is said to be. */
+static void limit_voltage(psa_instance *instance, double since, double *u, double *change) {
+#ifdef PSA_FIXED_LIMIT
+    const double wanted = u[PSA_VOLTAGE], end = wanted + change[PSA_VOLTAGE], most = PSA_FIXED_LIMIT;
+    if (fabs(wanted) <= most && fabs(end) <= most) return;
+    u[PSA_VOLTAGE] = fmin(fmax(wanted, -most), most);
+    change[PSA_VOLTAGE] = fmin(fmax(end, -most), most) - u[PSA_VOLTAGE];
+    if (instance->limit_told) return;
+    instance->limit_told = 1;
+    psa_say(instance, PSA_WARNING,
+            "The voltage of %.6g V at t = %.9g s is beyond %.6g V, up to which this fixed step is good; it is"
+            " limited to that. This is said once.",
+            fabs(end) > most ? end : wanted, instance->state.solver.origin + since, most);
+#else
+    (void)instance, (void)since, (void)u, (void)change;
+#endif
+}
+
 /* Steps of fixed length to the goal of the communication step, which is a multiple of them. */
 static psa_status run_fixed(psa_instance *instance) {
     psa_state *const state = &instance->state;
     psa_solver *const solver = &state->solver;
     const double count = round(instance->goal.since / PSA_FIXED_STEP);
     double u[PSA_NU + 1], change[PSA_NU + 1];
-    for (int i = 0; i < PSA_NU; ++i) change[i] = state->input.rate[i] * PSA_FIXED_STEP;
     for (double k = 0.0; k < count; k += 1.0) {
         psa_input_at(&state->input, k * PSA_FIXED_STEP, u);
+        for (int i = 0; i < PSA_NU; ++i) change[i] = state->input.rate[i] * PSA_FIXED_STEP;
+        limit_voltage(instance, k * PSA_FIXED_STEP, u, change);
         psa_fixed_step(solver->origin + k * PSA_FIXED_STEP, solver->x, u, change);
         solver->steps++;
     }

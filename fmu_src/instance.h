@@ -148,6 +148,7 @@ typedef struct {
     psa_end goal;       /* end of that step */
     double start_time;
     int outside_told;     /* that the instance has left what the records have shown */
+    int limit_told;       /* that the voltage is limited, with a fixed step */
     int debug;            /* what only debug logging shows is reported too */
     psa_reporter *report; /* may be NULL */
     void *owner;

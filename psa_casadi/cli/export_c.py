@@ -81,6 +81,7 @@ def c(
     """Write a model as C99 for a controller: a step of fixed length and constant cost."""
     from psa_casadi.cli.inputs import Given, step_seconds
     from psa_casadi.export.fixed_step.export import export_c
+    from psa_casadi.export.fixed_step.plan import limit_words
 
     given = Given(effects)
     seconds = given.attempt(lambda: step_seconds(step))
@@ -101,6 +102,7 @@ def c(
     show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
     show(step_words(seconds, found.substeps, precision.value), quiet)
     show_table(error_table({e.voltage: e.error for e in found.errors}), quiet)
+    show(limit_words(found.limit), quiet)
     tell_written(found.header, found.source, quiet=quiet)
 
 

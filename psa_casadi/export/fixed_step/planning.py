@@ -1,7 +1,7 @@
 """Plans a model's fixed step: whether it fits, in how many substeps, how far it errs."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
 from psa_casadi.export.fixed_step.header import header_code
 from psa_casadi.export.fixed_step.plan import CodePlan, check_names, timed
-from psa_casadi.export.fixed_step.probe import VoltageError, errors
+from psa_casadi.export.fixed_step.probe import VoltageError, errors, reach
 from psa_casadi.export.fixed_step.source import source_code
 from psa_casadi.export.fixed_step.step import step_expression
 from psa_casadi.model.compose import Model
@@ -74,7 +74,15 @@ def fixed_step(
             f" {100 * best.worst.error:.3g} % of its range on {best.worst.voltage}; the step is too"
             " long for this model: take a shorter one, or more --substeps."
         )
-    return best
+    return _limited(best)
+
+
+def _limited(found: FixedStep) -> FixedStep:
+    """Return a step whose voltage is limited to where it is as good as on the reference ones."""
+    limit = reach(found.plan, found.texts, max(GOOD, found.worst.error))
+    plan = replace(found.plan, limit=limit)
+    texts = (header_code(plan, found.errors), source_code(plan))
+    return FixedStep(plan, dict(zip(found.texts, texts, strict=True)), found.errors)
 
 
 def _check(name: str, step: float, precision: str, hold: str, substeps: int | None) -> None:
