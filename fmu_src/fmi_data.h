@@ -40,7 +40,8 @@ extern const psa_variable psa_variables[PSA_VARIABLES]; /* indexed by value refe
 extern const double psa_start_states[PSA_NX + 1];
 extern const double psa_start_inputs[PSA_NU + 1];
 extern const double psa_start_parameters[PSA_HELD + 1]; /* behind them the sampled states */
-extern const double psa_state_nominals[PSA_NX + 1];
+extern const double psa_state_nominals[PSA_NX + 1]; /* for the solver in here */
+extern const double psa_told_nominals[PSA_NX + 1];  /* for those of importers, as described */
 /* What a settled start needs: whether a state remembers what came before, and with what rest; whether a
    parameter is the gain of an effect. */
 enum { PSA_MEMORY_NONE, PSA_MEMORY_SETTLES, PSA_MEMORY_STAYS };

@@ -6,13 +6,14 @@
 #include "instants.h"
 
 #define DEFAULT_TOLERANCE 1e-6
+#define DESCRIBED_TOLERANCE 1e-5 /* of the DefaultExperiment; importers that integrate take it and do not tell */
 #define LOOSEST_TOLERANCE 1e-2
 /* The solver bounds the error of one step. What an importer means is the error of the trajectory, which
    is that of many steps: each gets this share. With it, cutting the time axis differently moved no output
    of the named stacks by more than four tolerances of its nominal; with three times as much, by 21. */
 #define STEP_SHARE 0.003
-/* Margin of the event indicators in tolerances. */
-#define EVENT_MARGIN 3.0
+/* Margin of the event indicators in tolerances: a solver that bounds the mean over the states errs by more in one. */
+#define EVENT_MARGIN 5.0
 #define TIGHTEST_STEP_TOLERANCE 1e-11
 
 #define BETWEEN \
@@ -104,7 +105,8 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     state->start_voltage = psa_start_inputs[PSA_VOLTAGE];
 #endif
     for (int i = 0; i < PSA_NZ; ++i) state->facing[i] = 1.0;
-    state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
+    state->event_margin =
+        EVENT_MARGIN * (interface == PSA_MODEL_EXCHANGE ? DESCRIBED_TOLERANCE : DEFAULT_TOLERANCE);
     state->phase = PSA_INSTANTIATED;
     state->interface = interface;
     instance->start_time = 0.0;
@@ -130,7 +132,7 @@ psa_result psa_setup(psa_instance *instance, int tolerance_defined, double toler
         state->event_margin = EVENT_MARGIN * fmin(tolerance, LOOSEST_TOLERANCE);
     }
     psa_solver_move(&state->solver, start);
-    instance->start_time = start;
+    instance->start_time = state->given_at = start;
     state->input.begin = 0.0;
     state->stop_defined = stop_defined;
     state->stop_time = stop_defined ? stop : 0.0;

@@ -64,6 +64,9 @@ typedef enum {
     PSA_STEP_SAMPLED = 4 /* a sample instant fell into it */
 } psa_step_kind;
 
+/* What a model exchange was asked for at the time at which its inputs were given last. */
+typedef enum { PSA_ASKED_NOTHING, PSA_ASKED_INDICATORS, PSA_ASKED_RATES } psa_asked;
+
 typedef struct {
     psa_solver solver;
     psa_input input;
@@ -81,11 +84,14 @@ typedef struct {
     psa_last_step last;
     int64_t rate_given[PSA_NU + 1]; /* the importer gave this input's rate for the next step */
     /* The option input_line: this share of the slope between the last two values that an input was
-       given goes on over a step (0: inputs are held). A step does not change what was given. */
+       given goes on over a step (0: inputs are held). A step does not change what was given. In model
+       exchange the last two are those that were set at different times; see follow_line. */
     double line;
     double given[PSA_NU + 1];   /* last */
-    double earlier[PSA_NU + 1]; /* that the last step started with */
-    double stride;              /* length of that step; 0: there is none, or an event came after it */
+    double earlier[PSA_NU + 1]; /* that the last step started with; in model exchange the ones before */
+    double stride;              /* time between both; 0: there are none, or an event came after them */
+    double given_at;            /* in model exchange: the time of the last */
+    int64_t asked;              /* psa_asked */
     /* The parameter start_voltage; what was set by itself before the first step, and so does not follow
        it; whether the states of now are older than what they follow from. */
     double start_voltage;

@@ -68,6 +68,7 @@ psa_result psa_sample_within(psa_instance *instance) {
 void psa_enter_event(psa_instance *instance) {
     instance->state.phase = PSA_EVENT;
     instance->state.stride = 0.0; /* no line through values before and after a jump */
+    instance->state.given_at = instance->state.solver.t;
     if (instance->state.interface == PSA_MODEL_EXCHANGE) psa_arrive(instance);
 }
 

@@ -8,12 +8,12 @@
     ((14 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_HELD + 1)) /* solver, input, parameters */
 typedef char psa_state_has_no_gaps
     [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + (PSA_NS + 1) + 8 +
-                                2 + 2 * (PSA_NU + 1) + 3 + (PSA_NX + 1))
+                                2 + 2 * (PSA_NU + 1) + 5 + (PSA_NX + 1))
          ? 1
          : -1];
 
 /* Raise it whenever psa_state or psa_solver changes its meaning. */
-#define SNAPSHOT_VERSION 6u
+#define SNAPSHOT_VERSION 7u
 
 /* In front of the bytes of a psa_state: who wrote them, and whether they arrived whole. A machine of
    another byte order or struct layout fails the comparison of version or size. */

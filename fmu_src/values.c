@@ -113,9 +113,30 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
     return PSA_FINE;
 }
 
+/* In model exchange: inputs are given at a new time, and the values before begin their line. */
+static void begin_line(psa_state *state) {
+    if (state->interface != PSA_MODEL_EXCHANGE || state->solver.t == state->given_at) return;
+    state->stride = state->solver.t - state->given_at;
+    state->given_at = state->solver.t;
+    state->asked = PSA_ASKED_NOTHING;
+    memcpy(state->earlier, state->given, sizeof state->earlier);
+    memset(state->input.rate, 0, sizeof state->input.rate);
+}
+
+/* In model exchange inputs hold between the times at which they are given. An importer that gives them at
+   the end of each step, where it asks for the event indicators, but not where it asks for derivatives (fmpy
+   with CVode) means them to move: to its solver the steps would be jumps. They follow the line then. */
+static void follow_line(psa_state *state) {
+    const int moves = state->asked == PSA_ASKED_INDICATORS && state->stride != 0.0;
+    state->input.begin = state->given_at - state->solver.t;
+    for (int i = 0; i < PSA_NU; ++i)
+        state->input.rate[i] = moves ? (state->given[i] - state->earlier[i]) / state->stride : 0.0;
+}
+
 static void set_one(psa_instance *instance, const psa_variable *v, double value) {
     psa_state *const state = &instance->state;
     if (v->kind == PSA_INPUT) {
+        begin_line(state);
         state->input.value[v->index] = state->given[v->index] = value;
         if (!state->rate_given[v->index]) state->input.rate[v->index] = 0.0;
         return;
@@ -163,7 +184,7 @@ psa_result psa_set_time(psa_instance *instance, double time) {
     if (!isfinite(time)) return psa_say(instance, PSA_ERROR, "The time is not finite.");
     if (psa_beyond_counting(instance, time, instance->state.p[PSA_PERIOD])) return PSA_ERROR;
     psa_solver_move(&instance->state.solver, time);
-    instance->state.input.begin = 0.0;
+    follow_line(&instance->state);
     instance->fresh = 0;
     return PSA_FINE;
 }
@@ -187,13 +208,15 @@ psa_result psa_get_states(psa_instance *instance, double *x, size_t count) {
 
 psa_result psa_get_derivatives(psa_instance *instance, double *xdot, size_t count) {
     if (mismatch(instance, xdot, count)) return PSA_ERROR;
+    psa_state *const state = &instance->state;
     const psa_result result = psa_refresh(instance);
     if (result != PSA_FINE) return result;
+    if (state->solver.t == state->given_at) state->asked = PSA_ASKED_RATES;
     for (int i = 0; i < PSA_STATES; ++i) {
         xdot[i] = instance->xdot[i];
         if (!isfinite(xdot[i]))
             return psa_say(instance, PSA_DISCARD, "The derivative of '%s' is not finite at t = %.9g s.",
-                           psa_variables[PSA_FIRST_STATE + i].name, instance->state.solver.t);
+                           psa_variables[PSA_FIRST_STATE + i].name, state->solver.t);
     }
     return PSA_FINE;
 }
@@ -203,7 +226,10 @@ psa_result psa_get_indicators(psa_instance *instance, double *z, size_t count) {
         return psa_say(instance, PSA_ERROR, "The model has %d event indicators; a vector of %lu was passed.",
                        PSA_NZ, (unsigned long)count);
     if (psa_lacks(instance, count, z, z)) return PSA_ERROR;
+    psa_state *const state = &instance->state;
     const psa_result result = psa_refresh(instance);
+    if (state->solver.t == state->given_at && state->asked == PSA_ASKED_NOTHING)
+        state->asked = PSA_ASKED_INDICATORS;
     if (result == PSA_FINE) memcpy(z, instance->z, sizeof(double) * PSA_NZ);
     return result;
 }
@@ -222,7 +248,7 @@ psa_result psa_update_events(psa_instance *instance) {
 
 psa_result psa_get_nominals(psa_instance *instance, double *nominal, size_t count) {
     if (mismatch(instance, nominal, count)) return PSA_ERROR;
-    if (count > 0) memcpy(nominal, psa_state_nominals, sizeof(double) * count);
+    if (count > 0) memcpy(nominal, psa_told_nominals, sizeof(double) * count);
     return PSA_FINE;
 }
 

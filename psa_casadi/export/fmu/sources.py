@@ -176,6 +176,7 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         return [v.start or 0.0 for v in table if v.kind == kind]
 
     nominals = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
+    sizes = [abs(q) for q in model.state_nominals()]
     scales = switch_scales(model, nominals)
     held = [*starts("parameter"), *starts("sampled")]
     lines = [
@@ -191,7 +192,8 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         _vector("psa_start_states", "PSA_NX", starts("state")),
         _vector("psa_start_inputs", "PSA_NU", starts("input")),
         _vector("psa_start_parameters", "PSA_HELD", held),
-        _vector("psa_state_nominals", "PSA_NX", nominals or [1.0]),
+        _vector("psa_state_nominals", "PSA_NX", sizes or [1.0]),
+        _vector("psa_told_nominals", "PSA_NX", nominals or [1.0]),
         *_settling(model),
         _vector("psa_switch_scales", "PSA_NZ", scales),
         *_seen(model),
