@@ -1,6 +1,8 @@
+#include <math.h>
 #include <string.h>
 
 #include "instance.h"
+#include "linear.h"
 
 /* Where a variable stands among the knowns, or NULL and a report. */
 static double *known_place(psa_instance *instance, unsigned vr, psa_knowns *in) {
@@ -13,10 +15,8 @@ static double *known_place(psa_instance *instance, unsigned vr, psa_knowns *in) 
     case PSA_PARAMETER: return in->p + v->index;
     case PSA_SAMPLED: return in->p + PSA_NP + v->index;
     case PSA_OPTION:
-        if (v->index != PSA_START_VOLTAGE || instance->state.phase != PSA_INITIALIZATION)
-            return &in->option;
-        psa_say(instance, PSA_ERROR, "The derivative of a settled start by '%s' is not known.", v->name);
-        return NULL;
+        if (v->index == PSA_START_VOLTAGE && instance->state.phase == PSA_INITIALIZATION) return &in->start;
+        return &in->option;
     default:
         psa_say(instance, PSA_ERROR, "'%s' is calculated and cannot be varied.", v->name);
         return NULL;
@@ -49,7 +49,7 @@ psa_result psa_directional_derivative(psa_instance *instance, const unsigned *un
     const psa_state *const state = &instance->state;
     psa_knowns *const in = &instance->calculus.in;
     psa_unknowns *const out = &instance->calculus.out;
-    double u[PSA_NU + 1];
+    double *const slope = instance->calculus.slope, u[PSA_NU + 1], slope_u[PSA_NU + 1] = {0.0};
     memset(in, 0, sizeof *in);
     memset(out, 0, sizeof *out);
     if (psa_lacks(instance, unknowns, unknown, sensitivity) || psa_lacks(instance, knowns, known, seed))
@@ -61,7 +61,12 @@ psa_result psa_directional_derivative(psa_instance *instance, const unsigned *un
     }
     psa_result ready = psa_begin(instance);
     if (ready == PSA_FINE) ready = psa_sample_now(instance);
+    if (ready == PSA_FINE && in->start != 0.0) ready = psa_start_slope(instance, slope, slope_u);
     if (ready != PSA_FINE) return ready;
+    if (in->start != 0.0) {
+        psa_axpy(PSA_NX, in->start, slope, in->x);
+        psa_axpy(PSA_NU, in->start, slope_u, in->u);
+    }
     psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, in->t, in->x, in->u, in->p,
                               out->xdot, out->y, out->z, instance->calculus.w))
@@ -104,7 +109,7 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
     const psa_state *const state = &instance->state;
     psa_knowns *const in = &instance->calculus.in;
     psa_unknowns *const out = &instance->calculus.out;
-    double u[PSA_NU + 1];
+    double *const slope = instance->calculus.slope, u[PSA_NU + 1], slope_u[PSA_NU + 1] = {0.0};
     memset(in, 0, sizeof *in);
     memset(out, 0, sizeof *out);
     if (psa_lacks(instance, unknowns, unknown, seed) || psa_lacks(instance, knowns, known, sensitivity))
@@ -122,9 +127,17 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
     if (psa_model_adjoint(state->solver.t, state->solver.x, u, state->p, out->xdot, out->y, out->z, &in->t,
                           in->x, in->u, in->p, instance->calculus.w))
         return psa_say(instance, PSA_DISCARD, "The model cannot be differentiated here.");
+    in->start = HUGE_VAL;
     for (size_t i = 0; i < knowns; ++i) {
         const double *const place = known_place(instance, known[i], in);
         if (!place) return PSA_ERROR;
+        if (place == &in->start && in->start == HUGE_VAL) {
+            ready = psa_start_slope(instance, slope, slope_u);
+            if (ready != PSA_FINE) return ready;
+            in->start = 0.0;
+            for (int k = 0; k < PSA_NX; ++k) in->start += in->x[k] * slope[k];
+            for (int k = 0; k < PSA_NU; ++k) in->start += in->u[k] * slope_u[k];
+        }
         sensitivity[i] = *place;
     }
     if (out->through_step) return add_through_step(instance, out->x, known, knowns, sensitivity);

@@ -63,7 +63,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     (void)resources, (void)visible;
     /* every variable can be read in an intermediate update, so the list only has to make sense */
     for (size_t i = 0; i < count; ++i)
-        if (!required || required[i] >= PSA_VARIABLES)
+        if (!required || required[i] - 1u >= PSA_VARIABLES)
             return refuse(logger, environment,
                           "The list of required intermediate variables is missing or names a value"
                           " reference that does not exist.");

@@ -6,7 +6,8 @@
 #include "fmi_config.h"
 #include "model.h"
 
-/* Value references count through the variables: time, then states, their derivatives, inputs, outputs,
+/* Value references count through the variables from 1 on (OMSimulator 3 reads them as indices of FMI 2,
+   which do): time, then states, their derivatives, inputs, outputs,
    parameters, event indicators, sampled states, each in the order of the model's vectors, and last the
    options: input_line if there are inputs, start_voltage if PSA_VOLTAGE is the place of the voltage among
    them, not -1. */
@@ -36,7 +37,7 @@ typedef struct {
 
 extern const char psa_token[];            /* must equal the one in modelDescription.xml */
 extern const char psa_model_identifier[];
-extern const psa_variable psa_variables[PSA_VARIABLES]; /* indexed by value reference */
+extern const psa_variable psa_variables[PSA_VARIABLES]; /* the first has the value reference 1 */
 extern const double psa_start_states[PSA_NX + 1];
 extern const double psa_start_inputs[PSA_NU + 1];
 extern const double psa_start_parameters[PSA_HELD + 1]; /* behind them the sampled states */

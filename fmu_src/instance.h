@@ -124,7 +124,8 @@ typedef int psa_update(void *owner, double time, int more, double *end);
 
 /* One number for each variable that can be known: a direction, or a gradient. */
 typedef struct {
-    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1], option; /* the option: of no effect */
+    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1];
+    double start, option; /* start_voltage until the initialization ends; options of no effect */
 } psa_knowns;
 
 /* One number for each variable that can be unknown: a change, or a weight. */
@@ -190,6 +191,8 @@ const char *psa_objection(const char *name, const char *token);
 /* start.c: the parameter start_voltage, until the initialization ends */
 /* Bring the states to what it makes them, where they are older. */
 psa_result psa_begin(psa_instance *instance);
+/* Change of states and inputs by it [1/V], of those that follow it: by differences of two settled starts. */
+psa_result psa_start_slope(psa_instance *instance, double *x, double *u);
 /* Set it; the voltage follows it unless that was set by itself. */
 void psa_start_at(psa_instance *instance, double voltage);
 /* Another variable was set. */

@@ -12,6 +12,7 @@
 #define RISE_TOLERANCE 1e-7
 #define MOST_STEPS 100000
 #define NEWTON_STEPS 30
+#define SLOPE_STEP 1e-3 /* of the voltage, at least of 1 V */
 
 #if PSA_VOLTAGE >= 0
 /* The equations of some states: those of memory `most` at most. */
@@ -116,16 +117,35 @@ static int risen(psa_instance *instance, double *x) {
            set_in_motion(instance, input.value, input.rate, x);
 }
 
+static psa_result restless(psa_instance *instance) {
+    return psa_say(instance, PSA_ERROR,
+                   "There is no settled state at the start_voltage of %.9g V. Likely it, an input or a"
+                   " parameter is far from its physical range.",
+                   instance->state.start_voltage);
+}
+
+psa_result psa_start_slope(psa_instance *instance, double *x, double *u) {
+    psa_state *const state = &instance->state;
+    const double voltage = state->start_voltage, step = SLOPE_STEP * fmax(fabs(voltage), 1.0);
+    double *const less = instance->calculus.base;
+    state->start_voltage = voltage + step;
+    int failed = risen(instance, x);
+    state->start_voltage = voltage - step;
+    failed |= risen(instance, less);
+    state->start_voltage = voltage;
+    if (failed) return restless(instance);
+    for (int i = 0; i < PSA_NX; ++i) x[i] = state->own_start[i] ? 0.0 : 0.5 * (x[i] - less[i]) / step;
+    memset(u, 0, sizeof(double) * PSA_NU);
+    u[PSA_VOLTAGE] = state->voltage_given ? 0.0 : 1.0;
+    return PSA_FINE;
+}
+
 psa_result psa_begin(psa_instance *instance) {
     psa_state *const state = &instance->state;
     double x[PSA_NX];
     if (!state->start_due) return PSA_FINE;
     if (state->start_voltage == psa_start_inputs[PSA_VOLTAGE]) memcpy(x, psa_start_states, sizeof x);
-    else if (risen(instance, x))
-        return psa_say(instance, PSA_ERROR,
-                       "There is no settled state at the start_voltage of %.9g V. Likely it, an input or a"
-                       " parameter is far from its physical range.",
-                       state->start_voltage);
+    else if (risen(instance, x)) return restless(instance);
     for (int i = 0; i < PSA_NX; ++i)
         if (!state->own_start[i]) state->solver.x[i] = x[i];
     psa_solver_invalidate(&state->solver);
@@ -154,6 +174,11 @@ void psa_start_changed(psa_instance *instance, const psa_variable *v) {
 #else
 psa_result psa_begin(psa_instance *instance) {
     (void)instance;
+    return PSA_FINE;
+}
+
+psa_result psa_start_slope(psa_instance *instance, double *x, double *u) {
+    (void)instance, (void)x, (void)u;
     return PSA_FINE;
 }
 

@@ -25,9 +25,9 @@ psa_result psa_refresh(psa_instance *instance) {
 }
 
 const psa_variable *psa_variable_of(psa_instance *instance, unsigned vr) {
-    if (vr < PSA_VARIABLES) return &psa_variables[vr];
-    psa_say(instance, PSA_ERROR, "There is no variable of value reference %u; the last is %u.", vr,
-            (unsigned)(PSA_VARIABLES - 1));
+    if (vr >= 1 && vr <= PSA_VARIABLES) return &psa_variables[vr - 1];
+    psa_say(instance, PSA_ERROR, "There is no variable of value reference %u; they go from 1 to %u.", vr,
+            (unsigned)PSA_VARIABLES);
     return NULL;
 }
 
@@ -166,8 +166,9 @@ psa_result psa_set(psa_instance *instance, const unsigned *vr, size_t count, con
     }
     if (worst != PSA_FINE) return worst;
     for (size_t i = 0; i < count; ++i) {
-        set_one(instance, &psa_variables[vr[i]], value[i]);
-        psa_start_changed(instance, &psa_variables[vr[i]]);
+        const psa_variable *const v = psa_variable_of(instance, vr[i]);
+        set_one(instance, v, value[i]);
+        psa_start_changed(instance, v);
     }
     instance->fresh = 0;
     return PSA_FINE;
@@ -268,7 +269,7 @@ psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_
                            order[i], v->name, rate[i]);
     }
     for (size_t i = 0; i < count; ++i) {
-        const int index = psa_variables[vr[i]].index;
+        const int index = psa_variable_of(instance, vr[i])->index;
         state->input.rate[index] = rate[i];
         state->rate_given[index] = 1;
     }

@@ -18,7 +18,7 @@
 
 unsigned reference(const char *name) {
     for (unsigned vr = 0; vr < PSA_VARIABLES; ++vr)
-        if (!strcmp(psa_variables[vr].name, name)) return vr;
+        if (!strcmp(psa_variables[vr].name, name)) return vr + 1;
     fprintf(stderr, "there is no variable %s\n", name);
     exit(1);
 }

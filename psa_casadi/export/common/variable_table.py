@@ -16,9 +16,9 @@ class Variable:
     `kind` is time, state, derivative, input, output, parameter, indicator (zero where a derivative
     has a kink), sampled (a state that changes at sample instants only) or option (how the FMU
     begins and takes its inputs, no part of the model); `index` is its place in the vector of its
-    kind; the value reference is the place in the table. Only a state, an input, a parameter, an
-    option and a sampled state have a `start`; a derivative has no nominal; an indicator, of which
-    only the sign counts, has neither unit nor nominal.
+    kind; the value reference is the place in the table, from 1 on. Only a state, an input, a
+    parameter, an option and a sampled state have a `start`; a derivative has no nominal; an
+    indicator, of which only the sign counts, has neither unit nor nominal.
     """
 
     name: str
