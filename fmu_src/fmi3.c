@@ -39,8 +39,6 @@ static psa_component3 *instantiate(fmi3String name, fmi3String token, psa_interf
     self->core.debug = logging;
     self->core.report = report;
     self->core.owner = self;
-    self->core.allocate = calloc;
-    self->core.release = free;
     psa_instance_start(&self->core, interface);
     return self;
 }
@@ -149,7 +147,7 @@ fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState snapshot) {
 
 fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *snapshot) {
     ENTER(PSA_CALL_ANY);
-    psa_snapshot_release(core, snapshot);
+    psa_snapshot_release(snapshot);
     return fmi3OK;
 }
 

@@ -159,8 +159,6 @@ typedef struct {
     int debug;            /* what only debug logging shows is reported too */
     psa_reporter *report; /* may be NULL */
     void *owner;
-    void *(*allocate)(size_t count, size_t size);
-    void (*release)(void *memory);
 } psa_instance;
 
 /* log.c: what an instance says */
@@ -273,7 +271,7 @@ const char *psa_state_fault(const psa_state *state);
 /* snapshot.c: the state of an instance, in memory and as bytes */
 psa_result psa_snapshot_take(psa_instance *instance, void **snapshot);
 psa_result psa_snapshot_restore(psa_instance *instance, const void *snapshot);
-void psa_snapshot_release(psa_instance *instance, void **snapshot);
+void psa_snapshot_release(void **snapshot);
 size_t psa_snapshot_size(void);
 psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, void *bytes, size_t size);
 psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t size, void **snapshot);

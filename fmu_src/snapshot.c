@@ -1,4 +1,5 @@
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "instance.h"
@@ -47,7 +48,7 @@ static psa_stamp stamp_of(const void *state) {
 }
 
 static psa_result provide(psa_instance *instance, void **snapshot) {
-    if (!*snapshot) *snapshot = instance->allocate(1, sizeof(psa_snapshot));
+    if (!*snapshot) *snapshot = calloc(1, sizeof(psa_snapshot));
     if (*snapshot) {
         ((psa_snapshot *)*snapshot)->zero = 0;
         return PSA_FINE;
@@ -74,9 +75,9 @@ psa_result psa_snapshot_restore(psa_instance *instance, const void *snapshot) {
     return PSA_FINE;
 }
 
-void psa_snapshot_release(psa_instance *instance, void **snapshot) {
+void psa_snapshot_release(void **snapshot) {
     if (!snapshot || !*snapshot) return;
-    instance->release(*snapshot);
+    free(*snapshot);
     *snapshot = NULL;
 }
 
@@ -119,6 +120,6 @@ psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t s
                          "The snapshot was altered: %s cannot be what this model wrote.", fault);
     else if ((result = provide(instance, snapshot)) == PSA_FINE)
         ((psa_snapshot *)*snapshot)->state = *state;
-    psa_snapshot_release(instance, &read);
+    psa_snapshot_release(&read);
     return result;
 }

@@ -52,6 +52,8 @@ def fixed_description(xml: str, fixed: FixedStep) -> str:
         for name in ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"):
             stepping.attrib.pop(name, None)
         stepping.set("fixedInternalStepSize", number(step))
+    elif stepping is not None:  # FMI 2 has no word for multiples of a step
+        stepping.attrib.pop("canHandleVariableCommunicationStepSize", None)
     if experiment is not None:
         steps = max(1, round(float(experiment.get("stepSize", "0")) / step))
         experiment.set("stepSize", number(steps * step))

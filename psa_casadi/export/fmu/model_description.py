@@ -58,6 +58,7 @@ def model_description(model: Model, identifier: str, token: str, sources: Sequen
 def _interfaces(root: ET.Element, identifier: str, sources: Iterable[str]) -> None:
     common = {
         "modelIdentifier": identifier,
+        "canNotUseMemoryManagementFunctions": "true",
         "canGetAndSetFMUstate": "true",
         "canSerializeFMUstate": "true",
         "providesDirectionalDerivative": "true",
