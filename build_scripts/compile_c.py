@@ -22,6 +22,7 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
+from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.texts import write_sources
 from psa_casadi.export.web.module import WEB_FLAGS, module_texts
 from psa_casadi.model.compose import Model, compose
@@ -30,9 +31,9 @@ from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import SOURCES
 
-FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+FLAGS = ("-std=c99", *STRICT)
 OPTIMISATION = "-O2"
-EXACT_FLAGS = ("-std=gnu99", "-fno-math-errno", "-Wall", "-Wextra", "-Werror")
+EXACT_FLAGS = ("-std=gnu99", "-fno-math-errno", *STRICT, "-Wno-pedantic")
 #: Sets of parameters side by side.
 LANES = (1, 4)
 
@@ -100,20 +101,21 @@ def page_work(model: Model, directory: Path) -> Work:
     for name, text in module_texts(model.structure).items():
         (directory / name).write_text(text, encoding="utf-8")
     here = ROOT / "fmu_src"
-    flags = (*WEB_FLAGS, "-Wall", "-Wextra", "-Werror")
+    flags = (*WEB_FLAGS, *STRICT, "-Wno-pedantic")
     return Work(tuple(sorted(here.glob("page/*.c"))), (directory, here / "page", here), flags)
 
 
 def write_all(sources: Path) -> list[Work]:
     """Write every source into folders of its own; return what is to be compiled.
 
-    The FMUs, of FMI 2 and FMI 3, are those of the base model, the library that of the model with
-    every effect. Exact steps are those of the base, and of a load, whose ports feed back.
+    The FMU of FMI 2 is that of the base model, that of FMI 3 and the library are those of the model
+    with every effect, whose functions are the largest. Exact steps are those of the base, and of a
+    load, whose ports feed back.
     """
     headers = Path(fmpy.__file__).parent / "c-code"
     every_effect = compose((*BASE, *EFFECTS.values()))
-    for fmi in (2, 3):
-        write_sources(compose(BASE), sources / f"fmi{fmi}", fmi=fmi)
+    write_sources(compose(BASE), sources / "fmi2", fmi=2)
+    write_sources(every_effect, sources / "fmi3", name="psa", fmi=3)
     write_library(every_effect, sources / "library")
     write_imported(sources / "imported")
     work = [

@@ -48,8 +48,6 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
                               fmi2Boolean logging) {
     const fmi2CallbackFunctions none = {NULL, NULL, NULL, NULL, NULL};
     const fmi2CallbackFunctions *const given = functions ? functions : &none;
-    const int own = !given->allocateMemory || !given->freeMemory;
-    void *(*const allocate)(size_t, size_t) = own ? calloc : given->allocateMemory;
     const char *const problem = objection(name, type, guid);
     (void)resources, (void)visible;
     if (problem) {
@@ -59,24 +57,20 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
         return NULL;
     }
     const size_t length = strlen(name) + 1;
-    component *const self = allocate(1, sizeof *self + length);
+    component *const self = calloc(1, sizeof *self + length);
     if (!self) return NULL;
-    memset(self, 0, sizeof *self);
     memcpy(self->name, name, length);
     self->logger = given->logger;
     self->environment = given->componentEnvironment;
     self->core.debug = logging != fmi2False;
     self->core.report = report;
     self->core.owner = self;
-    self->core.allocate = allocate;
-    self->core.release = own ? free : given->freeMemory;
     psa_instance_start(&self->core, type == fmi2CoSimulation ? PSA_CO_SIMULATION : PSA_MODEL_EXCHANGE);
     return self;
 }
 
 void fmi2FreeInstance(fmi2Component c) {
-    psa_instance *const core = c;
-    if (core) core->release(c);
+    free(c);
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean toleranceDefined, fmi2Real tolerance,
@@ -146,7 +140,7 @@ fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate snapshot) {
 
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *snapshot) {
     ENTER(PSA_CALL_ANY);
-    psa_snapshot_release(core, snapshot);
+    psa_snapshot_release(snapshot);
     return fmi2OK;
 }
 

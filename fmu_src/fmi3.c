@@ -39,8 +39,6 @@ static psa_component3 *instantiate(fmi3String name, fmi3String token, psa_interf
     self->core.debug = logging;
     self->core.report = report;
     self->core.owner = self;
-    self->core.allocate = calloc;
-    self->core.release = free;
     psa_instance_start(&self->core, interface);
     return self;
 }
@@ -63,7 +61,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     (void)resources, (void)visible;
     /* every variable can be read in an intermediate update, so the list only has to make sense */
     for (size_t i = 0; i < count; ++i)
-        if (!required || required[i] >= PSA_VARIABLES)
+        if (!required || required[i] - 1u >= PSA_VARIABLES)
             return refuse(logger, environment,
                           "The list of required intermediate variables is missing or names a value"
                           " reference that does not exist.");
@@ -149,7 +147,7 @@ fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState snapshot) {
 
 fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *snapshot) {
     ENTER(PSA_CALL_ANY);
-    psa_snapshot_release(core, snapshot);
+    psa_snapshot_release(snapshot);
     return fmi3OK;
 }
 

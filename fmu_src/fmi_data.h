@@ -6,7 +6,8 @@
 #include "fmi_config.h"
 #include "model.h"
 
-/* Value references count through the variables: time, then states, their derivatives, inputs, outputs,
+/* Value references count through the variables from 1 on (OMSimulator 3 reads them as indices of FMI 2,
+   which do): time, then states, their derivatives, inputs, outputs,
    parameters, event indicators, sampled states, each in the order of the model's vectors, and last the
    options: input_line if there are inputs, start_voltage if PSA_VOLTAGE is the place of the voltage among
    them, not -1. */
@@ -36,11 +37,12 @@ typedef struct {
 
 extern const char psa_token[];            /* must equal the one in modelDescription.xml */
 extern const char psa_model_identifier[];
-extern const psa_variable psa_variables[PSA_VARIABLES]; /* indexed by value reference */
+extern const psa_variable psa_variables[PSA_VARIABLES]; /* the first has the value reference 1 */
 extern const double psa_start_states[PSA_NX + 1];
 extern const double psa_start_inputs[PSA_NU + 1];
 extern const double psa_start_parameters[PSA_HELD + 1]; /* behind them the sampled states */
-extern const double psa_state_nominals[PSA_NX + 1];
+extern const double psa_state_nominals[PSA_NX + 1]; /* for the solver in here */
+extern const double psa_told_nominals[PSA_NX + 1];  /* for those of importers, as described */
 /* What a settled start needs: whether a state remembers what came before, and with what rest; whether a
    parameter is the gain of an effect. */
 enum { PSA_MEMORY_NONE, PSA_MEMORY_SETTLES, PSA_MEMORY_STAYS };
@@ -63,14 +65,14 @@ void psa_fixed_step(double t, double *x, const double *u, const double *change);
 #endif
 
 /* Derivative of (x', y, z) along a direction (dt, dx, du, dp) at the point (t, x, u, p): exact, by
-   automatic differentiation. A result that is NULL is left out. */
+   automatic differentiation. A result that is NULL is left out; w are PSA_DERIVATIVES_SZ_W numbers to work in. */
 int psa_model_directional(double t, const double *x, const double *u, const double *p, double dt,
                           const double *dx, const double *du, const double *dp, double *dxdot,
-                          double *dy, double *dz);
+                          double *dy, double *dz, double *w);
 /* Gradient of wxdot . x' + wy . y + wz . z with respect to (t, x, u, p): the transposed of the same
    matrix, by automatic differentiation backwards. */
 int psa_model_adjoint(double t, const double *x, const double *u, const double *p,
                       const double *wxdot, const double *wy, const double *wz, double *dt,
-                      double *dx, double *du, double *dp);
+                      double *dx, double *du, double *dp, double *w);
 
 #endif

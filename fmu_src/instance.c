@@ -6,13 +6,14 @@
 #include "instants.h"
 
 #define DEFAULT_TOLERANCE 1e-6
+#define DESCRIBED_TOLERANCE 1e-5 /* of the DefaultExperiment; importers that integrate take it and do not tell */
 #define LOOSEST_TOLERANCE 1e-2
 /* The solver bounds the error of one step. What an importer means is the error of the trajectory, which
    is that of many steps: each gets this share. With it, cutting the time axis differently moved no output
    of the named stacks by more than four tolerances of its nominal; with three times as much, by 21. */
 #define STEP_SHARE 0.003
-/* Margin of the event indicators in tolerances. */
-#define EVENT_MARGIN 3.0
+/* Margin of the event indicators in tolerances: a solver that bounds the mean over the states errs by more in one. */
+#define EVENT_MARGIN 5.0
 #define TIGHTEST_STEP_TOLERANCE 1e-11
 
 #define BETWEEN \
@@ -104,11 +105,12 @@ void psa_instance_start(psa_instance *instance, psa_interface interface) {
     state->start_voltage = psa_start_inputs[PSA_VOLTAGE];
 #endif
     for (int i = 0; i < PSA_NZ; ++i) state->facing[i] = 1.0;
-    state->event_margin = EVENT_MARGIN * DEFAULT_TOLERANCE;
+    state->event_margin =
+        EVENT_MARGIN * (interface == PSA_MODEL_EXCHANGE ? DESCRIBED_TOLERANCE : DEFAULT_TOLERANCE);
     state->phase = PSA_INSTANTIATED;
     state->interface = interface;
     instance->start_time = 0.0;
-    instance->outside_told = 0;
+    instance->outside_told = instance->limit_told = 0;
     psa_schedule(instance);
     instance->fresh = 0;
 }
@@ -130,7 +132,7 @@ psa_result psa_setup(psa_instance *instance, int tolerance_defined, double toler
         state->event_margin = EVENT_MARGIN * fmin(tolerance, LOOSEST_TOLERANCE);
     }
     psa_solver_move(&state->solver, start);
-    instance->start_time = start;
+    instance->start_time = state->given_at = start;
     state->input.begin = 0.0;
     state->stop_defined = stop_defined;
     state->stop_time = stop_defined ? stop : 0.0;
@@ -240,15 +242,34 @@ static void remember(psa_state *state, psa_end end) {
 }
 
 #ifdef PSA_FIXED_STEP
+/* Keep the voltage, over a step from u along its change, where the step is as good as it is said to be. */
+static void limit_voltage(psa_instance *instance, double since, double *u, double *change) {
+#ifdef PSA_FIXED_LIMIT
+    const double wanted = u[PSA_VOLTAGE], end = wanted + change[PSA_VOLTAGE], most = PSA_FIXED_LIMIT;
+    if (fabs(wanted) <= most && fabs(end) <= most) return;
+    u[PSA_VOLTAGE] = fmin(fmax(wanted, -most), most);
+    change[PSA_VOLTAGE] = fmin(fmax(end, -most), most) - u[PSA_VOLTAGE];
+    if (instance->limit_told) return;
+    instance->limit_told = 1;
+    psa_say(instance, PSA_WARNING,
+            "The voltage of %.6g V at t = %.9g s is beyond %.6g V, up to which this fixed step is good; it is"
+            " limited to that. This is said once.",
+            fabs(end) > most ? end : wanted, instance->state.solver.origin + since, most);
+#else
+    (void)instance, (void)since, (void)u, (void)change;
+#endif
+}
+
 /* Steps of fixed length to the goal of the communication step, which is a multiple of them. */
 static psa_status run_fixed(psa_instance *instance) {
     psa_state *const state = &instance->state;
     psa_solver *const solver = &state->solver;
     const double count = round(instance->goal.since / PSA_FIXED_STEP);
     double u[PSA_NU + 1], change[PSA_NU + 1];
-    for (int i = 0; i < PSA_NU; ++i) change[i] = state->input.rate[i] * PSA_FIXED_STEP;
     for (double k = 0.0; k < count; k += 1.0) {
         psa_input_at(&state->input, k * PSA_FIXED_STEP, u);
+        for (int i = 0; i < PSA_NU; ++i) change[i] = state->input.rate[i] * PSA_FIXED_STEP;
+        limit_voltage(instance, k * PSA_FIXED_STEP, u, change);
         psa_fixed_step(solver->origin + k * PSA_FIXED_STEP, solver->x, u, change);
         solver->steps++;
     }

@@ -64,6 +64,9 @@ typedef enum {
     PSA_STEP_SAMPLED = 4 /* a sample instant fell into it */
 } psa_step_kind;
 
+/* What a model exchange was asked for at the time at which its inputs were given last. */
+typedef enum { PSA_ASKED_NOTHING, PSA_ASKED_INDICATORS, PSA_ASKED_RATES } psa_asked;
+
 typedef struct {
     psa_solver solver;
     psa_input input;
@@ -81,11 +84,14 @@ typedef struct {
     psa_last_step last;
     int64_t rate_given[PSA_NU + 1]; /* the importer gave this input's rate for the next step */
     /* The option input_line: this share of the slope between the last two values that an input was
-       given goes on over a step (0: inputs are held). A step does not change what was given. */
+       given goes on over a step (0: inputs are held). A step does not change what was given. In model
+       exchange the last two are those that were set at different times; see follow_line. */
     double line;
     double given[PSA_NU + 1];   /* last */
-    double earlier[PSA_NU + 1]; /* that the last step started with */
-    double stride;              /* length of that step; 0: there is none, or an event came after it */
+    double earlier[PSA_NU + 1]; /* that the last step started with; in model exchange the ones before */
+    double stride;              /* time between both; 0: there are none, or an event came after them */
+    double given_at;            /* in model exchange: the time of the last */
+    int64_t asked;              /* psa_asked */
     /* The parameter start_voltage; what was set by itself before the first step, and so does not follow
        it; whether the states of now are older than what they follow from. */
     double start_voltage;
@@ -114,20 +120,45 @@ typedef void psa_reporter(void *owner, psa_result severity, const char *sentence
    communication step earlier, at the time written to `end`. */
 typedef int psa_update(void *owner, double time, int more, double *end);
 
+#define PSA_DIRECTIONS 8 /* at most so many of a step's sensitivities at once */
+
+/* One number for each variable that can be known: a direction, or a gradient. */
+typedef struct {
+    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1];
+    double start, option; /* start_voltage until the initialization ends; options of no effect */
+} psa_knowns;
+
+/* One number for each variable that can be unknown: a change, or a weight. */
+typedef struct {
+    double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1];
+    double x[PSA_NX + 1]; /* states at the end of the last step */
+    int through_step;     /* 1: one of them is asked for, 2: they are known, too */
+} psa_unknowns;
+
+/* Numbers of one call for derivatives, or for a settled start; nothing in here is needed after it. */
+typedef struct {
+    double w[PSA_DERIVATIVES_SZ_W];
+    psa_knowns in, along[PSA_DIRECTIONS];
+    psa_unknowns out;
+    psa_solver solver;
+    double moved[PSA_NX * PSA_DIRECTIONS], slope[PSA_NX * PSA_DIRECTIONS], base[PSA_NX * PSA_DIRECTIONS];
+    double stage[PSA_STAGES * PSA_NX * PSA_DIRECTIONS], f[PSA_NX + 1];
+} psa_calculus;
+
 typedef struct {
     psa_state state;
     psa_work work;
+    psa_calculus calculus;
     double xdot[PSA_NX + 1], y[PSA_NY + 1], z[PSA_NZ + 1]; /* valid while `fresh` */
     int fresh;
     psa_update *update; /* during a communication step; may be NULL */
     psa_end goal;       /* end of that step */
     double start_time;
     int outside_told;     /* that the instance has left what the records have shown */
+    int limit_told;       /* that the voltage is limited, with a fixed step */
     int debug;            /* what only debug logging shows is reported too */
     psa_reporter *report; /* may be NULL */
     void *owner;
-    void *(*allocate)(size_t count, size_t size);
-    void (*release)(void *memory);
 } psa_instance;
 
 /* log.c: what an instance says */
@@ -158,6 +189,8 @@ const char *psa_objection(const char *name, const char *token);
 /* start.c: the parameter start_voltage, until the initialization ends */
 /* Bring the states to what it makes them, where they are older. */
 psa_result psa_begin(psa_instance *instance);
+/* Change of states and inputs by it [1/V], of those that follow it: by differences of two settled starts. */
+psa_result psa_start_slope(psa_instance *instance, double *x, double *u);
 /* Set it; the voltage follows it unless that was set by itself. */
 void psa_start_at(psa_instance *instance, double voltage);
 /* Another variable was set. */
@@ -226,13 +259,6 @@ psa_result psa_adjoint_derivative(psa_instance *instance, const unsigned *unknow
                                   double *sensitivity);
 
 /* step_derivatives.c */
-#define PSA_DIRECTIONS 8 /* at most so many at once */
-
-/* One number for each variable that can be known: a direction, or a gradient. */
-typedef struct {
-    double t, x[PSA_NX + 1], u[PSA_NU + 1], p[PSA_HELD + 1], option; /* the option: of no effect */
-} psa_knowns;
-
 /* Change of the states at the end of the last communication step along each direction: moved is
    [PSA_NX][count]. */
 psa_result psa_step_sensitivity(psa_instance *instance, int count, const psa_knowns *directions,
@@ -245,7 +271,7 @@ const char *psa_state_fault(const psa_state *state);
 /* snapshot.c: the state of an instance, in memory and as bytes */
 psa_result psa_snapshot_take(psa_instance *instance, void **snapshot);
 psa_result psa_snapshot_restore(psa_instance *instance, const void *snapshot);
-void psa_snapshot_release(psa_instance *instance, void **snapshot);
+void psa_snapshot_release(void **snapshot);
 size_t psa_snapshot_size(void);
 psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, void *bytes, size_t size);
 psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t size, void **snapshot);

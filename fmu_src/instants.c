@@ -27,9 +27,9 @@ double psa_instant_after(double t, double period) {
 
 int psa_reached(double t, double instant, double period) { return t >= instant - slack(t, period); }
 
-int psa_take_sample(double t, const double *x, const double *u, double *p) {
+int psa_take_sample(double t, const double *x, const double *u, double *p, double *w) {
     double sampled[PSA_NS + 1];
-    if (psa_model_sample(t, x, u, p, sampled)) return 1;
+    if (psa_model_sample(t, x, u, p, sampled, w)) return 1;
     for (int i = 0; i < PSA_NS; ++i)
         if (!isfinite(sampled[i])) return 1;
     memcpy(p + PSA_NP, sampled, sizeof(double) * PSA_NS);

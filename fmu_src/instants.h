@@ -11,7 +11,7 @@ double psa_instant_after(double t, double period);
 /* 1 if t is at an instant, but for rounding, or after it. */
 int psa_reached(double t, double instant, double period);
 /* Put the sampled states at the end of p to their values after an instant at t; 0, or 1 if the model
-   cannot be evaluated there. */
-int psa_take_sample(double t, const double *x, const double *u, double *p);
+   cannot be evaluated there. w is for psa_model_sample. */
+int psa_take_sample(double t, const double *x, const double *u, double *p, double *w);
 
 #endif

@@ -8,27 +8,27 @@
 /* The vectors have PSA_NX states, PSA_NU inputs, PSA_NY outputs and PSA_HELD numbers that are constant
    over a step: PSA_NP parameters and behind them, in p too, PSA_NS sampled states, which change at the
    instants k * p[PSA_PERIOD] only. A model that has nothing but sampled states (PSA_STATES is 0) has one
-   state in here that stays as it is. */
+   state in here that stays as it is. Each function works in w, PSA_SZ_W numbers of the caller's. */
 #define PSA_HELD (PSA_NP + PSA_NS)
 
 /* x' = f(t, x, u, p) */
-int psa_model_ode(double t, const double *x, const double *u, const double *p, double *xdot);
+int psa_model_ode(double t, const double *x, const double *u, const double *p, double *xdot, double *w);
 /* df/dx, column-major, PSA_NX by PSA_NX */
-int psa_model_jacobian(double t, const double *x, const double *u, const double *p, double *jac);
+int psa_model_jacobian(double t, const double *x, const double *u, const double *p, double *jac, double *w);
 /* y = g(t, x, u, p) */
-int psa_model_outputs(double t, const double *x, const double *u, const double *p, double *y);
+int psa_model_outputs(double t, const double *x, const double *u, const double *p, double *y, double *w);
 /* z, PSA_NZ values: f has a kink where one of them is zero */
-int psa_model_switches(double t, const double *x, const double *u, const double *p, double *z);
+int psa_model_switches(double t, const double *x, const double *u, const double *p, double *z, double *w);
 /* The sampled states after an instant, PSA_NS values, from those before it at the end of p. */
-int psa_model_sample(double t, const double *x, const double *u, const double *p, double *sampled);
+int psa_model_sample(double t, const double *x, const double *u, const double *p, double *sampled, double *w);
 
 #ifdef PSA_WITH_SENSITIVITIES
 /* df/dx and df/dp, column-major */
 int psa_model_sensitivity(double t, const double *x, const double *u, const double *p, double *jac,
-                          double *param);
+                          double *param, double *w);
 /* dg/dx and dg/dp, column-major, PSA_NY rows */
 int psa_model_output_sensitivity(double t, const double *x, const double *u, const double *p,
-                                 double *jac, double *param);
+                                 double *jac, double *param, double *w);
 #endif
 
 #endif

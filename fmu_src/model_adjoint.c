@@ -9,11 +9,10 @@ casadi_function psa_adjoint;
 
 int psa_model_adjoint(double t, const double *x, const double *u, const double *p,
                       const double *wxdot, const double *wy, const double *wz, double *dt,
-                      double *dx, double *du, double *dp) {
+                      double *dx, double *du, double *dp, double *w) {
     const double *arg[PSA_DERIVATIVES_SZ_ARG] = {NULL};
     double *res[PSA_DERIVATIVES_SZ_RES] = {NULL};
     long long int iw[PSA_DERIVATIVES_SZ_IW];
-    double w[PSA_DERIVATIVES_SZ_W];
     arg[0] = &t;
     arg[1] = x;
     arg[2] = u;

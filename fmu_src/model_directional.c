@@ -9,11 +9,10 @@ casadi_function psa_directional;
 
 int psa_model_directional(double t, const double *x, const double *u, const double *p, double dt,
                           const double *dx, const double *du, const double *dp, double *dxdot,
-                          double *dy, double *dz) {
+                          double *dy, double *dz, double *w) {
     const double *arg[PSA_DERIVATIVES_SZ_ARG] = {NULL};
     double *res[PSA_DERIVATIVES_SZ_RES] = {NULL};
     long long int iw[PSA_DERIVATIVES_SZ_IW];
-    double w[PSA_DERIVATIVES_SZ_W];
     arg[0] = &t;
     arg[1] = x;
     arg[2] = u;

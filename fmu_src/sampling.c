@@ -41,7 +41,7 @@ psa_result psa_sample_now(psa_instance *instance) {
     if (PSA_NS == 0 || !state->at_instant) return PSA_FINE;
     memcpy(state->p + PSA_NP, state->before, sizeof(double) * PSA_NS);
     psa_input_at(&state->input, state->solver.since, u);
-    if (psa_take_sample(state->solver.t, state->solver.x, u, state->p))
+    if (psa_take_sample(state->solver.t, state->solver.x, u, state->p, instance->work.w))
         return psa_say(instance, PSA_DISCARD, "The sampled states cannot be evaluated at t = %.9g s.",
                        state->solver.t);
     return PSA_FINE;
@@ -68,6 +68,7 @@ psa_result psa_sample_within(psa_instance *instance) {
 void psa_enter_event(psa_instance *instance) {
     instance->state.phase = PSA_EVENT;
     instance->state.stride = 0.0; /* no line through values before and after a jump */
+    instance->state.given_at = instance->state.solver.t;
     if (instance->state.interface == PSA_MODEL_EXCHANGE) psa_arrive(instance);
 }
 

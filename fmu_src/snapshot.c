@@ -1,4 +1,5 @@
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "instance.h"
@@ -8,12 +9,12 @@
     ((14 + 3 * PSA_NX + PSA_NU + 1) + (1 + 2 * (PSA_NU + 1)) + (PSA_HELD + 1)) /* solver, input, parameters */
 typedef char psa_state_has_no_gaps
     [sizeof(psa_state) == 8 * (2 * WORDS_OF_POINT + 2 + (PSA_NU + 1) + (PSA_NZ + 1) + (PSA_NS + 1) + 8 +
-                                2 + 2 * (PSA_NU + 1) + 3 + (PSA_NX + 1))
+                                2 + 2 * (PSA_NU + 1) + 5 + (PSA_NX + 1))
          ? 1
          : -1];
 
 /* Raise it whenever psa_state or psa_solver changes its meaning. */
-#define SNAPSHOT_VERSION 6u
+#define SNAPSHOT_VERSION 7u
 
 /* In front of the bytes of a psa_state: who wrote them, and whether they arrived whole. A machine of
    another byte order or struct layout fails the comparison of version or size. */
@@ -47,7 +48,7 @@ static psa_stamp stamp_of(const void *state) {
 }
 
 static psa_result provide(psa_instance *instance, void **snapshot) {
-    if (!*snapshot) *snapshot = instance->allocate(1, sizeof(psa_snapshot));
+    if (!*snapshot) *snapshot = calloc(1, sizeof(psa_snapshot));
     if (*snapshot) {
         ((psa_snapshot *)*snapshot)->zero = 0;
         return PSA_FINE;
@@ -74,9 +75,9 @@ psa_result psa_snapshot_restore(psa_instance *instance, const void *snapshot) {
     return PSA_FINE;
 }
 
-void psa_snapshot_release(psa_instance *instance, void **snapshot) {
+void psa_snapshot_release(void **snapshot) {
     if (!snapshot || !*snapshot) return;
-    instance->release(*snapshot);
+    free(*snapshot);
     *snapshot = NULL;
 }
 
@@ -96,25 +97,29 @@ psa_result psa_snapshot_write(psa_instance *instance, const void *snapshot, void
 
 psa_result psa_snapshot_read(psa_instance *instance, const void *bytes, size_t size, void **snapshot) {
     psa_stamp found;
-    psa_state state;
+    void *read = NULL;
     if (psa_lacks(instance, 1, bytes, snapshot)) return PSA_ERROR;
     if (size != psa_snapshot_size())
         return psa_say(instance, PSA_ERROR, "These %lu bytes are no snapshot of this model, which has %lu.",
                        (unsigned long)size, (unsigned long)psa_snapshot_size());
     memcpy(&found, bytes, sizeof found);
-    memcpy(&state, (const char *)bytes + sizeof found, sizeof state);
-    const psa_stamp expected = stamp_of(&state);
+    const psa_stamp expected = stamp_of((const char *)bytes + sizeof found);
     if (memcmp(found.magic, expected.magic, sizeof found.magic) || found.version != expected.version ||
         found.size != expected.size || found.model != expected.model)
         return psa_say(instance, PSA_ERROR,
                        "The snapshot was written by another model, version or kind of machine.");
     if (found.checksum != expected.checksum)
         return psa_say(instance, PSA_ERROR, "The snapshot is damaged: its checksum does not match.");
-    const char *const fault = psa_state_fault(&state);
+    psa_result result = provide(instance, &read);
+    if (result != PSA_FINE) return result;
+    psa_state *const state = &((psa_snapshot *)read)->state;
+    memcpy(state, (const char *)bytes + sizeof found, sizeof *state);
+    const char *const fault = psa_state_fault(state);
     if (fault)
-        return psa_say(instance, PSA_ERROR,
-                       "The snapshot was altered: %s cannot be what this model wrote.", fault);
-    const psa_result result = provide(instance, snapshot);
-    if (result == PSA_FINE) ((psa_snapshot *)*snapshot)->state = state;
+        result = psa_say(instance, PSA_ERROR,
+                         "The snapshot was altered: %s cannot be what this model wrote.", fault);
+    else if ((result = provide(instance, snapshot)) == PSA_FINE)
+        ((psa_snapshot *)*snapshot)->state = *state;
+    psa_snapshot_release(&read);
     return result;
 }

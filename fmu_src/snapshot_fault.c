@@ -102,8 +102,9 @@ const char *psa_state_fault(const psa_state *state) {
     if (in_phase || in_last) return in_phase ? in_phase : in_last;
     for (int i = 0; i < PSA_NU; ++i)
         if (!is_flag(state->rate_given[i])) return "a flag";
-    if (!(state->line >= 0.0 && state->line <= 1.0) || !(state->stride >= 0.0 && isfinite(state->stride)) ||
-        !all_finite(state->given, PSA_NU) || !all_finite(state->earlier, PSA_NU))
+    if (state->asked < PSA_ASKED_NOTHING || state->asked > PSA_ASKED_RATES) return "a flag";
+    if (!(state->line >= 0.0 && state->line <= 1.0) || !isfinite(state->stride) ||
+        !isfinite(state->given_at) ||        !all_finite(state->given, PSA_NU) || !all_finite(state->earlier, PSA_NU))
         return "the line of the inputs";
     for (int i = 0; i < PSA_NZ; ++i)
         if (fabs(state->facing[i]) != 1.0) return "an event indicator";

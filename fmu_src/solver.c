@@ -108,12 +108,12 @@ static int factorise(psa_work *work, const double *jac, double h_gamma) {
 static int solve_stage(psa_solver *solver, psa_work *work, int stage, const double *base, double h_gamma,
                        const double *u, const double *p) {
     double *x = work->stage_x[stage], *k = work->stage_k[stage];
-    double f[PSA_NX], previous = 0.0;
+    double *const f = work->f, previous = 0.0;
     /* Hairer and Wanner, Solving ODEs II, IV.8: trust the contraction seen last, a little less each time */
     double contraction = pow(fmax(solver->contraction, 1e-10), 0.8);
     for (int iteration = 0; iteration < NEWTON_LIMIT; ++iteration) {
         for (int i = 0; i < PSA_NX; ++i) x[i] = base[i] + h_gamma * k[i];
-        if (psa_model_ode(work->stage_t[stage], x, u, p, f)) return 1;
+        if (psa_model_ode(work->stage_t[stage], x, u, p, f, work->w)) return 1;
         solver->evaluations++;
         for (int i = 0; i < PSA_NX; ++i) f[i] -= k[i];
         psa_lu_solve(PSA_NX, work->lu, work->pivot, f);
@@ -152,7 +152,7 @@ static double try_step(psa_solver *solver, psa_work *work, double h, const psa_i
                        const double *p) {
     const psa_method *const method = method_of(solver);
     const double h_gamma = h * method->gamma;
-    double base[PSA_NX], u[PSA_NU + 1], error[PSA_NX];
+    double *const base = work->base, *const error = work->error, u[PSA_NU + 1];
     if (work->lu_factor_h != h_gamma) {
         if (factorise(work, work->jac, h_gamma)) return -1.0;
         work->lu_factor_h = h_gamma;
@@ -167,7 +167,7 @@ static double try_step(psa_solver *solver, psa_work *work, double h, const psa_i
             for (int j = 0; j < stage; ++j) sum += method->a[stage][j] * work->stage_k[j][i];
             base[i] = solver->x[i] + h * sum;
         }
-        memcpy(work->stage_k[stage], work->stage_k[stage > 1 ? stage - 1 : 0], sizeof base);
+        memcpy(work->stage_k[stage], work->stage_k[stage > 1 ? stage - 1 : 0], sizeof work->base);
         if (solve_stage(solver, work, stage, base, h_gamma, u, p)) return -1.0;
     }
     for (int i = 0; i < PSA_NX; ++i) {
@@ -178,7 +178,7 @@ static double try_step(psa_solver *solver, psa_work *work, double h, const psa_i
     return scaled_norm(work, error, &solver->culprit);
 }
 
-static int prepare_slope(psa_solver *solver, const psa_input *input, const double *p) {
+static int prepare_slope(psa_solver *solver, psa_work *work, const psa_input *input, const double *p) {
     double u[PSA_NU + 1];
     int same = solver->slope_valid != 0;
     psa_input_at(input, solver->since, u);
@@ -186,7 +186,7 @@ static int prepare_slope(psa_solver *solver, const psa_input *input, const doubl
         if (fabs(u[i] - solver->last_input[i]) > 1e-12 * (fabs(u[i]) + fabs(solver->last_input[i])))
             same = 0;
     if (same) return 0;
-    if (psa_model_ode(solver->t, solver->x, u, p, solver->slope)) return 1;
+    if (psa_model_ode(solver->t, solver->x, u, p, solver->slope, work->w)) return 1;
     solver->evaluations++;
     for (int i = 0; i < PSA_NX; ++i)
         if (!isfinite(solver->slope[i])) {
@@ -209,11 +209,12 @@ static int step_sensitivities(const psa_solver *solver, psa_work *work, double h
     const psa_method *const method = method_of(solver);
     const int count = sens->count, size = PSA_NX * count, stages = method->stages;
     const size_t bytes = sizeof(double) * (size_t)size;
-    double jac[PSA_NX * PSA_NX], u[PSA_NU + 1];
+    double *const jac = work->jac, u[PSA_NU + 1];
     for (int stage = sens->slope_valid ? 1 : 0; stage < stages; ++stage) {
         double *const slopes = stage > 0 ? sens->stage + (long)stage * size : sens->slope;
         set_stage(solver, work, stage, h, input, u);
-        if (sens->differentiate(sens, work->stage_t[stage], work->stage_x[stage], u, p, jac, slopes))
+        if (sens->differentiate(sens, work->stage_t[stage], work->stage_x[stage], u, p, jac, slopes,
+                                work->w))
             return 1;
         memcpy(sens->base, sens->s, bytes);
         for (int j = 0; j < stage; ++j)
@@ -249,18 +250,18 @@ static void interpolate(const psa_solver *solver, const psa_work *work, double h
     }
 }
 
-static int switches_at(const psa_solver *solver, const psa_work *work, double h, double theta,
+static int switches_at(const psa_solver *solver, psa_work *work, double h, double theta,
                        const psa_input *input, const double *p, double *z) {
-    double x[PSA_NX], u[PSA_NU + 1];
+    double u[PSA_NU + 1];
     const double since = solver->since + theta * h;
-    interpolate(solver, work, h, theta, x);
+    interpolate(solver, work, h, theta, work->x);
     psa_input_at(input, since, u);
-    return psa_model_switches(solver->origin + since, x, u, p, z);
+    return psa_model_switches(solver->origin + since, work->x, u, p, z, work->w);
 }
 
 /* Share of the step just tried after which the first switch has changed its sign; 1 if none does.
    Illinois's variant of the secant method on the interpolated states. */
-static double first_kink(const psa_solver *solver, const psa_work *work, double h,
+static double first_kink(const psa_solver *solver, psa_work *work, double h,
                          const psa_input *input, const double *p) {
     double first = 1.0, low[PSA_NZ + 1], high[PSA_NZ + 1], z[PSA_NZ + 1];
     if (PSA_NZ == 0 || switches_at(solver, work, h, 0.0, input, p, low) ||
@@ -327,7 +328,7 @@ static psa_status one_step(psa_solver *solver, psa_work *work, psa_bounds *bound
     double aimed = 0.0; /* length of the step that ends at a kink; 0: no kink is in sight */
     psa_input_at(input, solver->since, u);
     set_weights(solver, work);
-    if (psa_model_jacobian(solver->t, solver->x, u, p, work->jac)) return PSA_NOT_FINITE;
+    if (psa_model_jacobian(solver->t, solver->x, u, p, work->jac, work->w)) return PSA_NOT_FINITE;
     work->lu_factor_h = 0.0;
     for (;;) {
         double h = fmax(solver->step, smallest);
@@ -378,7 +379,7 @@ psa_status psa_solver_advance(psa_solver *solver, psa_work *work, psa_end end,
     psa_bounds bounds = {end, limit};
     while (solver->since < bounds.end.since) {
         /* afresh for each step, because who watches may have changed the input */
-        switch (prepare_slope(solver, input, p)) {
+        switch (prepare_slope(solver, work, input, p)) {
         case 1: return PSA_NOT_FINITE;
         case 2:
             if (sens) sens->slope_valid = 0;

@@ -44,10 +44,12 @@ typedef struct {
     int64_t culprit;         /* index of the state that failed */
 } psa_solver;
 
-/* Numbers of one step; nothing in here is needed after it. */
+/* Numbers of one step; nothing in here is needed after it. They are not on the stack, which is small in
+   threads of some importers: no function here takes more than a page of it. */
 typedef struct {
     double stage_x[PSA_STAGES][PSA_NX], stage_k[PSA_STAGES][PSA_NX], stage_t[PSA_STAGES];
     double jac[PSA_NX * PSA_NX], lu[PSA_NX * PSA_NX], weight[PSA_NX];
+    double x[PSA_NX], base[PSA_NX], f[PSA_NX], error[PSA_NX], w[PSA_SZ_W];
     int pivot[PSA_NX];
     double lu_factor_h; /* h * gamma that `lu` was made for */
 } psa_work;
@@ -69,10 +71,11 @@ typedef struct {
 typedef struct psa_sensitivities psa_sensitivities;
 struct psa_sensitivities {
     int count;
-    /* Fill df/dx (column-major) and df/dtheta at constant x, [PSA_NX][count]; 0, or 1 on failure. */
+    /* Fill df/dx (column-major) and df/dtheta at constant x, [PSA_NX][count]; 0, or 1 on failure. w is
+       for functions of the model. */
     int (*differentiate)(const psa_sensitivities *sens, double t, const double *x, const double *u,
-                         const double *p, double *jac, double *forcing);
-    const void *directions; /* of the caller, for `differentiate` */
+                         const double *p, double *jac, double *forcing, double *w);
+    void *owner;            /* of the caller, for `differentiate` */
     double *s;              /* [PSA_NX][count]: dx/dtheta */
     double *slope;          /* [PSA_NX][count]: d(x')/dtheta at t */
     double *stage;          /* [PSA_STAGES][PSA_NX][count]: work */

@@ -4,15 +4,22 @@
 
 #include "instance.h"
 
+typedef struct {
+    const psa_knowns *along;
+    psa_calculus *calculus;
+} psa_directions;
+
 /* df/dx, and the change of f along the directions at constant x. */
 static int differentiate(const psa_sensitivities *sens, double t, const double *x, const double *u,
-                         const double *p, double *jac, double *forcing) {
-    const psa_knowns *const along = sens->directions;
-    const double none[PSA_NX + 1] = {0.0};
-    double f[PSA_NX + 1];
-    if (psa_model_jacobian(t, x, u, p, jac)) return 1;
+                         const double *p, double *jac, double *forcing, double *w) {
+    static const double none[PSA_NX + 1] = {0.0};
+    const psa_directions *const given = sens->owner;
+    const psa_knowns *const along = given->along;
+    double *const f = given->calculus->f;
+    if (psa_model_jacobian(t, x, u, p, jac, w)) return 1;
     for (int c = 0; c < sens->count; ++c) {
-        if (psa_model_directional(t, x, u, p, along[c].t, none, along[c].u, along[c].p, f, NULL, NULL))
+        if (psa_model_directional(t, x, u, p, along[c].t, none, along[c].u, along[c].p, f, NULL, NULL,
+                                  given->calculus->w))
             return 1;
         for (int i = 0; i < PSA_NX; ++i) forcing[i * sens->count + c] = f[i];
     }
@@ -51,17 +58,18 @@ static psa_result refuse(psa_instance *instance) {
 psa_result psa_step_sensitivity(psa_instance *instance, int count, const psa_knowns *directions,
                                 double *moved) {
     const psa_last_step *const last = &instance->state.last;
-    double slope[PSA_NX * PSA_DIRECTIONS], base[PSA_NX * PSA_DIRECTIONS];
-    double stage[PSA_STAGES * PSA_NX * PSA_DIRECTIONS];
-    psa_solver solver = last->solver;
-    psa_sensitivities sens = {count, differentiate, directions, moved, slope, stage, base, 0};
-    psa_repetition repetition = {&solver, instance->state.solver.since};
+    psa_calculus *const calculus = &instance->calculus;
+    psa_directions given = {directions, calculus};
+    psa_sensitivities sens = {count, differentiate, &given, moved, calculus->slope, calculus->stage,
+                              calculus->base, 0};
+    psa_repetition repetition = {&calculus->solver, instance->state.solver.since};
     const psa_watch watch = {stop_there, &repetition};
     for (int i = 0; i < PSA_NX; ++i)
         for (int c = 0; c < count; ++c) moved[i * count + c] = directions[c].x[i];
     if (last->kind == PSA_NO_STEP) return PSA_FINE;
     if (last->kind != PSA_STEP_KNOWN) return refuse(instance);
-    if (psa_solver_advance(&solver, &instance->work, last->end, &last->input, last->p, &sens, &watch))
+    calculus->solver = last->solver;
+    if (psa_solver_advance(&calculus->solver, &instance->work, last->end, &last->input, last->p, &sens, &watch))
         return psa_say(instance, PSA_DISCARD, "The last step cannot be differentiated.");
     return PSA_FINE;
 }

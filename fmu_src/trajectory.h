@@ -39,8 +39,8 @@ typedef struct {
     int culprit;
 } psa_trajectory;
 
-/* A psa_status, or that the run was stopped. */
-enum { PSA_STOPPED = 4 };
+/* A psa_status, or that the run was stopped, or did not begin. */
+enum { PSA_STOPPED = 4, PSA_NO_MEMORY = 5 };
 
 PSA_API int psa_run(psa_trajectory *trajectory);
 

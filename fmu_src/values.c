@@ -5,16 +5,16 @@
 
 psa_result psa_refresh(psa_instance *instance) {
     const psa_state *const state = &instance->state;
-    double u[PSA_NU + 1];
+    double u[PSA_NU + 1], *const w = instance->work.w;
     if (instance->fresh) return PSA_FINE;
     psa_result result = psa_begin(instance);
     if (result == PSA_FINE) result = psa_sample_now(instance);
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.since, u);
     psa_watch_range(instance, u, NULL);
-    if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot) ||
-        psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y) ||
-        psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z))
+    if (psa_model_ode(state->solver.t, state->solver.x, u, state->p, instance->xdot, w) ||
+        psa_model_outputs(state->solver.t, state->solver.x, u, state->p, instance->y, w) ||
+        psa_model_switches(state->solver.t, state->solver.x, u, state->p, instance->z, w))
         return psa_say(instance, PSA_DISCARD, "The model cannot be evaluated at t = %.9g s.",
                        state->solver.t);
     for (int i = 0; i < PSA_NZ; ++i)
@@ -25,9 +25,9 @@ psa_result psa_refresh(psa_instance *instance) {
 }
 
 const psa_variable *psa_variable_of(psa_instance *instance, unsigned vr) {
-    if (vr < PSA_VARIABLES) return &psa_variables[vr];
-    psa_say(instance, PSA_ERROR, "There is no variable of value reference %u; the last is %u.", vr,
-            (unsigned)(PSA_VARIABLES - 1));
+    if (vr >= 1 && vr <= PSA_VARIABLES) return &psa_variables[vr - 1];
+    psa_say(instance, PSA_ERROR, "There is no variable of value reference %u; they go from 1 to %u.", vr,
+            (unsigned)PSA_VARIABLES);
     return NULL;
 }
 
@@ -113,9 +113,30 @@ static psa_result settable(psa_instance *instance, unsigned vr, double value) {
     return PSA_FINE;
 }
 
+/* In model exchange: inputs are given at a new time, and the values before begin their line. */
+static void begin_line(psa_state *state) {
+    if (state->interface != PSA_MODEL_EXCHANGE || state->solver.t == state->given_at) return;
+    state->stride = state->solver.t - state->given_at;
+    state->given_at = state->solver.t;
+    state->asked = PSA_ASKED_NOTHING;
+    memcpy(state->earlier, state->given, sizeof state->earlier);
+    memset(state->input.rate, 0, sizeof state->input.rate);
+}
+
+/* In model exchange inputs hold between the times at which they are given. An importer that gives them at
+   the end of each step, where it asks for the event indicators, but not where it asks for derivatives (fmpy
+   with CVode) means them to move: to its solver the steps would be jumps. They follow the line then. */
+static void follow_line(psa_state *state) {
+    const int moves = state->asked == PSA_ASKED_INDICATORS && state->stride != 0.0;
+    state->input.begin = state->given_at - state->solver.t;
+    for (int i = 0; i < PSA_NU; ++i)
+        state->input.rate[i] = moves ? (state->given[i] - state->earlier[i]) / state->stride : 0.0;
+}
+
 static void set_one(psa_instance *instance, const psa_variable *v, double value) {
     psa_state *const state = &instance->state;
     if (v->kind == PSA_INPUT) {
+        begin_line(state);
         state->input.value[v->index] = state->given[v->index] = value;
         if (!state->rate_given[v->index]) state->input.rate[v->index] = 0.0;
         return;
@@ -145,8 +166,9 @@ psa_result psa_set(psa_instance *instance, const unsigned *vr, size_t count, con
     }
     if (worst != PSA_FINE) return worst;
     for (size_t i = 0; i < count; ++i) {
-        set_one(instance, &psa_variables[vr[i]], value[i]);
-        psa_start_changed(instance, &psa_variables[vr[i]]);
+        const psa_variable *const v = psa_variable_of(instance, vr[i]);
+        set_one(instance, v, value[i]);
+        psa_start_changed(instance, v);
     }
     instance->fresh = 0;
     return PSA_FINE;
@@ -163,7 +185,7 @@ psa_result psa_set_time(psa_instance *instance, double time) {
     if (!isfinite(time)) return psa_say(instance, PSA_ERROR, "The time is not finite.");
     if (psa_beyond_counting(instance, time, instance->state.p[PSA_PERIOD])) return PSA_ERROR;
     psa_solver_move(&instance->state.solver, time);
-    instance->state.input.begin = 0.0;
+    follow_line(&instance->state);
     instance->fresh = 0;
     return PSA_FINE;
 }
@@ -187,13 +209,15 @@ psa_result psa_get_states(psa_instance *instance, double *x, size_t count) {
 
 psa_result psa_get_derivatives(psa_instance *instance, double *xdot, size_t count) {
     if (mismatch(instance, xdot, count)) return PSA_ERROR;
+    psa_state *const state = &instance->state;
     const psa_result result = psa_refresh(instance);
     if (result != PSA_FINE) return result;
+    if (state->solver.t == state->given_at) state->asked = PSA_ASKED_RATES;
     for (int i = 0; i < PSA_STATES; ++i) {
         xdot[i] = instance->xdot[i];
         if (!isfinite(xdot[i]))
             return psa_say(instance, PSA_DISCARD, "The derivative of '%s' is not finite at t = %.9g s.",
-                           psa_variables[PSA_FIRST_STATE + i].name, instance->state.solver.t);
+                           psa_variables[PSA_FIRST_STATE + i].name, state->solver.t);
     }
     return PSA_FINE;
 }
@@ -203,7 +227,10 @@ psa_result psa_get_indicators(psa_instance *instance, double *z, size_t count) {
         return psa_say(instance, PSA_ERROR, "The model has %d event indicators; a vector of %lu was passed.",
                        PSA_NZ, (unsigned long)count);
     if (psa_lacks(instance, count, z, z)) return PSA_ERROR;
+    psa_state *const state = &instance->state;
     const psa_result result = psa_refresh(instance);
+    if (state->solver.t == state->given_at && state->asked == PSA_ASKED_NOTHING)
+        state->asked = PSA_ASKED_INDICATORS;
     if (result == PSA_FINE) memcpy(z, instance->z, sizeof(double) * PSA_NZ);
     return result;
 }
@@ -222,7 +249,7 @@ psa_result psa_update_events(psa_instance *instance) {
 
 psa_result psa_get_nominals(psa_instance *instance, double *nominal, size_t count) {
     if (mismatch(instance, nominal, count)) return PSA_ERROR;
-    if (count > 0) memcpy(nominal, psa_state_nominals, sizeof(double) * count);
+    if (count > 0) memcpy(nominal, psa_told_nominals, sizeof(double) * count);
     return PSA_FINE;
 }
 
@@ -242,7 +269,7 @@ psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_
                            order[i], v->name, rate[i]);
     }
     for (size_t i = 0; i < count; ++i) {
-        const int index = psa_variables[vr[i]].index;
+        const int index = psa_variable_of(instance, vr[i])->index;
         state->input.rate[index] = rate[i];
         state->rate_given[index] = 1;
     }
@@ -253,7 +280,7 @@ psa_result psa_set_input_rates(psa_instance *instance, const unsigned *vr, size_
 psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size_t count,
                                 const int *order, double *rate) {
     const psa_state *const state = &instance->state;
-    const double none[PSA_HELD + 1] = {0.0};
+    static const double none[PSA_HELD + 1] = {0.0};
     double dy[PSA_NY + 1], u[PSA_NU + 1];
     if (psa_lacks(instance, count, vr, rate) || psa_lacks(instance, count, order, order))
         return PSA_ERROR;
@@ -261,7 +288,7 @@ psa_result psa_get_output_rates(psa_instance *instance, const unsigned *vr, size
     if (result != PSA_FINE) return result;
     psa_input_at(&state->input, state->solver.since, u);
     if (psa_model_directional(state->solver.t, state->solver.x, u, state->p, 1.0, instance->xdot,
-                              state->input.rate, none, NULL, dy, NULL))
+                              state->input.rate, none, NULL, dy, NULL, instance->calculus.w))
         return psa_say(instance, PSA_DISCARD, "The outputs cannot be differentiated here.");
     for (size_t i = 0; i < count; ++i) {
         const psa_variable *const v = psa_variable_of(instance, vr[i]);

@@ -7,17 +7,16 @@ from tests.fmu_models import model_named
 
 STACK = "P-885.51"
 #: Value references of the model's variables by name.
-PLACES = {v.name: k for k, v in enumerate(variable_table(model_named(STACK).plant()))}
+PLACES = {v.name: k for k, v in enumerate(variable_table(model_named(STACK).plant()), 1)}
 SWITCH, KNOWNS = "switch.voltage_reversal", ("u", "voltage", "G", "R_s", "C_p")
 KINDS = "tunable tunable dependent dependent dependent"
 
 
 def _unknown(fmi: int, name: str, *knowns: str, kinds: str) -> str:
     """Return how the description lists the dependencies of an output."""
-    offset = 1 if fmi == 2 else 0
-    places = " ".join(str(PLACES[n] + offset) for n in knowns)
+    places = " ".join(str(PLACES[n]) for n in knowns)
     own = "index" if fmi == 2 else "valueReference"
-    return f'{own}="{PLACES[name] + offset}" dependencies="{places}" dependenciesKind="{kinds}"'
+    return f'{own}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
 
 
 def _dependency(
@@ -30,7 +29,7 @@ def _dependency(
 
 def _of_state(fmi: int, unit: str) -> tuple[str, str]:
     """Return the edit of the unit of der(u), the only variable in V/s that has no nominal value."""
-    more = ' derivative="2"' if fmi == 2 else ' intermediateUpdate="true" derivative="1"'
+    more = (' intermediateUpdate="true"' if fmi == 3 else "") + ' derivative="2"'
     return f'unit="V/s"{more}', f'unit="{unit}"{more}'
 
 

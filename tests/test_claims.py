@@ -50,13 +50,16 @@ _EXPORTS = """\
 #include "model.h"
 #define FACE(name) __attribute__((visibility("default"))) int test_##name
 #define POINT double t, const double *x, const double *u, const double *p
-FACE(ode)(POINT, double *a) { return psa_model_ode(t, x, u, p, a); }
-FACE(jacobian)(POINT, double *a) { return psa_model_jacobian(t, x, u, p, a); }
-FACE(outputs)(POINT, double *a) { return psa_model_outputs(t, x, u, p, a); }
-FACE(switches)(POINT, double *a) { return psa_model_switches(t, x, u, p, a); }
-FACE(sensitivity)(POINT, double *a, double *b) { return psa_model_sensitivity(t, x, u, p, a, b); }
+static double w[PSA_SZ_W];
+FACE(ode)(POINT, double *a) { return psa_model_ode(t, x, u, p, a, w); }
+FACE(jacobian)(POINT, double *a) { return psa_model_jacobian(t, x, u, p, a, w); }
+FACE(outputs)(POINT, double *a) { return psa_model_outputs(t, x, u, p, a, w); }
+FACE(switches)(POINT, double *a) { return psa_model_switches(t, x, u, p, a, w); }
+FACE(sensitivity)(POINT, double *a, double *b) {
+    return psa_model_sensitivity(t, x, u, p, a, b, w);
+}
 FACE(output_sensitivity)(POINT, double *a, double *b) {
-    return psa_model_output_sensitivity(t, x, u, p, a, b);
+    return psa_model_output_sensitivity(t, x, u, p, a, b, w);
 }
 """
 

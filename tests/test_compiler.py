@@ -91,6 +91,8 @@ def test_binaries_for_other_platforms_need_the_extra() -> None:
     for names in ([other], ["all"], ["host", other]):
         with pytest.raises(InputError, match=rf"{other}.*psa-casadi\[compiler\]"):
             chosen_platforms(names)
+    with pytest.raises(InputError, match="systems like this one"):
+        chosen_platforms([host().name])  # by its name: for old systems too
 
 
 @pytest.mark.usefixtures("no_zig")

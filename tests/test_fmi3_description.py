@@ -31,7 +31,9 @@ def xml_of(name: str) -> ET.Element:
 def test_variables(name: str) -> None:
     variables = list(xml_of(name).iterfind("ModelVariables/*"))
     assert {v.tag for v in variables} == {"Float64"}
-    assert [int(v.attrib["valueReference"]) for v in variables] == list(range(len(variables)))
+    assert [int(v.attrib["valueReference"]) for v in variables] == [
+        k + 1 for k in range(len(variables))
+    ]
     independent = [v for v in variables if v.attrib["causality"] == "independent"]
     assert independent == variables[:1]
     by_reference = {int(v.attrib["valueReference"]): v.attrib["name"] for v in variables}

@@ -1,5 +1,7 @@
 """FMUs broken in one way each: the check must find every one, and name it."""
 
+import platform
+import shutil
 import time
 import zipfile
 from collections.abc import Callable, Mapping
@@ -13,9 +15,13 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check import agreement, check, description
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.check import CheckReport, check_fmu
-from psa_casadi.export.check.description import misplaced_binaries
-from psa_casadi.export.fmu.archive import MODEL_ENTRY, write_archive
-from psa_casadi.export.fmu.platforms import compile_library, host_platform
+from psa_casadi.export.check.description import (
+    misplaced_binaries,
+    new_libraries,
+    oldest_systems,
+)
+from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu, write_archive
+from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library, host_platform
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
@@ -264,9 +270,47 @@ def test_names_in_the_binary(fmi: int, tmp_path: Path) -> None:
     found = _failures(check_fmu(rewritten(exported(STACK, fmi), path, {name: change})))
     assert f"fmi{fmi}DoStep is missing" in found["functions present"]
     assert f"fmi{fmi}DoStop is exported" in found["no other symbols"]
-    change = _edit("GLIBC_2.2.5\0", "GLIBC_2.38\0\0")
+    change = _edit("GLIBC_2.2.5\0", "GLIBC_2.99\0\0")
     found = _failures(check_fmu(rewritten(exported(STACK, fmi), path, {name: change})))
-    assert "needs GLIBC_2.38" in found["GNU libc 2.17"]
+    assert "needs GLIBC_2.99" in found["GNU libc"]
+
+
+@pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
+def test_the_oldest_system_that_a_binary_loads_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that loads here passes, with a note; `portable` and other platforms ask for more."""
+    path, change = tmp_path / "b.fmu", _edit("GLIBC_2.2.5\0", "GLIBC_2.29\0\0")
+    with Archive(rewritten(exported(STACK, 2), path, {_binary(2): change})) as newer:
+        for libc, portable, problem in (
+            ("2.36", False, None), ("2.29", False, None),
+            ("2.28", False, "systems with GNU libc 2.28"), ("", False, "with GNU libc 2.17 "),
+            ("2.36", True, "with GNU libc 2.17 "),
+        ):  # fmt: skip
+            monkeypatch.setattr(platform, "libc_ver", lambda v=libc: ("glibc", v))
+            said = "; ".join(new_libraries(newer, portable=portable))
+            assert problem in said if problem else said == ""
+        assert oldest_systems(newer).endswith("loads on GNU libc 2.29 and later")
+    monkeypatch.setattr(platform, "libc_ver", lambda: ("glibc", "2.36"))
+    other = "riscv64-linux" if host_platform().name != "riscv64-linux" else "x86_64-linux"
+    monkeypatch.setattr(description, "host_platform", lambda: PLATFORMS[other])
+    with Archive(path) as foreign:
+        (said,) = new_libraries(foreign)
+    assert "needs GLIBC_2.29, which systems with GNU libc 2.17 lack" in said
+
+
+@slow
+@harmless
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a compiler of the system")
+def test_what_the_compiler_of_the_system_makes_passes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No wheel of a compiler: the FMU is for systems like this one, and sound."""
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.has_zig", lambda: False)
+    monkeypatch.setenv("CC", "gcc")
+    report = check_fmu(export_fmu(model_named(STACK), tmp_path / "own.fmu"))
+    assert report.passed, _failures(report)
+    assert "loads on GNU libc 2." in next(r.remark for r in report.rows if r.name == "GNU libc")
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)

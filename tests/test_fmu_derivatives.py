@@ -46,12 +46,13 @@ def _names(name: str) -> dict[str, list[str]]:
 def _point(name: str) -> dict[str, float]:
     """Return values of states, inputs and parameters in full motion, away from every kink."""
     random = np.random.default_rng(20)
-    point = {}
-    for v in variable_table(model_named(name).plant()):
+    point, model = {}, model_named(name).plant()
+    sizes = dict(zip(model.state_names, model.state_nominals(), strict=True))
+    for v in variable_table(model):
         if v.kind == "parameter":
             point[v.name] = _inside(float(v.start or 0.0), *(v.bounds or (-math.inf, math.inf)))
         elif v.kind in ("state", "input"):
-            point[v.name] = float(v.nominal or 1.0) * random.uniform(0.3, 0.6)
+            point[v.name] = float(sizes.get(v.name, v.nominal) or 1.0) * random.uniform(0.3, 0.6)
     # the voltage rises; the hysteresis force grows from where it is, without passing zero
     point["u"] = 0.5 * point["voltage"]
     point["f_H"] = math.copysign(point["f_H"], point["A"])

@@ -32,11 +32,11 @@ def _rate(u: float, voltage: float) -> float:
     return (voltage - u) / (values["R_s"] * values["C_p"])
 
 
-def _margin(tolerance: float = 1e-6) -> float:
-    """Return 3 tolerances of what the voltage's nominal value moves its rate by [V/s]."""
+def _margin(tolerance: float = 1e-5) -> float:
+    """Return 5 tolerances of what the voltage's nominal value moves its rate by [V/s]."""
     values = model_named(STACK).values
     nominal = next(v.nominal for v in variable_table(model_named(STACK)) if v.name == "u")
-    return 3.0 * tolerance * float(nominal or 0.0) / (values["R_s"] * values["C_p"])
+    return 5.0 * tolerance * float(nominal or 0.0) / (values["R_s"] * values["C_p"])
 
 
 def test_indicator_is_the_rate_of_the_voltage_in_fmi_2() -> None:
@@ -99,26 +99,39 @@ def test_a_held_voltage_makes_no_events(fmi: int) -> None:
 
 
 @slow
-@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+@pytest.mark.parametrize("fmi", [2, 3])
 def test_importer_locates_reversals_where_they_are(fmi: int) -> None:
     """After a corner of a triangle, u turns R_s C_p ln 2 later: the drive is of first order."""
-    signal = np.zeros(len(CORNERS), dtype=[("time", "f8"), ("voltage", "f8"), ("load_force", "f8")])
-    signal["time"], signal["voltage"] = CORNERS, VOLTS
-    path = fmpy.simulate_fmu(
-        str(exported(STACK, fmi)), fmi_type="ModelExchange", input=signal,
-        output=["displacement", SWITCH], stop_time=CORNERS[-1], output_interval=1e-5,
-        relative_tolerance=1e-6,
-    )  # fmt: skip
-    events = path["time"][:-1][np.diff(path["time"]) == 0.0]
+    events: list[float] = []
+    with Fmu(exported(STACK, fmi)) as fmu, fmu.start(MODEL_EXCHANGE, tolerance=1e-6) as instance:
+        nominal = np.array([fmu.nominals[n] for n in fmu.states()])
+
+        def slope(time: float, x: FloatArray) -> FloatArray:
+            return instance.derivatives(
+                time, x, {"voltage": float(np.interp(time, CORNERS, VOLTS))}
+            )
+
+        def indicator(time: float, x: FloatArray) -> float:
+            slope(time, x)
+            return float(instance.vector("GetEventIndicators", 1)[0])
+
+        indicator.terminal = True  # type: ignore[attr-defined]  # as scipy asks for it
+        time, x = 0.0, np.zeros(len(nominal))
+        while time < CORNERS[-1]:
+            solved = solve_ivp(
+                slope, (time, float(CORNERS[-1])), x, "Radau", events=indicator,
+                rtol=1e-6, atol=1e-6 * nominal, max_step=1e-4,
+            )  # fmt: skip
+            time, x = float(solved.t[-1]), solved.y[:, -1]
+            if time < CORNERS[-1]:
+                events.append(time)
+                instance.require("EnterEventMode")
+                instance.update_discrete_states()
+                instance.require("EnterContinuousTimeMode")
     values = model_named(STACK).values
     turns = CORNERS[1:-1] + values["R_s"] * values["C_p"] * np.log(2.0)
-    assert len(turns) == 3
-    for turn in turns:
-        assert np.abs(events - turn).min() < 0.1 * values["R_s"] * values["C_p"]
-    assert len(events) < 3 * len(turns)
-    # fmpy holds the input over its interval: a delay of up to 10 us, 0.1 V of 50 V
-    truth = _path(np.asarray(path["time"]))
-    assert np.abs(np.asarray(path["displacement"]) - truth).max() < 2e-3 * np.ptp(truth)
+    assert len(events) == len(turns) == 3
+    assert np.abs(events - turns).max() < 0.01 * values["R_s"] * values["C_p"]
 
 
 def _path(times: FloatArray) -> FloatArray:

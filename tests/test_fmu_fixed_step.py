@@ -142,6 +142,8 @@ def test_the_description_says_what_it_is(fmi: int, tmp_path: Path) -> None:
     stepping, variables = root.find("CoSimulation"), root.find("ModelVariables")
     assert stepping is not None
     assert stepping.get("fixedInternalStepSize") == ("1e-05" if fmi == 3 else None)
+    claimed = stepping.get("canHandleVariableCommunicationStepSize")
+    assert claimed == (None if fmi == 2 else "true")
     assert variables is not None
     constants = {v.get("name") for v in variables if v.get("variability") == "constant"}
     assert constants == set(stack("P-885.51").plant().values)

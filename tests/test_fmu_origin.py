@@ -10,7 +10,7 @@ import pytest
 from psa_casadi.export.check.check import CheckRow, check_fmu
 from psa_casadi.export.fmu import sources
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.simulation.codegen import generate_c
+from psa_casadi.simulation.codegen import c_code, generate_c
 from tests.fmu_models import model_named, rewritten
 from tests.tiers import slow_but
 
@@ -27,14 +27,14 @@ def _as_another_writes(text: str) -> str:
 @pytest.fixture(scope="module")
 def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An FMU whose C another CasADi generated; what is tried here needs no binary."""
-    generate, derivatives = generate_c, sources._c_code
+    generate, derivatives = generate_c, c_code
 
     def generated(*args: Any, **options: Any) -> dict[str, str]:
         return {n: _as_another_writes(t) for n, t in generate(*args, **options).items()}
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sources, "generate_c", generated)
-        patch.setattr(sources, "_c_code", lambda *args: _as_another_writes(derivatives(*args)))
+        patch.setattr(sources, "c_code", lambda *args: _as_another_writes(derivatives(*args)))
         patch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
         return export_fmu(model_named(STACK), tmp_path_factory.mktemp("fmu") / "older.fmu")
 

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from build_scripts.compile_everywhere import complaint
 from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
+from psa_casadi.export.fmu.texts import exported_texts
 from psa_casadi.simulation.compiler import OPTIMISE, zig_command
 from tests.c_host.build import (
     EMULATED,
@@ -19,6 +21,7 @@ from tests.c_host.build import (
     linked,
     native,
 )
+from tests.fmu_models import model_named
 from tests.tiers import slow
 
 #: Each of them compiles two archives for nine platforms: one process shall do it.
@@ -111,6 +114,19 @@ def test_damaged_state_is_refused(fmi: int, tmp_path: Path) -> None:
         kept.write_bytes(damaged)
         with pytest.raises(AssertionError, match="loading the state failed"):
             native().run(fmi, steps=(HALF, STEPS), state=kept)
+
+
+@pytest.mark.parametrize("name", ["x86_64-windows", "x86-windows"])
+def test_a_model_with_every_effect_links_for_windows(name: str) -> None:
+    """Its functions are the largest; beyond a page they would need what no runtime there has.
+
+    `build_scripts.compile_everywhere` compiles each effect and each stack for all platforms.
+    """
+    texts = exported_texts(model_named("every_effect"), "psa")[1]
+    assert complaint("every effect", texts, PLATFORMS[name]) == ""
+    large = "void psa_large(int i) { volatile char page[5000]; page[i] = 1; }"
+    texts["large.c"] = f"__declspec(dllexport) {large}\n"
+    assert "undefined symbol" in complaint("large", texts, PLATFORMS[name])
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)

@@ -54,8 +54,8 @@ def test_sanitizers_find_nothing(kind: str, fmi: int) -> None:
 
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_nothing_is_allocated_after_instantiation(fmi: int) -> None:
-    """Nor does one of 1,000 instances or 8 threads differ from another by a bit."""
-    compiler = [tool("gcc"), "-O2", *COUNTED]
+    """Nor does one of 1,000 instances or 8 threads of small stacks differ from another by a bit."""
+    compiler = [tool("gcc"), "-O2", "-DSTACK=16384", *COUNTED]
     assert not complaints([linked(fmi, compiler, FILES[fmi], "counted")])
 
 
@@ -72,11 +72,11 @@ def test_valgrind_finds_nothing() -> None:
 FAULTS = {
     "a read behind an array": (
         "memory", "AddressSanitizer: global-buffer-overflow",
-        "values.c", "if (vr < PSA_VARIABLES)", "if (vr < 2 * PSA_VARIABLES)",
+        "values.c", "vr <= PSA_VARIABLES)", "vr <= 2 * PSA_VARIABLES)",
     ),
     "a leak": (
         "memory", "LeakSanitizer",
-        "snapshot.c", "instance->release(*snapshot);", "(void)instance;",
+        "snapshot.c", "free(*snapshot);", "(void)snapshot;",
     ),
     "memory that threads share": (
         "threads", "ThreadSanitizer: data race",
@@ -85,7 +85,7 @@ FAULTS = {
     "an allocation in a step": (
         "counted", "allocations == made",
         "values.c", "    psa_input_at(&state->input, state->solver.since, u);\n",
-        "    if (!instance->allocate(1, 1)) return PSA_ERROR;\n"
+        "    extern void *calloc(size_t, size_t);\n    if (!calloc(1, 1)) return PSA_ERROR;\n"
         "    psa_input_at(&state->input, state->solver.since, u);\n",
     ),
 }  # fmt: skip

@@ -1,6 +1,7 @@
 """The parameter `start_voltage` of an FMU: settled at a voltage, as `psa.settled_at` has it."""
 
 import time
+from ctypes import c_bool
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE
 from psa_casadi.export.importer.fmu import Fmu, FmuError, Instance
+from psa_casadi.export.importer.instance3 import Instance3
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import simulate as reference
 from psa_casadi.scratch import temporary_folder
@@ -58,6 +60,48 @@ def test_an_instance_begins_settled_at_the_voltage(
         with fmu.start(interface, values={START_VOLTAGE: 0.0}) as instance:
             assert apart(fmu, instance, dict.fromkeys(expected, 0.0)) == 0.0
         assert max(abs(expected[n]) / fmu.nominals[n] for n in model.state_names) > 0.05
+
+
+def begun(fmu: Fmu, voltage: float) -> Instance:
+    """Return an instance in initialization mode with this `start_voltage`."""
+    instance = fmu.open(MODEL_EXCHANGE)
+    if fmu.version == 2:
+        instance.require("SetupExperiment", 0, 0.0, 0.0, 0, 0.0)
+        instance.require("EnterInitializationMode")
+    else:
+        instance.require("EnterInitializationMode", c_bool(False), 0.0, 0.0, c_bool(False), 0.0)
+    instance.set({START_VOLTAGE: voltage})
+    return instance
+
+
+@BOTH
+@pytest.mark.parametrize("voltage", [60.0, 0.0])
+def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage: float) -> None:
+    """Until the initialization ends, as the description says that outputs depend on it."""
+    with Fmu(exported(STACK, fmi)) as fmu:
+        entries = {e.variable.name: e for e in fmu.description.initialUnknowns}
+        names = [n for n, e in entries.items() if START_VOLTAGE in [d.name for d in e.dependencies]]
+        assert {"displacement", "der(u)"} <= set(names)
+        ends = []
+        for side in (0.05, -0.05):
+            with begun(fmu, voltage + side) as instance:
+                ends.append(instance.get(names))
+        change = (ends[0] - ends[1]) / 0.1
+        with begun(fmu, voltage) as instance:
+            found = instance.directional(names, [START_VOLTAGE], [1.0])
+            moved = np.array([n in ("charge", "displacement", "blocked_force") for n in names])
+            assert np.allclose(found[moved], change[moved], rtol=1e-4, atol=0.0)
+            jump = instance.directional(names, ["voltage"], [1.0])  # of one that does not settle
+            rests = [names.index(n) for n in ("der(u)", "der(f_H)", "current")]
+            assert np.all(np.abs(found[rests]) < 1e-9 * np.abs(jump[rests]))
+            (twice,) = instance.directional(["displacement"], [START_VOLTAGE, "k_L"], [2.0, 0.0])
+            assert twice == pytest.approx(2.0 * found[names.index("displacement")], rel=1e-12)
+            if isinstance(instance, Instance3):
+                for name, slope in zip(np.array(names)[moved], found[moved], strict=True):
+                    both = instance.adjoint([name], ["time", START_VOLTAGE], [1.0])
+                    assert both[1] == pytest.approx(slope, rel=1e-9)
+            instance.require("ExitInitializationMode")
+            assert instance.directional(["displacement"], [START_VOLTAGE], [1.0])[0] == 0.0
 
 
 def test_it_stays_there_and_is_where_the_papers_equations_lead() -> None:

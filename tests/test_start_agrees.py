@@ -83,6 +83,20 @@ def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
     assert "where the history 120,0 V leaves them" in said
 
 
+def test_the_option_that_is_named_begins_as_the_fmu_does(folder: Path) -> None:
+    """A relaxed start at 60 V and one that rose there from 0 V remember other things."""
+    inputs = Signals(("voltage",), TIME, VOLTAGE[:, None])
+    with Fmu(exported("P-885.51")) as fmu:
+        truth = co_simulate(
+            fmu, TIME, inputs, ["displacement"], tolerance=1e-9, values={"start_voltage": 60.0}
+        )[:, 0]
+    relaxed, said = _simulated(folder, "plain.json")
+    assert "give --start-voltage 60 here too to begin as it does" in said
+    named, _ = _simulated(folder, "plain.json", "--start-voltage", "60")
+    assert np.abs(named - truth).max() < 1e-5 * np.ptp(truth)
+    assert np.abs(relaxed - truth).max() > 0.05 * np.ptp(truth)
+
+
 def test_a_history_is_played_from_relaxed_whatever_start_the_model_has() -> None:
     held = settled_at(STACK, 60.0, [120.0])
     assert memory_after(held, [100.0], at=30.0) == memory_after(STACK, [100.0], at=30.0)

@@ -106,7 +106,7 @@ static int step_through(double rtol, int hold) {
     const int status = psa_run(&run);
     record.way = STEPPER;
     record.steps = run.steps;
-    return status;
+    return status == PSA_NO_MEMORY ? NO_MEMORY : status;
 }
 
 #if PAGE_EXACT

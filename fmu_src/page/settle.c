@@ -10,15 +10,19 @@
 
 #define NEWTON_STEPS 30
 
+/* A module has one thread, and what is large is not on its stack. */
+static double jac[PSA_NX * PSA_NX], part[PSA_NX * PSA_NX], by_input[PSA_NX * PSA_NU + 1];
+static double work[PAGE_SZ_W > PSA_SZ_W ? PAGE_SZ_W : PSA_SZ_W];
+
 #if PSA_NU > 0
 int psa_by_input(const double **arg, double **res, long long int *iw, double *w, int memory);
 
 /* df/du, column-major, PSA_NX by PSA_NU */
 static int slopes_by_input(double t, const double *x, const double *u, const double *p, double *slopes) {
     const double *arg[PAGE_SZ_ARG] = {&t, x, u, p};
-    double *res[PAGE_SZ_RES] = {slopes}, w[PAGE_SZ_W];
+    double *res[PAGE_SZ_RES] = {slopes};
     long long int iw[PAGE_SZ_IW];
-    return psa_by_input(arg, res, iw, w, 0);
+    return psa_by_input(arg, res, iw, work, 0);
 }
 #else
 static int slopes_by_input(double t, const double *x, const double *u, const double *p, double *slopes) {
@@ -35,9 +39,9 @@ static int rows_of(int with_settling, int *rows) {
     return count;
 }
 
-/* b = J[rows, rows]^-1 b */
-static int solve(int count, const int *rows, const double *jac, double *b) {
-    double a[PSA_NX * PSA_NX];
+/* b = jac[rows, rows]^-1 b */
+static int solve(int count, const int *rows, double *b) {
+    double *const a = part;
     int pivot[PSA_NX];
     for (int j = 0; j < count; ++j)
         for (int i = 0; i < count; ++i) a[i + j * count] = jac[rows[i] + rows[j] * PSA_NX];
@@ -47,12 +51,13 @@ static int solve(int count, const int *rows, const double *jac, double *b) {
 }
 
 static int newton(const psa_beginning *at, const double *p, int with_settling, double *x) {
-    double slope[PSA_NX], jac[PSA_NX * PSA_NX], b[PSA_NX];
+    double slope[PSA_NX], b[PSA_NX];
     int rows[PSA_NX];
     const int count = rows_of(with_settling, rows);
-    if (psa_model_ode(at->t, x, at->u, p, slope) || psa_model_jacobian(at->t, x, at->u, p, jac)) return 1;
+    if (psa_model_ode(at->t, x, at->u, p, slope, work)) return 1;
+    if (psa_model_jacobian(at->t, x, at->u, p, jac, work)) return 1;
     for (int k = 0; k < count; ++k) b[k] = slope[rows[k]];
-    if (solve(count, rows, jac, b)) return 1;
+    if (solve(count, rows, b)) return 1;
     for (int k = 0; k < count; ++k) x[rows[k]] -= b[k];
     return 0;
 }
@@ -84,19 +89,19 @@ static int rest(const psa_beginning *at, const double *p, double *x) {
 
 /* From rest to a steady motion at the rates of inputs and memories */
 static int set_in_motion(const psa_beginning *at, const double *still, double *x) {
-    double slope[PSA_NX], jac[PSA_NX * PSA_NX], by_input[PSA_NX * PSA_NU + 1], lag[PSA_NX];
+    double slope[PSA_NX], lag[PSA_NX];
     int rows[PSA_NX];
     const int count = rows_of(0, rows);
-    if (psa_model_jacobian(at->t, still, at->u, at->p, jac)) return 1;
+    if (psa_model_jacobian(at->t, still, at->u, at->p, jac, work)) return 1;
     if (slopes_by_input(at->t, still, at->u, at->p, by_input)) return 1;
-    if (psa_model_ode(at->t, x, at->u, at->p, slope)) return 1;
+    if (psa_model_ode(at->t, x, at->u, at->p, slope, work)) return 1;
     for (int k = 0; k < count; ++k) {
         lag[k] = 0.0;
         for (int q = 0; q < PSA_NU; ++q) lag[k] -= by_input[rows[k] + q * PSA_NX] * at->rate[q];
         for (int i = 0; i < PSA_STATES; ++i)
             if (page_memory[i]) lag[k] -= jac[rows[k] + i * PSA_NX] * slope[i];
     }
-    if (solve(count, rows, jac, lag) || solve(count, rows, jac, lag)) return 1;
+    if (solve(count, rows, lag) || solve(count, rows, lag)) return 1;
     memcpy(x, still, sizeof(double) * PSA_NX);
     for (int k = 0; k < count; ++k) x[rows[k]] += lag[k];
     return 0;

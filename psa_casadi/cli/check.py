@@ -37,6 +37,12 @@ def check(
         ),
     ] = None,
     columns: ColumnsOption = None,
+    portable: Annotated[
+        bool,
+        typer.Option(
+            "--portable", help="Its binary for Linux must load on old systems too: GNU libc 2.17."
+        ),
+    ] = False,
     json: Annotated[Path | None, typer.Option(help="JSON file of all checks to write.")] = None,
     junit: JunitOption = None,
     effects: EffectsOption = None,
@@ -86,6 +92,7 @@ def check(
             memory=memory << 20,
             evidence=evidence,
             records=records,
+            portable=portable,
         )
     show_table(check_table(report), quiet)
     show(f"\n{check_sentence(report)}", quiet)

@@ -89,6 +89,7 @@ def c(
     from psa_casadi.cli.inputs import Given, step_seconds
     from psa_casadi.design.online.part_for import part_for
     from psa_casadi.export.fixed_step.export import export_c
+    from psa_casadi.export.fixed_step.plan import limit_words
 
     given = Given(effects)
     seconds = given.attempt(lambda: step_seconds(step))
@@ -115,6 +116,7 @@ def c(
         show(note, quiet)
     show(step_words(seconds, found.substeps, precision.value), quiet)
     show_table(error_table({e.voltage: e.error for e in found.errors}), quiet)
+    show(limit_words(found.limit), quiet)
     tell_written(found.header, found.source, quiet=quiet)
 
 

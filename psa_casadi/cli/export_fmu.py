@@ -1,6 +1,7 @@
 """`psa export fmu`: a model as an FMU."""
 
 import json
+import math
 import zipfile
 from enum import StrEnum
 from pathlib import Path
@@ -102,6 +103,7 @@ def fmu(
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
     from psa_casadi.cli.export_c import error_table, step_words
     from psa_casadi.cli.inputs import Given
+    from psa_casadi.export.fixed_step.plan import limit_words
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.fmu.fixed import FIXED_ENTRY
     from psa_casadi.export.fmu.platforms import chosen_platforms
@@ -146,6 +148,7 @@ def fmu(
             fixed = json.loads(archive.read(FIXED_ENTRY))
         show(step_words(seconds, fixed["substeps"], "double"), quiet)
         show_table(error_table(fixed["errors"]), quiet)
+        show(limit_words(fixed.get("voltage_limit", math.inf)), quiet)
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"

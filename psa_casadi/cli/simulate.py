@@ -97,11 +97,16 @@ def start_sentence(model: "Model", record: "Record", history: str | None, as_exp
         memory = "relaxed" if history is None else f"where the history {history} V leaves them"
         rate = initial_slope(record.time, record.voltage)
         moving = f", moving at {rate:.4g} V/s" if rate else ""
-        option = "" if history is None else f" --history {history}"
-        return (
-            f"settled at {first:.4g} V{moving}, hysteresis and creep {memory}; an FMU of it begins"
-            f" at rest there with --start-voltage {first:.4g}{option}"
+        option = f"--start-voltage {first:.4g}" + (
+            "" if history is None else f" --history {history}"
         )
+        begins = f"an FMU of it begins at rest there with {option}"
+        if history is None and first:
+            begins = (
+                f"an FMU with {option} has risen there from 0 V, which its hysteresis remembers:"
+                f" give {option} here too to begin as it does"
+            )
+        return f"settled at {first:.4g} V{moving}, hysteresis and creep {memory}; {begins}"
     held = next(i.start for i in model.structure.inputs if i.name == "voltage")
     step = "" if held == first else f"; the record begins with a step from there to {first:.4g} V"
     return f"the start values of the model, at {held:.4g} V, as an exported FMU has them{step}"

@@ -2,6 +2,7 @@
 
 import errno
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import casadi as ca
@@ -19,6 +20,9 @@ PRAGMAS = """\
 #endif
 #define CASADI_SYMBOL_EXPORT
 """
+#: From so many numbers on, those of a function in C are in its caller's workspace: as variables of
+#: its own they could take more of the stack than a page, which not every thread has.
+_MANY = 200
 #: How a library reaches a function that is in another one; see `Foreign`.
 FOREIGN = """\
 #include "trajectory.h"
@@ -95,19 +99,25 @@ def c_slopes(structure: Structure) -> Expression:
 def generate_c(structure: Structure, *, sensitivities: bool) -> dict[str, str]:
     """Return the generated files of a model: {"model.c": ..., "model_config.h": ...}."""
     functions = functions_of(structure, sensitivities=sensitivities)
-    generator = ca.CodeGenerator("model.c", {"with_header": False})
-    for function in functions.values():
+    return {
+        **{f"{f.name}.c": FOREIGN.format(name=f.name) for f in structure.foreign},
+        "model.c": c_code("model.c", functions.values()),
+        "model_config.h": _config(structure, list(functions.values()), sensitivities),
+    }
+
+
+def c_code(name: str, functions: Collection[ca.Function]) -> str:
+    """Return the text of functions in C; `name` is that of the file."""
+    many = any(f.sz_w() > _MANY for f in functions)
+    generator = ca.CodeGenerator(name, {"with_header": False, "avoid_stack": many})
+    for function in functions:
         generator.add(function)
     with temporary_folder() as folder:
         generator.generate(f"{folder}/")
-        body = (folder / "model.c").read_text(encoding="utf-8")
+        body = (folder / name).read_text(encoding="utf-8")
     if not body.endswith("#endif\n"):  # CasADi does not look whether its writing succeeded
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
-    return {
-        **{f"{f.name}.c": FOREIGN.format(name=f.name) for f in structure.foreign},
-        "model.c": PRAGMAS + body,
-        "model_config.h": _config(structure, list(functions.values()), sensitivities),
-    }
+    return PRAGMAS + body
 
 
 def fingerprint(structure: Structure) -> str:

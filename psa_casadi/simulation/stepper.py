@@ -31,6 +31,8 @@ _MOST_PERIODS = 1e13
 _POINTER = ctypes.c_void_p
 #: Status of a run that an interrupt has ended.
 _STOPPED = 4
+#: Status of a run for which there was no memory.
+_NO_MEMORY = 5
 _REASONS = {
     1: "the step size became too small",
     2: "the model returned a value that is not finite",
@@ -149,6 +151,8 @@ def run(
     status = _library(model.structure).psa_run(ctypes.byref(request))
     if status == _STOPPED:
         raise KeyboardInterrupt
+    if status == _NO_MEMORY:
+        raise MemoryError("There is no memory for a run of this model.")
     if status:
         state = (*model.state_names, *model.sampled_names, "none")[request.culprit]
         raise SimulationError(

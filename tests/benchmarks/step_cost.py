@@ -45,7 +45,7 @@ def measured(model: Model, repetitions: int, *, fixed: bool) -> FloatArray:
 
     The FMU is the ordinary one, or the one with a `fixed` step.
     """
-    table = {v.name: k for k, v in enumerate(variable_table(model))}
+    table = {v.name: k for k, v in enumerate(variable_table(model), start=1)}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         export_c(model, folder, step=STEP, name="stack", substeps=1)

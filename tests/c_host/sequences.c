@@ -1,6 +1,6 @@
 /* Runs all sequences of sequences.h, once; then many instances, several threads, and a count of the
    allocations that a master's loop makes (none). INSTANCES and STEPS may be given smaller numbers for a
-   guard that is slow. */
+   guard that is slow, STACK bytes to the threads. */
 #include "sequences.h"
 
 #include <pthread.h>
@@ -18,7 +18,7 @@
 
 unsigned reference(const char *name) {
     for (unsigned vr = 0; vr < PSA_VARIABLES; ++vr)
-        if (!strcmp(psa_variables[vr].name, name)) return vr;
+        if (!strcmp(psa_variables[vr].name, name)) return vr + 1;
     fprintf(stderr, "there is no variable %s\n", name);
     exit(1);
 }
@@ -66,6 +66,7 @@ static void *run_alone(void *result) {
         advance_slave(slave, step);
         if (step % 25 == 0) keep_states(slave);
     }
+    differentiate(slave);
     *(double *)result = read_slave(slave);
     free_slave(slave);
     return NULL;
@@ -73,10 +74,16 @@ static void *run_alone(void *result) {
 
 static void many_threads(void) {
     pthread_t threads[THREADS];
+    pthread_attr_t attributes;
     double alone, found[THREADS];
+    CHECK(!pthread_attr_init(&attributes));
+#if defined(STACK)
+    CHECK(!pthread_attr_setstacksize(&attributes, STACK));
+#endif
     run_alone(&alone);
     CHECK(alone > 1e-6);
-    for (int i = 0; i < THREADS; ++i) CHECK(!pthread_create(&threads[i], NULL, run_alone, &found[i]));
+    for (int i = 0; i < THREADS; ++i)
+        CHECK(!pthread_create(&threads[i], &attributes, run_alone, &found[i]));
     for (int i = 0; i < THREADS; ++i) {
         CHECK(!pthread_join(threads[i], NULL));
         CHECK(found[i] == alone);

@@ -74,7 +74,7 @@ void step_without_allocation(void *slave, int step) {
     const double rate = 1e3;
     double every[PSA_VARIABLES];
     unsigned all[PSA_VARIABLES];
-    for (unsigned vr = 0; vr < PSA_VARIABLES; ++vr) all[vr] = vr;
+    for (unsigned k = 0; k < PSA_VARIABLES; ++k) all[k] = k + 1;
     FINE(fmi2SetRealInputDerivatives(slave, &input, 1, &order, &rate));
     advance_slave(slave, step);
     FINE(fmi2GetReal(slave, all, PSA_VARIABLES, every));
@@ -226,7 +226,7 @@ void call_without_instance(void) {
 }
 
 void call_illegally(void) {
-    const unsigned beyond = PSA_VARIABLES, far = ~0U, output = reference("displacement");
+    const unsigned beyond = PSA_VARIABLES + 1, far = ~0U, output = reference("displacement");
     const fmi2String categories[] = {"nonsense", NULL};
     const double value = 1.0, bad = INFINITY;
     const int order = 2;

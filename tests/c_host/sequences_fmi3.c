@@ -78,7 +78,7 @@ void free_slave(void *slave) {
 void step_without_allocation(void *slave, int step) {
     double every[PSA_VARIABLES];
     unsigned all[PSA_VARIABLES];
-    for (unsigned vr = 0; vr < PSA_VARIABLES; ++vr) all[vr] = vr;
+    for (unsigned k = 0; k < PSA_VARIABLES; ++k) all[k] = k + 1;
     advance_slave(slave, step);
     FINE(fmi3GetFloat64(slave, all, PSA_VARIABLES, every, PSA_VARIABLES));
     differentiate(slave);

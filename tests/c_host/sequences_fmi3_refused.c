@@ -93,7 +93,7 @@ static fmi3Instance make(fmi3String name, fmi3String token, const unsigned requi
 }
 
 static void refuse_values(fmi3Instance c) {
-    const unsigned beyond = PSA_VARIABLES, output = reference("displacement");
+    const unsigned beyond = PSA_VARIABLES + 1, output = reference("displacement");
     const double value = 1.0, bad = NAN;
     double found;
     REFUSED(fmi3GetFloat64(c, &beyond, 1, &found, 1));

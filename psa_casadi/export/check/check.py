@@ -19,6 +19,7 @@ from psa_casadi.export.check.description import (
     missing_notices,
     needless_symbols,
     new_libraries,
+    oldest_systems,
     published_as,
     undefined_units,
 )
@@ -81,6 +82,7 @@ def check_fmu(
     memory: int = MEMORY,
     evidence: bool = False,
     records: Sequence[Record] = (),
+    portable: bool = False,
 ) -> CheckReport:
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
@@ -97,6 +99,8 @@ def check_fmu(
     However it ends, its rows are kept, and the check that ran did not pass. It is no sandbox: files
     and network are open to the code. An archive that would leave its folder, has links, is damaged
     or a bomb is not unpacked, and nothing of it runs.
+
+    Its binary for this machine must load on systems like this one, with `portable` on old ones.
 
     Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
     checks that mean nothing there.
@@ -118,7 +122,7 @@ def check_fmu(
             )
         carried = (archive.directory / MODEL_ENTRY).is_file()
         with started(_INTEGRATOR if model or carried else ()) as process:
-            for row in _described(archive, chosen, tuple(effects)):
+            for row in _described(archive, chosen, tuple(effects), portable=portable):
                 rows.append(row)
                 if time.monotonic() > end:
                     rows.append(stopped("time", OVERTIME.format(timeout)))
@@ -162,12 +166,14 @@ def _same(problems: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _described(
-    archive: Archive, chosen: list[Model], effects: tuple[Component, ...]
+    archive: Archive, chosen: list[Model], effects: tuple[Component, ...], *, portable: bool
 ) -> Iterator[CheckRow]:
     """Yield what the files say; `chosen` has the model, or gets the one inside, as exported."""
     yield count("description valid", invalid, archive)
     for name, check in _DESCRIBED.items():
         yield count(name, check, archive)
+    libc = count("GNU libc", new_libraries, archive, portable=portable)
+    yield replace(libc, remark=oldest_systems(archive)) if libc.passed else libc
     if not chosen and (archive.directory / MODEL_ENTRY).is_file():
         yield count("model inside", _read_model, archive, chosen, effects)
     if chosen:
@@ -235,7 +241,6 @@ _DESCRIBED: dict[str, Callable[[Archive], Iterable[str]]] = {
     "units consistent": inconsistent_units,
     "functions present": missing_functions,
     "no other symbols": needless_symbols,
-    "GNU libc 2.17": new_libraries,
     "binaries in their folders": misplaced_binaries,
     "licence inside": missing_notices,
 }

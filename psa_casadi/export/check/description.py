@@ -1,6 +1,7 @@
 """What modelDescription.xml and the binaries say by themselves, without a call."""
 
 import math
+import platform
 import re
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -17,7 +18,7 @@ from psa_casadi.export.common.publication import (
     copyright_line,
     terms_of_code,
 )
-from psa_casadi.export.fmu.platforms import PLATFORMS
+from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
 from psa_casadi.export.importer.archive import FUNCTIONS, Archive
 from psa_casadi.export.importer.binary_file import Binary, read_binary
 from psa_casadi.export.importer.calls import MODEL_EXCHANGE
@@ -27,9 +28,9 @@ from psa_casadi.simulation.compiler import INSTALL_ZIG
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Publication
 
-#: The newest version of the GNU C library that a binary may need: of 2012, or the platform's first.
-_NEWEST_LIBC = (2, 17)
-_FIRST_LIBC = {"riscv64-linux": (2, 27)}
+#: The GNU C library of the oldest systems that a portable binary loads on: of 2012, or the first.
+_OLDEST_LIBC: tuple[int, ...] = (2, 17)
+_FIRST_LIBC: dict[str, tuple[int, ...]] = {"riscv64-linux": (2, 27)}
 _BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 #: Names by FMI's grammar of the convention "structured" (FMI 2.0.4, 2.2.9; FMI 3.0.2, 2.4.7.5.1), a
 #: pattern whose work is linear in their length; the convention "flat" bars three characters.
@@ -134,17 +135,47 @@ def needless_symbols(archive: Archive) -> Iterator[str]:
             yield f"{name} is exported by {place}"
 
 
-def new_libraries(archive: Archive) -> Iterator[str]:
-    """No Linux binary needs a GNU C library newer than 2.17 (of 2012), or 2.27 on RISC-V."""
+def new_libraries(archive: Archive, *, portable: bool = False) -> Iterator[str]:
+    """No Linux binary needs a newer GNU C library than the systems have that it is for.
+
+    One for this machine's platform is for systems like this one, as its own compiler makes it. All
+    others, and every one if `portable`, are for systems from 2.17 (of 2012) on, or 2.27 on RISC-V.
+    """
     for place, binary in _binaries(archive):
-        newest = _FIRST_LIBC.get(binary.platform, _NEWEST_LIBC)
-        for need in sorted(n for n in binary.needs if n.startswith("GLIBC_")):
-            version = need.removeprefix("GLIBC_").split(".")
-            if not all(p.isdigit() for p in version) or tuple(map(int, version)) > newest:
+        have = _FIRST_LIBC.get(binary.platform, _OLDEST_LIBC)
+        if not portable and binary.platform == host_platform().name:
+            have = max(have, _libc(platform.libc_ver()[1]) or have)
+        for need in _libc_needs(binary):
+            if (_libc(need) or (math.inf,)) > have:
                 yield (
-                    f"{place} needs {need}, which older systems lack; for one that loads on them"
-                    f" run `{INSTALL_ZIG}` and export it again"
+                    f"{place} needs GLIBC_{need}, which systems with GNU libc {_dotted(have)} lack;"
+                    f" for one that loads there run `{INSTALL_ZIG}` and export it again"
                 )
+
+
+def oldest_systems(archive: Archive) -> str:
+    """Return what the Linux binaries load on, "" if none needs the GNU C library."""
+    newest = {
+        place: max(filter(None, map(_libc, _libc_needs(binary))), default=())
+        for place, binary in _binaries(archive)
+    }
+    return "; ".join(
+        f"{p} loads on GNU libc {_dotted(v)} and later" for p, v in newest.items() if v
+    )
+
+
+def _libc_needs(binary: Binary) -> list[str]:
+    return sorted(n.removeprefix("GLIBC_") for n in binary.needs if n.startswith("GLIBC_"))
+
+
+def _libc(version: str) -> tuple[int, ...] | None:
+    """Return the numbers of a version of the GNU C library, None if it has others than numbers."""
+    parts = version.split(".")
+    return tuple(map(int, parts)) if all(p.isdigit() for p in parts) else None
+
+
+def _dotted(version: tuple[int, ...]) -> str:
+    return ".".join(map(str, version))
 
 
 def misplaced_binaries(archive: Archive) -> Iterator[str]:

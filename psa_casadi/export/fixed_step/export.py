@@ -1,5 +1,6 @@
 """A model as two files of C99 for a controller: a step of fixed length and constant cost."""
 
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +16,15 @@ from psa_casadi.model.compose import Model
 class CodeExport:
     """The files that were written, the substeps of a step, and the errors that were measured.
 
-    An error is the largest one of the displacement over its range, on one reference voltage.
+    An error is the largest one of the displacement over its range, on one reference voltage. A
+    voltage beyond `limit` [V] is limited to it; it is infinite where there is no voltage.
     """
 
     header: Path
     source: Path
     substeps: int
     errors: tuple[VoltageError, ...]
+    limit: float = math.inf
 
 
 def export_c(
@@ -62,4 +65,5 @@ def export_c(
         folder / f"{identifier}.c",
         found.plan.substeps,
         found.errors,
+        found.plan.limit,
     )

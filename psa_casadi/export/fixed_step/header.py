@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.publication import code_license
-from psa_casadi.export.fixed_step.plan import CodePlan, timed
+from psa_casadi.export.fixed_step.plan import CodePlan, bounded, limit_words, timed
 from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, VoltageError, shown_output
 
 
@@ -35,8 +35,8 @@ def header_code(plan: CodePlan, errors: Sequence[VoltageError] = ()) -> str:
         "/* Begin at the start values */",
         f"void {name}_init({name}_state *state);",
         "",
-        "/* Go on by one step: constant cost, no allocation, no iteration */",
-        f"void {name}_step({name}_state *state, const {name}_input *input, {name}_output *output);",
+        *_step_comment(plan),
+        f"int {name}_step({name}_state *state, const {name}_input *input, {name}_output *output);",
         "",
         "#ifdef __cplusplus",
         "}",
@@ -46,6 +46,17 @@ def header_code(plan: CodePlan, errors: Sequence[VoltageError] = ()) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _step_comment(plan: CodePlan) -> list[str]:
+    returned = "Returns 0"
+    if bounded(plan):
+        returned = (
+            f"Returns 1 if the voltage was beyond {plan.limit:.6g} V, in either direction, and"
+        )
+        returned += " so was limited to it (no number: kept as it was), else 0"
+    text = f"Go on by one step: constant cost, no allocation, no iteration. {returned}"
+    return ["/* " + "\n   ".join(_wrapped(text)) + " */"]
 
 
 def _comment(plan: CodePlan, errors: Sequence[VoltageError]) -> str:
@@ -107,7 +118,8 @@ def _accuracy(plan: CodePlan, errors: Sequence[VoltageError]) -> list[str]:
         f" stepper at a tolerance of 1e-10, on voltages of {STEPS} steps over the rated range:"
     )
     rows = [f"    {e.voltage:16} {e.error:.1e}   {VOLTAGES[e.voltage][0]}" for e in errors]
-    return [*lines, "", *rows]
+    words = limit_words(plan.limit)
+    return [*lines, "", *rows, *(["", *_wrapped(words)] if words else [])]
 
 
 def _equations(plan: CodePlan) -> list[str]:

@@ -1,5 +1,6 @@
 """What is generated for a fixed step, and the names that C takes for it."""
 
+import math
 from dataclasses import dataclass
 
 import casadi as ca
@@ -25,7 +26,7 @@ class CodePlan:
     `step` is the time between two calls [s], `substeps` how many `expression`s it takes. With
     `held` inputs a value holds over the step that it is given for; else it is reached at its end,
     along a line from the value before. An instant of the sampled states ends `every` so many
-    calls, 0 where there are none.
+    calls, 0 where there are none. A voltage beyond `limit` [V], up or down, is limited to it.
     """
 
     model: Model
@@ -36,6 +37,22 @@ class CodePlan:
     held: bool
     precision: Precision
     every: int = 0
+    limit: float = math.inf
+
+
+def bounded(plan: CodePlan) -> bool:
+    """Whether there is a voltage that is limited."""
+    return math.isfinite(plan.limit)
+
+
+def limit_words(limit: float) -> str:
+    """Say up to which voltage [V] a step was measured; nothing where there is none."""
+    if not math.isfinite(limit):
+        return ""
+    return (
+        f"A voltage beyond {limit:.6g} V, in either direction, is limited to it; up to there jumps"
+        " err no more than is stated, or 0.1 % of the range."
+    )
 
 
 def timed(plan: CodePlan) -> bool:

@@ -1,7 +1,7 @@
 """Plans a model's fixed step: whether it fits, in how many substeps, how far it errs."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
 from psa_casadi.export.fixed_step.header import header_code
 from psa_casadi.export.fixed_step.plan import CodePlan, check_names, timed
-from psa_casadi.export.fixed_step.probe import VoltageError, errors, shown_output
+from psa_casadi.export.fixed_step.probe import VoltageError, errors, reach, shown_output
 from psa_casadi.export.fixed_step.source import source_code
 from psa_casadi.export.fixed_step.whole import step_of
 from psa_casadi.model.compose import Model
@@ -77,7 +77,15 @@ def fixed_step(
     best = (good or sorted(found, key=lambda f: f.worst.error))[0]
     if not best.worst.error <= USELESS:
         raise InputError(_useless(best))
-    return best
+    return _limited(best)
+
+
+def _limited(found: FixedStep) -> FixedStep:
+    """Return a step whose voltage is limited to where it is as good as on the reference ones."""
+    limit = reach(found.plan, found.texts, max(GOOD, found.worst.error))
+    plan = replace(found.plan, limit=limit)
+    texts = (header_code(plan, found.errors), source_code(plan))
+    return FixedStep(plan, dict(zip(found.texts, texts, strict=True)), found.errors)
 
 
 def _useless(best: FixedStep) -> str:

@@ -10,12 +10,14 @@ from psa_casadi.export.fixed_step.matrices import FloatArray
 from psa_casadi.export.fixed_step.plan import CodePlan
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.compiler import shared_library
-from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.stepper import SimulationError, run
 from psa_casadi.simulation.ways import output_of
 from psa_casadi.variables import nominal_value
 
 #: Steps of a reference voltage.
 STEPS = 1000
+#: Multiples of the usual voltage that are tried beyond it, the furthest first.
+_BEYOND = (8.0, 4.0, 2.0, 1.25)
 #: Tolerance of the reference: its error is far below that of any step.
 _RTOL = 1e-10
 
@@ -100,21 +102,51 @@ def errors(plan: CodePlan, texts: dict[str, str]) -> tuple[VoltageError, ...]:
 
     An error that is no number is infinite. Raises SimulationError where the model itself fails.
     """
-    model, probe = plan.model, Probe(plan, texts)
+    probe, share = Probe(plan, texts), np.linspace(0.0, 1.0, STEPS + 1)
+    shapes = {name: shape(share) for name, (_, shape) in VOLTAGES.items()}
+    return tuple(
+        VoltageError(name, _error(plan, probe, played_inputs(plan.model, shape)))
+        for name, shape in shapes.items()
+    )
+
+
+def reach(plan: CodePlan, texts: dict[str, str], allowed: float) -> float:
+    """Return the voltage [V] up to which jumps within one step err by no more than `allowed`.
+
+    In either direction and between both, over the range of the output there. At least the usual
+    voltage, for which `errors` are; infinite for a model without one.
+    """
+    s = plan.model.structure
+    if "voltage" not in plan.model.input_names:
+        return float("inf")
+    place, probe = plan.model.input_names.index("voltage"), Probe(plan, texts)
+    usual = abs(nominal_value(s.inputs[place].nominal, plan.model.values))
+    share = np.linspace(0.0, 1.0, STEPS + 1)
+    jumps = np.select([share < 0.1, share < 0.4, share < 0.7], [0.0, 1.0, -1.0], 1.0)
+    for multiple in _BEYOND:
+        u = np.tile([q.start for q in s.inputs], (STEPS + 1, 1))
+        u[1:, place] = multiple * usual * jumps[1:]
+        try:
+            if _error(plan, probe, u) <= allowed:
+                return multiple * usual
+        except SimulationError:  # nothing is known of the model there
+            continue
+    return usual
+
+
+def _error(plan: CodePlan, probe: Probe, u: FloatArray) -> float:
+    """Return the largest error over the range of the output on inputs (n, nu)."""
+    model = plan.model
     output = model.output_names.index(shown_output(model))
     x0 = np.array([q.start for q in model.structure.states])
-    times = plan.step * np.arange(STEPS + 1, dtype=np.float64)
-    found = []
-    for name, (_, shape) in VOLTAGES.items():
-        u = played_inputs(model, shape(np.linspace(0.0, 1.0, STEPS + 1)))
-        hold = "zero" if plan.held else "linear"
-        true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
-        # held inputs hold from the instant on that they are given for
-        own = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
-        size = float(np.ptp(true)) or float(model.output_nominals()[output])
-        worst = float(np.max(np.abs(own - true))) / size
-        found.append(VoltageError(name, worst if np.isfinite(worst) else float("inf")))
-    return tuple(found)
+    times = plan.step * np.arange(len(u), dtype=np.float64)
+    hold = "zero" if plan.held else "linear"
+    true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
+    # held inputs hold from the instant on that they are given for
+    own = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
+    size = float(np.ptp(true)) or float(model.output_nominals()[output])
+    worst = float(np.max(np.abs(own - true))) / size
+    return worst if np.isfinite(worst) else float("inf")
 
 
 def _probe_code(plan: CodePlan) -> str:

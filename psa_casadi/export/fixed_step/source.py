@@ -7,7 +7,14 @@ import numpy as np
 
 from psa_casadi.component import Expression
 from psa_casadi.export.fixed_step.expressions import Printer
-from psa_casadi.export.fixed_step.plan import CodePlan, moves, outputs_of, sampled_of, timed
+from psa_casadi.export.fixed_step.plan import (
+    CodePlan,
+    bounded,
+    moves,
+    outputs_of,
+    sampled_of,
+    timed,
+)
 
 #: Size over a state's usual one below which it counts as 0: next to it numbers become slow ones.
 NOTHING = 1e-15
@@ -181,9 +188,8 @@ def _output(plan: CodePlan) -> list[str]:
 
 def _step(plan: CodePlan) -> list[str]:
     s, name, p, count = plan.model.structure, plan.name, plan.precision, plan.substeps
-    head = (
-        f"void {name}_step({name}_state *state, const {name}_input *input, {name}_output *output)"
-    )
+    head = f"int {name}_step({name}_state *state, const {name}_input *{_wanted(plan)},"
+    head += f" {name}_output *output)"
     loop = f"    for (int k = 0; k < {count}; ++k) " if count > 1 else "    "
     if not moves(plan):
         lines = ["    state->last_input = *input;" if s.inputs else "    (void)input;"]
@@ -214,4 +220,26 @@ def _step(plan: CodePlan) -> list[str]:
             f"        state->steps_to_instant = {plan.every};",
             "    }",
         ]
-    return [head + " {", *lines, "    outputs(state, output);", "}"]
+    beyond = "beyond" if bounded(plan) else "0"
+    end = ["    outputs(state, output);", f"    return {beyond};", "}"]
+    return [head + " {", *_within(plan), *lines, *end]
+
+
+def _wanted(plan: CodePlan) -> str:
+    """Return the name of the inputs that the step is given; `input` are those that it takes."""
+    return "wanted" if bounded(plan) else "input"
+
+
+def _within(plan: CodePlan) -> list[str]:
+    """Return how the inputs that a step takes follow from the wanted ones."""
+    if not bounded(plan):
+        return []
+    limit = plan.precision.literal(plan.limit)
+    return [
+        f"    {plan.name}_input within = *wanted;",
+        f"    const {plan.name}_input *const input = &within;",
+        f"    const {plan.precision.ctype} v = wanted->voltage;",
+        f"    const int beyond = !(v >= -{limit} && v <= {limit});",
+        f"    within.voltage = v > {limit} ? {limit} : v < -{limit} ? -{limit}",
+        "                     : beyond ? state->last_input.voltage : v; /* if it is no number */",
+    ]

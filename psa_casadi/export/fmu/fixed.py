@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 from psa_casadi.export.common.markup import number, xml_text
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.fixed_step.function import function_code
+from psa_casadi.export.fixed_step.plan import bounded, limit_words
 from psa_casadi.export.fixed_step.planning import FixedStep
 from psa_casadi.export.fixed_step.probe import STEPS, shown_output
 
@@ -23,7 +24,10 @@ _HEADER, _SOURCE = "fmi_config.h", "fmi_data.c"
 
 def fixed_sources(texts: Mapping[str, str], fixed: FixedStep) -> dict[str, str]:
     """Return the sources of an FMU with the fixed step in them."""
-    define = f"#define PSA_FIXED_STEP {fixed.plan.step!r}\n#endif\n"
+    define = f"#define PSA_FIXED_STEP {fixed.plan.step!r}\n"
+    if bounded(fixed.plan):
+        define += f"#define PSA_FIXED_LIMIT {fixed.plan.limit!r}\n"
+    define += "#endif\n"
     head, end, rest = texts[_HEADER].rpartition("#endif\n")
     code = function_code(fixed.plan, "psa_fixed_step")
     return {**texts, _HEADER: head + define + rest if end else "", _SOURCE: texts[_SOURCE] + code}
@@ -48,6 +52,8 @@ def fixed_description(xml: str, fixed: FixedStep) -> str:
         for name in ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"):
             stepping.attrib.pop(name, None)
         stepping.set("fixedInternalStepSize", number(step))
+    elif stepping is not None:  # FMI 2 has no word for multiples of a step
+        stepping.attrib.pop("canHandleVariableCommunicationStepSize", None)
     if experiment is not None:
         steps = max(1, round(float(experiment.get("stepSize", "0")) / step))
         experiment.set("stepSize", number(steps * step))
@@ -59,6 +65,8 @@ def fixed_entry(fixed: FixedStep) -> bytes:
     """Return the text of `FIXED_ENTRY`; errors have two digits, as they have elsewhere."""
     errors = {e.voltage: float(f"{e.error:.1e}") for e in fixed.errors}
     content = {"step": fixed.plan.step, "substeps": fixed.plan.substeps, "errors": errors}
+    if bounded(fixed.plan):
+        content["voltage_limit"] = fixed.plan.limit
     return (json.dumps(content, indent=2) + "\n").encode("utf-8")
 
 
@@ -66,13 +74,14 @@ def use_of(fixed: FixedStep) -> str:
     """Return what the page of the FMU says of its steps."""
     found = ", ".join(f"{e.voltage} {e.error:.1e}" for e in fixed.errors)
     output = shown_output(fixed.plan.model)
+    limited = f" {limit_words(fixed.plan.limit)}".rstrip()
     line = "held" if fixed.plan.held else "linear"
     return (
         f"Co-simulation takes steps of {fixed.plan.step:g} s: the same operations each time,"
         " without iteration or allocation. A communication step is a multiple of it; another one is"
         " an error. Parameters are constants, for whose values the step was made. Largest errors of"
         f" {output} over its range, measured at export on voltages of {STEPS} steps, {line} over"
-        f" each: {found}."
+        f" each: {found}.{limited}"
     )
 
 

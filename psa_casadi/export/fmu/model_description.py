@@ -49,7 +49,7 @@ def model_description(model: Model, identifier: str, token: str, sources: Sequen
     log_categories(root)
     default_experiment(root, model)
     variables = ET.SubElement(root, "ModelVariables")
-    for reference, variable in enumerate(table):
+    for reference, variable in enumerate(table, start=1):
         _variable(variables, reference, variable)
     _structure(ET.SubElement(root, "ModelStructure"), model, table)
     return xml_text(root)
@@ -58,6 +58,7 @@ def model_description(model: Model, identifier: str, token: str, sources: Sequen
 def _interfaces(root: ET.Element, identifier: str, sources: Iterable[str]) -> None:
     common = {
         "modelIdentifier": identifier,
+        "canNotUseMemoryManagementFunctions": "true",
         "canGetAndSetFMUstate": "true",
         "canSerializeFMUstate": "true",
         "providesDirectionalDerivative": "true",

@@ -71,7 +71,7 @@ def model_description3(model: Model, identifier: str, token: str, sources: Seque
     log_categories(root)
     default_experiment(root, model)
     variables = ET.SubElement(root, "ModelVariables")
-    for reference, variable in enumerate(table):
+    for reference, variable in enumerate(table, start=1):
         _variable(variables, reference, variable)
     _structure(ET.SubElement(root, "ModelStructure"), model, table)
     return xml_text(root)
@@ -88,7 +88,7 @@ def _variable(parent: ET.Element, reference: int, variable: Variable) -> None:
     if variable.kind in _IN_BETWEEN:
         attributes["intermediateUpdate"] = "true"
     if variable.kind == "derivative":
-        attributes["derivative"] = str(variable.index + 1)
+        attributes["derivative"] = str(variable.index + 2)
     ET.SubElement(parent, "Float64", attributes)
 
 
@@ -99,7 +99,7 @@ def _structure(parent: ET.Element, model: Model, table: Sequence[Variable]) -> N
     """
     structure = model.structure
     found, at_start = dependencies(structure), at_the_start(model)
-    references = {(v.kind, v.index): reference for reference, v in enumerate(table)}
+    references = {(v.kind, v.index): place for place, v in enumerate(table, start=1)}
     outputs: list[Key] = [("output", i) for i in range(len(structure.outputs))]
     rates: list[Key] = [("derivative", i) for i in range(len(structure.states))]
     indicators: list[Key] = [("indicator", i) for i in range(len(structure.switches))]

@@ -90,8 +90,11 @@ def host_platform() -> Platform:
 def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     """Return the platforms named: names of `PLATFORMS`, "host" or "all"; each once, in order.
 
-    Raises InputError for a name that is not known, and for platforms that are not this machine's
-    where the `ziglang` compiler is not installed.
+    A platform that is named is one of the table, and its binary loads on old systems; "host" is
+    this machine, and its own compiler will do.
+
+    Raises InputError for a name that is not known, and for platforms that are named where the
+    `ziglang` compiler is not installed.
     """
     unknown = [n for n in names if n not in (*PLATFORMS, "host", "all")]
     if unknown or not names:
@@ -104,11 +107,10 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     for name in names:
         found = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
         chosen.update({p.name: p for p in found})
-    foreign = ", ".join(n for n in chosen if n != host_platform().name)
-    if foreign and not has_zig():
+    if {*names} != {"host"} and not has_zig():
         raise InputError(
-            f"The machine's own compiler makes no binary for {foreign}; run `{INSTALL_ZIG}`, or"
-            " export for the host alone."
+            f"The machine's own compiler makes binaries for systems like this one alone; for"
+            f" {', '.join(chosen)} run `{INSTALL_ZIG}`, or export with --platforms host."
         )
     return tuple(chosen.values())
 

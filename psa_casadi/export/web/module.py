@@ -19,7 +19,7 @@ import casadi as ca
 from psa_casadi.cache import cached
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.codegen import PRAGMAS, c_arguments, c_slopes, generate_c
+from psa_casadi.simulation.codegen import c_arguments, c_code, c_slopes, generate_c
 from psa_casadi.simulation.compiler import has_zig, run_compiler, sources_directory, zig_command
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.graph import Unprintable
@@ -111,12 +111,10 @@ def module_texts(structure: Structure) -> Mapping[str, str]:
     by_input = ca.Function(
         "psa_by_input", c_arguments(s), [ca.densify(ca.jacobian(c_slopes(s), s.u))], {"cse": True}
     )
-    generator = ca.CodeGenerator("by_input.c", {"with_header": False})
-    generator.add(by_input)
     return {
         **generate_c(s, sensitivities=False),
         **({} if exact is None else {"exact_model.h": exact}),
-        "by_input.c": PRAGMAS + generator.dump(),
+        "by_input.c": c_code("by_input.c", [by_input]),
         "page_config.h": _config(s, by_input, exact=exact is not None),
     }
 
