@@ -52,6 +52,11 @@ BENCHES: dict[str, Bench] = {
             sized=True,
         ),
         _later(
+            "reading",
+            "reading",
+            "records of 200 MB in every format: exact, time against the library's own reading",
+        ),
+        _later(
             "web",
             "web",
             "models in pages: sizes, redraw times in a headless browser, errors",
