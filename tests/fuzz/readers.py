@@ -1,16 +1,21 @@
 """The readers of records, column maps and units: damaged files in, a sound record or a sentence."""
 
+import json
 import math
+import os
+import signal
 import struct
 import zlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from random import Random
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 
+from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.column_map import parse_columns
@@ -19,7 +24,6 @@ from psa_casadi.units import convert, parse_unit, si_unit
 from tests.fuzz.mutators import WORDS, damaged_bytes, damaged_table, damaged_words
 from tests.fuzz.target import FALSE_PASS, Found, Target
 from tests.fuzz.valid_files import csv_texts, hdf5_files, mat_files, parquet_files, recompressed
-from tests.reading_here import told_here
 
 ROOM = "readers"
 _UNIT_TEXTS = ("N.s/m", "um", "V/degC", "kg.m2/s3", "N/(V.s)", "1/A", "counts/um", "%", "MOhm")
@@ -104,12 +108,32 @@ def _parquet(rng: Random) -> bytes:
 
 
 def read(name: str, data: bytes, folder: Path) -> Iterator[Found]:
-    """Read a record in this process, which is one of many, and yield what is unsound in it."""
+    """Read a record and yield what is unsound in it."""
     path = folder / name
     path.write_bytes(data)
-    with patch.object(apart, "_told", told_here):
+    with patch.object(apart, "_told", _told_by_fork):
         record = read_record(path)
     yield from unsound(record)
+
+
+def _told_by_fork(path: str, asked: dict[str, Any]) -> dict[str, Any]:
+    """Return what the process apart tells of a file: a fork of this one, which starts at once.
+
+    As there, one that a library crashes or that does not end has met a damaged file.
+    """
+    answer = Path(path).with_suffix(".json")
+    child = os.fork()
+    if not child:
+        signal.setitimer(signal.ITIMER_REAL, 5.0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        answer.write_text(json.dumps(apart.answered({"path": path, **asked})))
+        os._exit(0)
+    if os.waitpid(child, 0)[1]:
+        raise InputError(f"{path}: is damaged.")
+    found: dict[str, Any] = json.loads(answer.read_text())
+    if "refused" in found:
+        raise InputError(found["refused"])
+    return found
 
 
 def unsound(record: Record) -> Iterator[Found]:
