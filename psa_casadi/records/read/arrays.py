@@ -136,9 +136,3 @@ def told_step(attributes: Mapping[str, Any]) -> Iterator[float]:
         elif name in ("samplerate", "samplingrate", "samplingfrequency", "samplefrequency", "fs",
                       "rate", "samplefreq"):  # fmt: skip
             yield 1.0 / number
-
-
-def names_a_time(series: Iterable[Series]) -> bool:
-    """Whether one of the series is the time by its name."""
-    meant = (understood(one.name.rpartition(".")[2]) for one in series)
-    return any(name is not None and name.column == "time" for name in meant)

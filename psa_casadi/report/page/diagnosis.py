@@ -109,7 +109,7 @@ def _add_floor(page: Document, d: Diagnosis) -> None:
     span = max(e.record.range_m for e in d.experiments)
     text = handy_scale(span, counts=scale.unit == "counts").text(span)
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
-    found = f" Found from {sources}." if sources else ""
+    found = f" It is estimated from: {sources}." if sources else ""
     page.bars(
         f"Error on held-out samples, rms; the displacement's range is {text}",
         rows,
