@@ -105,8 +105,8 @@ def test_wrong_description(fault: str, fmi: int, tmp_path: Path) -> None:
 CORE = {
     "wrong sign of a derivative": (
         "model_casadi.c",
-        "return call(psa_ode, t, x, u, p, xdot, NULL);",
-        "const int r = call(psa_ode, t, x, u, p, xdot, NULL); xdot[0] = -xdot[0]; return r;",
+        "return call(psa_ode, t, x, u, p, xdot, NULL, w);",
+        "const int r = call(psa_ode, t, x, u, p, xdot, NULL, w); xdot[0] = -xdot[0]; return r;",
         {"equations", "directional derivatives"},
     ),
     "wrong directional derivative": (

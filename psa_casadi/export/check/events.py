@@ -39,7 +39,7 @@ def event_indicators(fmu: Fmu) -> Iterator[str]:
     names, count = fmu.indicators(), fmu.indicator_count()
     if count != len(names):
         yield f"{count} event indicators are announced, {len(names)} variables switch.* repeat them"
-    with fmu.start(MODEL_EXCHANGE) as instance:
+    with fmu.start(MODEL_EXCHANGE, tolerance=_TOLERANCE) as instance:
         if isinstance(instance, Instance3):
             yield from _numbers(fmu, instance)
         yield from _one_sided(fmu, instance)
