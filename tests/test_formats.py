@@ -283,7 +283,7 @@ def test_a_missing_optional_package_is_named(
     path = table(tmp_path / "a.parquet", {"time [s]": T, "voltage [V]": U, "displacement [um]": Y})
     monkeypatch.setattr(apart, "find_spec", lambda name: None)
     (problem,) = problems_of(path)
-    assert "reading it needs pyarrow, which is not installed; run `pip install 'psa-c" in problem
+    assert "reading it needs pyarrow, which is not installed; run `pip install pyarrow`" in problem
 
 
 def test_the_commands_take_every_format(tmp_path: Path) -> None:

@@ -88,12 +88,11 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
 
 def _told(path: str, asked: dict[str, Any]) -> dict[str, Any]:
     """Return what the process tells of a file."""
-    _, package, extra = READERS[ending_of(path)]
+    _, package = READERS[ending_of(path)]
     if find_spec(package) is None:
-        option = f"`pip install 'psa-casadi[{extra}]'`" if extra else f"`pip install {package}`"
         raise InputError(
-            f"{path}: reading it needs {package}, which is not installed; run {option}, or export"
-            " the record as CSV."
+            f"{path}: reading it needs {package}, which is not installed; run"
+            f" `pip install {package}`, or export the record as CSV."
         )
     size = Path(path).stat().st_size
     limit = _TIME + _TIME_PER_MIB * size / 2**20

@@ -33,6 +33,11 @@ class Series:
     unit: str | None = None
 
 
+def unit_stated(unit: object) -> str | None:
+    """Return the unit that a file states beside an array, None where it is none."""
+    return unit_named(unit, common=False) if isinstance(unit, str) else None
+
+
 def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator[Series]:
     """Yield the series in an array: itself, its fields, or its columns counted from 1.
 
@@ -44,7 +49,7 @@ def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator
         return
     if numbers.dtype.kind not in "biufmM":
         return
-    stated = unit_named(unit, common=False) if isinstance(unit, str) else None
+    stated = unit_stated(unit)
     numbers = np.squeeze(numbers) if numbers.size else numbers.ravel()
     if numbers.ndim == 1:
         yield Series(name or "1", numbers.size, lambda: numbers, stated)

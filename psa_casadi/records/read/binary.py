@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from psa_casadi.errors import InputError
-from psa_casadi.records.read.arrays import Series, array_tables, series_in, told_step
+from psa_casadi.records.read.arrays import Series, array_tables, series_in, told_step, unit_stated
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.names import name_without_unit, stated_unit
 from psa_casadi.records.read.table import Cells, Table
@@ -201,8 +201,7 @@ def _of_dataset(path: str, item: Any) -> Iterator[Series]:
             return found.asstr()[()].ravel().tolist() if found.dtype.kind == "O" else found[()]
 
     if item.shape and sum(n != 1 for n in item.shape) == 1 and item.dtype.kind in "biuf":
-        stated = next((s.unit for s in series_in(name, np.zeros(2), unit)), None)
-        yield Series(name, size, lambda: np.ravel(read()), stated)
+        yield Series(name, size, lambda: np.ravel(read()), unit_stated(unit))
     elif item.shape and item.dtype.kind in "biufV":
         check_size(path, item.size * item.dtype.itemsize, "its arrays hold")
         yield from series_in(name, read(), unit)
@@ -271,13 +270,12 @@ def tdms_tables(path: str) -> list[Table]:
             continue
         name = f"{channel.group_name}.{channel.name}" if several else channel.name
         unit = next((u for k, u in channel.properties.items() if k.lower() in _UNITS), None)
-        stated = next((s.unit for s in series_in(name, np.zeros(2), unit)), None)
 
         def read(group: str = channel.group_name, own: str = channel.name) -> Cells:
             with nptdms.TdmsFile.open(path) as whole:
                 return np.asarray(whole[group][own][:])
 
-        found.append(Series(name, len(channel), read, stated))
+        found.append(Series(name, len(channel), read, unit_stated(unit)))
         steps |= {float(s) for k, s in channel.properties.items() if k == "wf_increment" and s > 0}
     return array_tables(path, found, steps)
 
@@ -362,28 +360,23 @@ def universal_tables(path: str) -> list[Table]:
     return array_tables(path, found, steps)
 
 
-#: What reads a file, by its ending; the package that it needs, and the extra that brings it.
-READERS: dict[str, tuple[Callable[[str], list[Table]], str, str]] = {
-    **dict.fromkeys(
-        (".xlsx", ".xlsm", ".xls", ".xlsb", ".ods"), (excel_tables, "python_calamine", "")
-    ),
-    ".mat": (matlab_tables, "pymatreader", ""),
-    **dict.fromkeys((".h5", ".hdf5", ".hdf"), (hdf5_tables, "h5py", "")),
-    ".tdms": (tdms_tables, "nptdms", "tdms"),
-    **dict.fromkeys((".npy", ".npz"), (numpy_tables, "numpy", "")),
-    **dict.fromkeys(
-        (".parquet", ".pq", ".feather", ".arrow"), (parquet_tables, "pyarrow", "parquet")
-    ),
-    **dict.fromkeys((".uff", ".unv", ".uf", ".bunv"), (universal_tables, "pyuff", "uff")),
+#: What reads a file, by its ending, and the package that it needs.
+READERS: dict[str, tuple[Callable[[str], list[Table]], str]] = {
+    **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods"), (excel_tables, "python_calamine")),
+    ".mat": (matlab_tables, "pymatreader"),
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), (hdf5_tables, "h5py")),
+    ".tdms": (tdms_tables, "nptdms"),
+    **dict.fromkeys((".npy", ".npz"), (numpy_tables, "numpy")),
+    **dict.fromkeys((".parquet", ".pq", ".feather", ".arrow"), (parquet_tables, "pyarrow")),
+    **dict.fromkeys((".uff", ".unv", ".uf", ".bunv"), (universal_tables, "pyuff")),
 }
 #: Files whose makers' programs write something that is read, by their ending.
 EXPORTS = {
     ".raw": "a result of SPICE", ".trc": "a LeCroy waveform", ".isf": "a Tektronix waveform",
-    ".wfm": "an oscilloscope's waveform",
-    ".bin": "a binary waveform", ".psdata": "a PicoScope file", ".svd": "a Polytec file",
-    ".pvd": "a Polytec file", ".mf4": "a measurement file", ".mdf": "a measurement file",
-    ".dat4": "a binary file", ".opj": "an Origin project", ".opju": "an Origin project",
-    ".d7d": "a Dewesoft file", ".dxd": "a Dewesoft file", ".ibw": "an Igor wave",
+    ".wfm": "an oscilloscope's waveform", ".bin": "a binary waveform", ".ibw": "an Igor wave",
+    ".psdata": "a PicoScope file", ".svd": "a Polytec file", ".pvd": "a Polytec file",
+    ".mf4": "a measurement file", ".mdf": "a measurement file", ".opj": "an Origin project",
+    ".opju": "an Origin project", ".d7d": "a Dewesoft file", ".dxd": "a Dewesoft file",
 }  # fmt: skip
 _MAGIC = {
     b"\x89HDF": ".h5", b"PK\x03\x04": ".xlsx", b"PAR1": ".parquet", b"TDSm": ".tdms",
