@@ -120,7 +120,7 @@ def experiment(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.design.experiment.search import Effort
 
-    given = Given(own)
+    given = Given(own, quiet=quiet)
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
     effects = design_given.effects(given, [*(separate or []), *(more or [])], parameter or [])
     chosen = given.model_or_stack(model, stack)

@@ -142,7 +142,7 @@ def diagnose(
             from psa_casadi.diagnosis.result import DiagnosisInterrupted
             from psa_casadi.report.words.text import story
         with stage("reading"):
-            given, held = Given(effects), holdout or []
+            given, held = Given(effects, quiet=quiet), holdout or []
             given.stiffness(stiffness)
             beside = {"--next": following, "--events": events, "--junit": junit}
             given.outputs({**outputs, **beside}, [*records, *held, model])
@@ -151,7 +151,7 @@ def diagnose(
             start = given.model_or_stack(model, stack, needed=False)
             table, wanted = given.searched(leave_out or ()), expected(given, expect, max_error)
             given.check()
-        count = len(records)
+        count = given.fitted
         with working("diagnosing", quiet, DIAGNOSE) as progress, events_to(events) as watch:
             try:
                 d = run(

@@ -79,7 +79,7 @@ def identify(
     from psa_casadi.identification.paper.method import identify_by_paper as by_paper
     from psa_casadi.report.words.text import identification_text
 
-    given = Given(effects)
+    given = Given(effects, quiet=quiet)
     if method is Method.PAPER and profile:
         given.add("--method paper has no likelihood; leave --profile or --method out.")
     if method is Method.PAPER and (model, stack) != (None, None):

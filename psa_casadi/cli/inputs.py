@@ -30,8 +30,12 @@ T = TypeVar("T")
 class Given:
     """Collects the problems of everything that a command is given, to tell them all at once."""
 
-    def __init__(self, modules: Sequence[str] | None = None) -> None:
-        """Begin with the effects of the `modules` that --effects names."""
+    def __init__(self, modules: Sequence[str] | None = None, *, quiet: bool = False) -> None:
+        """Begin with the effects of the `modules` that --effects names.
+
+        Unless `quiet`, what the reader took a record's columns for is told.
+        """
+        self._quiet, self.fitted = quiet, 0
         self._problems: list[str] = []
         read = [self.attempt(partial(own_effects, module)) for module in modules or ()]
         self.effects = [c for found in read for c in (found or {}).values()]
@@ -61,11 +65,11 @@ class Given:
         columns: str | None = None,
         sample_time: float | None = None,
     ) -> list[Record]:
-        """Read records to fit, then those held out; no record may be given twice.
+        """Read records to fit, `fitted` of them, then those held out; none may be given twice.
 
         A record to fit must have a voltage that changes, all must have a displacement. `columns` is
         what --columns says. Nothing is read where that is not understood. `sample_time` [s] gives
-        the time of files without one.
+        the time, whatever the files say of it.
         """
         wanted = self.columns(columns, [*paths, *held_out])
         if wanted is None:
@@ -84,7 +88,8 @@ class Given:
                         " two."
                     )
                 found.append(record)
-                for note in record.notes:
+                self.fitted += fitted
+                for note in () if self._quiet else record.notes:
                     tell(f"Note: {note}")
         return found
 

@@ -82,7 +82,7 @@ def sample(
     from psa_casadi.report.words.posterior_words import posterior_text
     from psa_casadi.strict_json import json_text
 
-    given = Given(effects)
+    given = Given(effects, quiet=quiet)
     if (model, stack) == (None, None) and len(records) > 1 and records[0].suffix == ".json":
         model, *records = records  # as it was written before there was --model here
     given.outputs({"--output": output, "--json": json, "--figure": figure}, [model, *records])

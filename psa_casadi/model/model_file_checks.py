@@ -43,7 +43,7 @@ def _problems(content: Any, source: str, effects: Mapping[str, Component]) -> li
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
         return [
             f"{source} is not a model file: its format is {shown(found)}, expected '{FORMAT}';"
-            " give a file that `psa identify` or `psa diagnose` wrote."
+            " give a file that `psa identify` or `psa diagnose` wrote with -o."
         ]
     problems: list[str] = []
     known: list[Component] = []

@@ -20,6 +20,8 @@ from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.names import stated_unit, understood, unit_named
 from psa_casadi.records.read.table import Cells, Columns, Table
 
+#: The attributes and properties that state a unit, in lower case.
+UNITS = ("units", "unit", "unit_string")
 _BRACKETED = re.compile(r"(?P<name>.+?)\s*\[(?P<unit>[^\[\]]+)\]")
 
 

@@ -265,7 +265,21 @@ def _open(
         [*unclear, *missing], [c for _, c in free], lambda c: rises(table, index[id(c)])
     )
     sources = {name: source_of(name, free[k][1]) for name, k in chosen.items()}
+    length = chosen.get("displacement")
+    if length is not None and free[length][1].hint is None:
+        usual = sources["displacement"].array
+        sources["displacement"] = Source(usual, _usual_length(table, free[length][0]))
     return Choice(fields, told, {**wanted, **sources} if sources else {})
+
+
+def _usual_length(table: Table, index: int) -> str:
+    """Return the unit in which numbers are a stroke that a stack may have: 1 nm to 1 mm."""
+    cells = table.glance[index]
+    if not isinstance(cells, np.ndarray):
+        cells = words.numbers(cells, words.decimal_sign(cells), "").values
+    finite = cells[np.isfinite(cells)] if cells.dtype.kind in "biuf" else np.zeros(0)
+    span = float(np.ptp(finite)) if finite.size else 0.0
+    return "m" if 1e-9 <= span < 1e-3 else "nm" if span > 3e3 else "um"
 
 
 def _main_size(table: Table) -> int:

@@ -13,8 +13,9 @@ from psa_casadi.records.checks import FEWEST_SAMPLES
 from psa_casadi.records.read import clock, words
 from psa_casadi.records.read.arrays import Series, array_tables
 from psa_casadi.records.read.choose import rises
+from psa_casadi.records.read.convert import Request
 from psa_casadi.records.read.names import stated_unit
-from psa_casadi.records.read.samples import Outcome, Request, samples_of
+from psa_casadi.records.read.samples import Outcome, samples_of
 from psa_casadi.records.read.table import Cells, Table
 from psa_casadi.units import FloatArray, to_si
 

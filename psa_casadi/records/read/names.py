@@ -62,7 +62,7 @@ _WITH_UNIT = _COLUMN_OF | {"s": "displacement"}
 #: A name and its unit: in brackets of any form, after a slash, comma, underscore or space.
 _FORMS = (
     re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]*)[\])}]"),
-    re.compile(r"(?P<name>.*?)\s*[/,]\s*(?P<unit>\S+)"),
+    re.compile(r"(?P<name>.*?)\s*(?:[/,]|\bin\b)\s*(?P<unit>\S+)"),
     re.compile(r"(?P<name>.*)[_ ](?P<unit>[^_ ]+)"),
 )
 _DIGITS = re.compile(r"[0-9.+-]")

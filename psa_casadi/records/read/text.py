@@ -1,8 +1,7 @@
 """Tables in the lines of a text or of a spreadsheet: preamble, header, units in a row, several."""
 
-import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,41 +13,28 @@ from psa_casadi.records.read import words
 from psa_casadi.records.read.clock import is_stamp, unit_of_times
 from psa_casadi.records.read.columns import COLUMNS, measures
 from psa_casadi.records.read.instruments import instrument_lines, stated_step
-from psa_casadi.records.read.names import (
-    columns_known,
-    stated_unit,
-    understood,
-    unit_named,
-    units_row,
+from psa_casadi.records.read.layout import (
+    SPACES,
+    WORDY,
+    Layout,
+    cells_of,
+    delimiter_of,
+    end_of_rows,
+    further_layouts,
+    holds,
+    laid_out,
 )
+from psa_casadi.records.read.names import stated_unit, understood, unit_named
 from psa_casadi.records.read.table import Cells, Columns, Table
 from psa_casadi.units import units_of
 
-#: Lines in which the first header is looked for, and the most that are asked for further ones.
-_MOST_LINES, _MOST_HEADERS = 500, 20_000
 #: The most lines below a table that are told as no samples: sums, means, an end mark.
 _MOST_BELOW = 20
-_WIDE = re.compile(r"\s*\t\s*|[ ]{2,}")
-#: The most rows of remarks below the units.
-_MOST_REMARKS = 3
-_SPACES, _BEFORE_UNIT = re.compile(r"[ \t]+"), re.compile(r"\s+(?=[\[(])")
 #: A first line that tells Excel what separates the cells.
 _TOLD_MARK = re.compile(r"\s*\"?sep=([^\w\s]|\t)\"?[\s,;]*", re.I)
 _NAME = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 _IN_BRACKETS = re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]+)[\])}]")
-#: How a line begins that may be a header: with a letter or a bracket, perhaps quoted or a comment.
-_WORDY = re.compile(r"[#%\s\"']*[^\W\d_(\[]")
 _COMMENTS = ("#", "%", "!", "//", ";")
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """The header's cells, the delimiter, and the lines of the header and of the first numbers."""
-
-    header: tuple[str, ...]
-    delimiter: str
-    header_line: int
-    first: int
 
 
 def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> list[Table]:
@@ -66,16 +52,16 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
     told = _TOLD_MARK.fullmatch(lines[0]) if lines else None
     mark = told[1] if told else ""
     lines = ["", *lines[1:]] if told else lines
-    first = _in_rows(lines, mark) or _laid_out(lines, mark)
-    first = _Layout(header, ",", 0, 0) if header else first
+    first = _in_rows(lines, mark) or laid_out(lines, mark)
+    first = Layout(header, ",", 0, 0) if header else first
     if first is None:
         return []
     if isinstance(first, Table):
         return [replace(first, path=path, where=f"{path}: {place} 1", name=name)]
-    found = [first, *_further(lines, mark, first)]
+    found = [first, *further_layouts(lines, mark, first)]
     ends = [*(layout.header_line for layout in found[1:]), len(lines)]
     parts = [
-        _Part(path, place, layout, lines[layout.first : _end(lines, layout, end)], single)
+        _Part(path, place, layout, lines[layout.first : end_of_rows(lines, layout, end)], single)
         for layout, end in zip(found, ends, strict=True)
         if (single := len(found) == 1) or end - layout.first >= FEWEST_SAMPLES
     ]
@@ -119,13 +105,13 @@ class _Part:
 
     path: str
     place: str
-    layout: _Layout
+    layout: Layout
     rows: Sequence[str]
     single: bool
 
     def table(self, name: str, step: float | None) -> Table:
         layout = self.layout
-        first = next((row for row in self.rows if _holds(row)), "")
+        first = next((row for row in self.rows if holds(row)), "")
         width = len(layout.header) or len(self._cells(first))
         bare = Table(
             path=self.path, name=name, header=layout.header or [""] * width, labels=[],
@@ -181,8 +167,8 @@ class _Part:
         """Whether a row is no sample: it begins with a word and is not as the rows above it."""
         cells = self._cells(self.rows[k])
         wordy = cells[0].strip() if cells else ""
-        return bool(_WORDY.match(wordy)) and not (
-            words.is_missing(wordy) or is_stamp(wordy) or _WORDY.match(self.rows[0])
+        return bool(WORDY.match(wordy)) and not (
+            words.is_missing(wordy) or is_stamp(wordy) or WORDY.match(self.rows[0])
         )
 
     def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> NDArray[np.float64] | None:
@@ -192,7 +178,7 @@ class _Part:
         if not body or '"' in body or (point == "," and mark == ","):
             return None
         if mark == " ":
-            rows = [_SPACES.sub(" ", row.strip()) for row in rows]
+            rows = [SPACES.sub(" ", row.strip()) for row in rows]
             body = "\n".join(rows)
         width = len(self.layout.header) or rows[0].count(mark) + 1
         if body.count(mark) != len(rows) * (width - 1):
@@ -265,89 +251,6 @@ def _in_small_letters(text: str) -> str:
     return f"{match['name']} [{small}]" if small else text
 
 
-def _laid_out(lines: Sequence[str], mark: str) -> _Layout | None:
-    """Return where the first header and its numbers are; "" for a `mark` that is not told."""
-    start = next((k for k, line in enumerate(lines) if _holds(line)), None)
-    if start is None:
-        return None
-    plain = _named(lines, [start], mark)
-    place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)), mark)
-    if place is None:
-        numbers = _numbers(lines[start], mark)
-        if numbers:
-            return _Layout((), numbers, start, start)
-        place = _above_numbers(lines, start, mark)
-    return _with_header(lines, place, mark)
-
-
-def _with_header(lines: Sequence[str], place: int, mark: str) -> _Layout:
-    delimiter = mark or delimiter_of(lines[place].lstrip("#% "))
-    header = cells_of(lines[place].lstrip("#% "), delimiter, spaced=True)
-    below = place + 1
-    if below < len(lines):
-        units = units_row(cells_of(lines[below].lstrip("#% "), delimiter))
-        if units is not None and len(units) == len(header):
-            pairs = zip(header, units, strict=True)
-            header = [f"{n.strip()} [{u}]" if u and not stated_unit(n) else n for n, u in pairs]
-            below += 1
-    for k, line in enumerate(lines[below : below + _MOST_REMARKS + 1]):
-        if _numbers(line, mark):  # below remarks, as Origin has them under its units
-            below += k
-            break
-        if not _is_remark(line, delimiter):
-            break
-    while len(header) > 1 and not header[-1].strip():
-        header.pop()
-    row = lines[below] if below < len(lines) else ""
-    if delimiter in " \t" and not mark and len(cells_of(row, delimiter)) != len(header):
-        for form in (_WIDE, _SPACES):  # names with spaces in them, tabs and spaces mixed
-            names = form.split(_BEFORE_UNIT.sub(" ", lines[place].strip("#% \t")))
-            if len(names) == len(cells_of(row, " ")) and _numbers(row, " "):
-                header, delimiter = names, " "
-                break
-    return _Layout(tuple(header), delimiter, place, below)
-
-
-def _is_remark(line: str, delimiter: str) -> bool:
-    """Whether a line below a header holds words and no number."""
-    cells = [c for c in cells_of(line, delimiter) if c.strip()]
-    return bool(cells) and not any(
-        words.is_number(c) or is_stamp(c) or words.is_missing(c) or words.unit_in([c])
-        for c in cells
-    )
-
-
-def _further(lines: Sequence[str], mark: str, first: _Layout) -> Iterator[_Layout]:
-    """Yield the layouts of the headers below the first one."""
-    asked, begin = 0, first.first
-    if not first.header:
-        return
-    for k in range(first.first + 1, len(lines)):
-        if k < begin or not _WORDY.match(lines[k]):
-            continue
-        asked += 1
-        if asked > _MOST_HEADERS:
-            return
-        if _named(lines, [k], mark, sure=True) is not None:
-            found = _with_header(lines, k, mark)
-            if found.delimiter == first.delimiter:
-                begin = found.first
-                yield found
-
-
-def _end(lines: Sequence[str], layout: _Layout, end: int) -> int:
-    """Return where the rows of a table end: above the preamble of the next one."""
-    if end == len(lines):
-        return end
-    while end > layout.first and not (
-        (cells := cells_of(lines[end - 1], layout.delimiter))
-        and len(cells) >= len(layout.header)
-        and (words.is_number(cells[0]) or is_stamp(cells[0]))
-    ):
-        end -= 1
-    return end
-
-
 def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
     """Return the table of records that lie in rows: each a name with its numbers behind it."""
     rows = [line for line in lines[:100] if line.strip() and not line.startswith("#")]
@@ -368,85 +271,6 @@ def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
         return Columns([cells[k][1:end] for k in asked], np.arange(1, end))
 
     return Table("", "", header, [label_of(h) for h in header], "", "sample", load)
-
-
-def cells_of(line: str, delimiter: str, *, spaced: bool = False) -> list[str]:
-    """Return the cells of a line; the delimiter " " stands for any number of spaces.
-
-    `spaced` says that a space may stand before a quoted cell.
-    """
-    if delimiter == " ":
-        return _SPACES.split(_BEFORE_UNIT.sub("", line.strip()))
-    if '"' not in line:
-        return line.split(delimiter)
-    try:
-        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=spaced), [])
-    except csv.Error:  # a cell of more than 128 KiB, as where a quote never ends
-        return line.split(delimiter)
-
-
-def delimiter_of(line: str) -> str:
-    """Return the one of comma, semicolon and tab that a line holds most often, else a space."""
-    most = max(",;\t", key=line.count)
-    return most if most in line else " "
-
-
-def _holds(line: str) -> bool:
-    return bool(line.strip()) and not line.startswith("#")
-
-
-def _numbers(line: str, mark: str) -> str:
-    """Return what separates the numbers of a line, "" where it does not hold numbers alone.
-
-    Where numbers have decimal commas, that is no comma.
-    """
-    for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), ";", "\t", " ")):
-        cells = [c for c in cells_of(line, delimiter) if c.strip()]
-        if len(cells) > 1 and all(map(words.is_number, cells)):
-            return delimiter
-    return ""
-
-
-def _above_numbers(lines: Sequence[str], start: int, mark: str) -> int:
-    """Return the line of names, and of units below it, above the first numbers, else the first."""
-    places = range(start, min(len(lines), _MOST_LINES))
-    first = next((k for k in places if _numbers(lines[k], mark)), start)
-    told = mark or _numbers(lines[first], mark).strip(" ")
-    cells = [
-        cells_of(line, told if told and told in line else delimiter_of(line))
-        for line in lines[max(start, first - 2) : first + 1]
-    ]
-    if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
-        return first - 2
-    alike = len(cells) > 1 and len(cells[-2]) == len(cells[-1])
-    return first - 1 if alike and not words.is_number(cells[-2][0]) else start
-
-
-def _named(
-    lines: Sequence[str], places: Sequence[int], mark: str, *, sure: bool = False
-) -> int | None:
-    """Return the first of the places that names two columns, and has more lines below.
-
-    `sure` demands numbers below in any case, not only below a comment.
-    """
-    for k in places:
-        line = lines[k].lstrip("#% ")
-        for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), " ")):
-            known = columns_known(cells_of(line, delimiter))
-            if known >= 2 and (
-                not (sure or lines[k].startswith(("#", "%"))) or _follow(lines, k, mark)
-            ):
-                return k
-    return None
-
-
-def _follow(lines: Sequence[str], k: int, mark: str) -> bool:
-    """Whether a line that begins with a number comes within three lines of line k."""
-    return any(
-        words.is_number(cells_of(line, mark or delimiter_of(line))[0])
-        for line in lines[k + 1 : k + 4]
-        if line.strip()
-    )
 
 
 def decoded(data: bytes, path: str) -> str:
