@@ -52,7 +52,7 @@ def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator
     if numbers.dtype.kind not in "biufmM":
         return
     stated = unit_stated(unit)
-    numbers = np.squeeze(numbers) if numbers.size else numbers.ravel()
+    numbers = np.atleast_1d(np.squeeze(numbers)) if numbers.size else numbers.ravel()
     if numbers.ndim == 1:
         yield Series(name or "1", numbers.size, lambda: numbers, stated)
     elif numbers.ndim == 2:

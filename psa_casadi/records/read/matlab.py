@@ -47,8 +47,8 @@ def _of_tree(name: str, value: Any) -> Iterator[Series]:
                 yield from series_in(f"{name}.{field}", inner, unit)
             else:
                 yield from _of_tree(f"{name}.{field}", inner)
-    elif isinstance(value, np.ndarray):
-        yield from series_in(name, value)
+    elif isinstance(value, np.ndarray | np.number | float | int):
+        yield from series_in(name, np.asarray(value))
 
 
 def _elements(value: Any) -> Any:
