@@ -32,25 +32,29 @@ _STEP = re.compile(
 _SAMPLES = ("sampl", "acqui", "record", "scan", "adc", "time", "x", "delta", "dt", "fs", "incr")
 
 
-def instrument_lines(path: str, lines: Sequence[str]) -> tuple[Sequence[str], tuple[str, ...]]:
+Form = tuple[Sequence[str], tuple[str, ...], float | None]
+
+
+def instrument_lines(path: str, lines: Sequence[str]) -> Form:
     """Return the lines of a table where an instrument wrote them in its form, else the same lines.
 
-    The second is the header of a table that has none among its lines.
+    With them come the header of a table that has none among its lines, and the time between samples
+    [s] that the head states.
 
     Raises:
         InputError: the head is damaged, or the channels were sampled at different instants.
     """
     if lines[0].strip().startswith("LabVIEW Measurement"):
-        return _labview(path, lines), ()
+        return _labview(path, lines), (), None
     names = [cell.strip() for cell in lines[0].strip().rstrip(",").split(",")]
     if names[0] == "Record Length" and len(names) > 4:
         return _tektronix(lines)
     if names[0] == "X" and names[-2:] == ["Start", "Increment"] and len(lines) > 1:
-        return _oscilloscope(path, lines, names[1:-2]), ()
+        return _rigol(path, lines, names[1:-2])
     head = lines[:_MOST_LINES]
     ends = (k for k, line in enumerate(head) if re.fullmatch(r"#\s*END_HEADER\s*", line))
     end = next(ends, None)
-    return (lines if end is None else _data_recorder(path, lines, end)), ()
+    return (lines, (), None) if end is None else _data_recorder(path, lines, end)
 
 
 def stated_step(lines: Sequence[str]) -> float | None:
@@ -72,47 +76,35 @@ def stated_step(lines: Sequence[str]) -> float | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _tektronix(lines: Sequence[str]) -> tuple[Sequence[str], tuple[str, ...]]:
+def _tektronix(lines: Sequence[str]) -> Form:
     """Return the time and the value of a channel, which stand beside the settings."""
     rows = [[cell.strip() for cell in line.split(",")] for line in lines]
     told = {row[0]: row[1] for row in rows if len(row) > 1 and row[0]}
     unit, clock = (unit_named(told.get(f"{axis} Units", "")) for axis in ("Vertical", "Horizontal"))
     name = told.get("Source") or "value"
     header = (f"time [{clock or 's'}]", f"{name} [{unit}]" if unit else name)
-    return [",".join(row[3:5]) if len(row) > 4 else "" for row in rows], header
+    return [",".join(row[3:5]) if len(row) > 4 else "" for row in rows], header, None
 
 
-def _data_recorder(path: str, lines: Sequence[str], end: int) -> Sequence[str]:
-    """Return a data recorder's table with the time that its sample time gives."""
+def _data_recorder(path: str, lines: Sequence[str], end: int) -> Form:
+    """Return a PI data recorder's table: names and sample time stand in comments above it."""
     head = {m["key"]: m["value"] for line in lines[:end] if (m := _ENTRY.fullmatch(line))}
-    count = sum(re.fullmatch(r"NAME\d+", key) is not None for key in head)
-    names = [head.get(f"NAME{k}", "") for k in range(count)]
-    step = _positive(path, "SAMPLE_TIME", head.get("SAMPLE_TIME", ""))
-    if not count or not all(names):
+    names = tuple(value for key, value in head.items() if re.fullmatch(r"NAME\d+", key) and value)
+    if not names:
         raise InputError(
             f"{path}: its head names no columns (NAME0, NAME1, ...); record the data again."
         )
-    rows, k = [], 0
-    for line in lines[end + 1 :]:
-        cells = re.split(r"[\s,;]+", line.strip())
-        rows.append("\t".join([f"{k * step:.12g}", *cells]) if line.strip() else "")
-        k += bool(line.strip())
-    return [*[""] * end, "\t".join(["time [s]", *names]), *rows]
+    return [*[""] * (end + 1), *lines[end + 1 :]], names, stated_step(lines[:end])
 
 
-def _oscilloscope(path: str, lines: Sequence[str], channels: Sequence[str]) -> Sequence[str]:
-    """Return an oscilloscope's table, whose rows are counted, with the time in their place."""
+def _rigol(path: str, lines: Sequence[str], channels: Sequence[str]) -> Form:
+    """Return the channels of a Rigol oscilloscope, whose rows are counted."""
     units = [cell.strip() for cell in lines[1].strip().rstrip(",").split(",")]
-    start, step = _number(units[-2]) if len(units) > 1 else math.nan, units[-1]
-    width, interval = len(channels), _positive(f"{path}: line 2", "Increment", step)
+    step = _positive(f"{path}: line 2", "Increment", units[-1])
     named = zip(channels, map(unit_named, units[1:]), strict=False)
-    header = ["time [s]", *(f"{name} [{unit}]" if unit else name for name, unit in named)]
-    rows, k = [], 0
-    for line in lines[2:]:
-        cells = line.split(",")[1 : 1 + width]
-        rows.append(",".join([f"{start + k * interval:.12g}", *cells]) if line.strip() else "")
-        k += bool(line.strip())
-    return ["", ",".join(header), *rows]
+    header = tuple(f"{name} [{unit}]" if unit else name for name, unit in named)
+    rows = [",".join(line.split(",")[1 : 1 + len(channels)]) for line in lines[2:]]
+    return ["", "", *rows], header, step
 
 
 def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:

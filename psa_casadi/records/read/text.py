@@ -48,12 +48,13 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
     Raises:
         InputError: the head of an instrument's file is damaged.
     """
-    lines, header = instrument_lines(path, lines) if place == "line" else (lines, ())
+    lines, header, step = instrument_lines(path, lines) if place == "line" else (lines, (), None)
     told = _TOLD_MARK.fullmatch(lines[0]) if lines else None
     mark = told[1] if told else ""
     lines = ["", *lines[1:]] if told else lines
     first = _in_rows(lines, mark) or laid_out(lines, mark)
-    first = Layout(header, ",", 0, 0) if header else first
+    if header:
+        first = Layout(header, delimiter_of(next(filter(holds, lines), "")), 0, 0)
     if first is None:
         return []
     if isinstance(first, Table):
@@ -61,11 +62,11 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
     found = [first, *further_layouts(lines, mark, first)]
     ends = [*(layout.header_line for layout in found[1:]), len(lines)]
     parts = [
-        _Part(path, place, layout, lines[layout.first : end_of_rows(lines, layout, end)], single)
+        _Part(path, place, layout, lines[layout.first : end_of_rows(lines, layout, end)])
         for layout, end in zip(found, ends, strict=True)
-        if (single := len(found) == 1) or end - layout.first >= FEWEST_SAMPLES
+        if len(found) == 1 or end - layout.first >= FEWEST_SAMPLES
     ]
-    step = stated_step(lines[: first.first])
+    step = step or stated_step(lines[: first.first])
     tables = [side for part in parts for side in _side_by_side(part.table(name, step))]
     if len(tables) == 1:
         return tables
@@ -101,13 +102,12 @@ def _side_by_side(table: Table) -> list[Table]:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """The lines of one table below its header; `single` if nothing else is in the file."""
+    """The lines of one table below its header."""
 
     path: str
     place: str
     layout: Layout
     rows: Sequence[str]
-    single: bool
 
     def table(self, name: str, step: float | None) -> Table:
         layout = self.layout
