@@ -36,9 +36,9 @@ from tests.fuzz.target import CRASH, FALSE_PASS, FOREIGN, HANG, LEFT_OVER, Found
 #: Inputs of each target in the quick tier, and in the full one.
 QUICK = {"records-csv": 500, "column-maps": 500, "paths": 200, "models": 200}
 FULL = {
-    "records-csv": 1500, "records-mat": 400, "records-hdf5": 6, "records-parquet": 200,
-    "records-xlsx": 100, "records-tdms": 200, "records-h5": 6, "records-npz": 200,
-    "records-npy": 200, "records-lvm": 200, "records-dat": 200,
+    "records-csv": 1500, "records-mat": 80, "records-hdf5": 20, "records-parquet": 40,
+    "records-xlsx": 40, "records-tdms": 40, "records-h5": 20, "records-npz": 40,
+    "records-npy": 40, "records-lvm": 200, "records-dat": 200,
     "column-maps": 1500, "mapped-records": 300, "units": 1000, "models": 400, "paths": 500,
     "binaries": 1500, "zips": 100, "descriptions": 300, "states": 250,
 }  # fmt: skip
