@@ -43,7 +43,6 @@ def read(path: str, request: Request) -> tuple[Outcome, str]:
             installed.
         MachineError: the other process cannot be started.
     """
-    check_there(path)
     if not ending_of(path):
         tables, digest = text_of(path)
         return samples_of(path, tables, request), digest
@@ -66,7 +65,6 @@ def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
         InputError, MachineError: as `read`.
     """
     place = str(path)
-    check_there(place)
     if not ending_of(place):
         return head_of_tables(place, text_of(place)[0], count, table)
     return Head.from_json(_told(place, {"head": count, "table": table}))
@@ -89,6 +87,7 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
 
 def _told(path: str, asked: dict[str, Any]) -> dict[str, Any]:
     """Return what the process tells of a file."""
+    check_there(path)
     _, package = READERS[ending_of(path)]
     if find_spec(package) is None:
         raise InputError(

@@ -83,31 +83,37 @@ def array_tables(
     scalars = {n.rpartition(".")[2]: s.values() for n, s in series.items() if s.size == 1}
     stated = {*steps, *told_step(scalars)}
     step = stated.pop() if len(stated) == 1 else None
-    whole = _table(path, "", list(series.values()), step, place)
+    texts = {name: _text(one) for name, one in series.items()}
+    whole = _table(path, "", list(series.values()), texts, step, place)
     groups: dict[str, list[Series]] = {}
     for name, one in series.items():
         group, _, last = name.rpartition(".")
         groups.setdefault(last if last.isdecimal() else group, []).append(one)
     shared = groups.get("", [])
     several = {n: [*shared, *own] for n, own in groups.items() if n and len(own) > 1}
-    parts = [_table(path, name, own, step, place) for name, own in several.items()]
+    parts = [_table(path, name, own, texts, step, place) for name, own in several.items()]
     return [whole, *(parts if len(parts) > 1 else [])]
 
 
-def _table(path: str, name: str, series: Sequence[Series], step: float | None, place: str) -> Table:
+def _table(
+    path: str, name: str, series: Sequence[Series], texts: Mapping[str, str], step: float | None,
+    place: str,
+) -> Table:  # fmt: skip
+    """Return the table of some series; `texts` are their names with units."""
+
     def load(asked: Sequence[int], most: int | None, _: Problems) -> Columns:
         check_size(path, 8 * sum(series[k].size for k in asked if most is None), "its columns hold")
         cells = [series[k].values()[: most or series[k].size] for k in asked]
         longest = max(map(len, cells), default=0)
         return Columns(cells, np.arange(1, longest + 1))
 
-    header = [_text(one) for one in series]
     numbered = all(one.name.isdecimal() for one in series) and bool(series)
     kind = "column" if place == "row" else "array"
     labels = [one.name for one in series]
     return Table(
-        path=path, name=name, header=header, labels=labels, where=f"{path}: {kind} names",
-        place=place, load=load, step=step, sizes=[one.size for one in series],
+        path=path, name=name, header=[texts[label] for label in labels], labels=labels,
+        where=f"{path}: {kind} names", place=place, load=load, step=step,
+        sizes=[one.size for one in series],
         headless=", ".join(labels) if numbered else "",
     )  # fmt: skip
 

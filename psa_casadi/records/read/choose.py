@@ -4,6 +4,7 @@ import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -18,21 +19,39 @@ from psa_casadi.records.read.columns import (
     Source,
     check_unit,
     measures,
+    mismatch,
     usual_source,
 )
-from psa_casadi.records.read.names import column_named, stated_unit, unit_for
+from psa_casadi.records.read.names import column_named, stated_unit, unit_for, unit_named
 from psa_casadi.records.read.table import Table
 from psa_casadi.units import parse_unit
 
 _HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 
 
+class Ask(StrEnum):
+    """What an option says that is offered for what is open."""
+
+    COLUMN = "say which column it is"
+    UNIT = "say which, and in which unit"
+    SCALE = "say what 1 in the file is"
+
+
+@dataclass(frozen=True)
+class Question:
+    """Something that a table leaves open: what it is, and what to do in the file, if anything."""
+
+    what: str
+    ask: Ask
+    cure: str = ""
+
+
 @dataclass(frozen=True)
 class Choice:
-    """The columns that a table has for sure; what is open, in sentences, and suggested for it."""
+    """The columns that a table has for sure; what is open, and suggested for it."""
 
     fields: Mapping[str, Field]
-    open: Sequence[str]
+    open: Sequence[Question]
     sources: ColumnMap
 
 
@@ -48,7 +67,7 @@ def choose(table: Table, required: Sequence[str], wanted: ColumnMap, problems: P
     fields: dict[str, Field] = {}
     strangers: list[int] = []
     wrong: dict[str, Source] = {}
-    units = Problems()
+    units: list[Question] = []
     places = {name: _place(source.array, table) for name, source in wanted.items()}
     for index, text in enumerate(table.header):
         match = _HEADER.fullmatch(text.strip())
@@ -72,13 +91,12 @@ def choose(table: Table, required: Sequence[str], wanted: ColumnMap, problems: P
             stated = match["unit"] or (unit_for(name, _last(own)) if asked else None)
             if table.sizes and asked and wanted[name].unit:  # of an array it is more often wrong
                 stated = None
-            scaled = not asked and stated is not None and not measures(name, stated)
-            unit = _agreed_unit(
-                name, stated, wanted.get(name), place, units if scaled else problems
-            )
-            fields[name] = Field(index, unit)
-            if scaled:
-                wrong[name] = usual_source(name, table.labels[index], unit)
+            if asked or stated is None or _is_right(name, stated):
+                stated = _agreed_unit(name, stated, wanted.get(name), place, problems)
+            else:
+                units.append(_of_scale(name, stated, place))
+                wrong[name] = usual_source(name, table.labels[index], stated)
+            fields[name] = Field(index, stated)
     cells, unclear = _by_other_names(table, strangers, fields, required, wanted, units, wrong)
     for name, source in wanted.items():
         if places[name] is None:
@@ -87,11 +105,10 @@ def choose(table: Table, required: Sequence[str], wanted: ColumnMap, problems: P
                 f"the header (found: {_listed(fields, cells)}); correct --columns."
             )
     missing = _missing(table, cells, fields, required, wanted, problems)
-    told = [sentence.removesuffix(".") for sentence in units.sentences()]
     found = _open(table, cells, unclear, missing, fields, wanted)
-    if not told:
+    if not units:
         return found
-    return Choice(found.fields, [*found.open, *told], {**wanted, **wrong, **found.sources})
+    return Choice(found.fields, [*found.open, *units], {**wanted, **wrong, **found.sources})
 
 
 def rises(table: Table, index: int) -> bool:
@@ -156,11 +173,9 @@ def _numbered(table: Table, required: Sequence[str]) -> Choice:
         if k is not None:
             sources[name] = usual_source(name, str(k + 1))
     example = ",".join(COLUMNS[name].example for name in required)
-    told = (
-        f"{table.where}: found '{table.headless[:60]}', expected a header; write a first line such "
-        f"as '{example}'"
-    )
-    return Choice({}, [told], sources)
+    told = f"{table.where}: found '{table.headless[:60]}', expected a header"
+    cure = f"write a first line such as '{example}'"
+    return Choice({}, [Question(told, Ask.UNIT, cure)], sources)
 
 
 def _by_other_names(
@@ -169,14 +184,14 @@ def _by_other_names(
     fields: dict[str, Field],
     required: Sequence[str],
     wanted: ColumnMap,
-    units: Problems,
+    units: list[Question],
     wrong: dict[str, Source],
 ) -> tuple[list[tuple[int, Cell]], dict[str, list[Cell]]]:
     """Add the columns that go by a laboratory's name for them, or by the unit that only one has.
 
     What has a column's own name keeps it, and what has it misspelled is nothing else. Returns the
     cells that remain, and by the name of a column those that may be it. Units that do not measure
-    their column are told in `units`; how it is scaled is asked as in `wrong`.
+    their column are asked about in `units`, with the sources in `wrong`.
     """
     last = _last if table.sizes else str
     cells = [(k, cell_of(last(table.header[k]), table.labels[k])) for k in strangers]
@@ -194,12 +209,23 @@ def _by_other_names(
         if one is None and not (column == "time" and _are_equal(table, may_be)):
             unclear[column] = [c for _, c in may_be]
         else:
-            check_unit(COLUMNS[column], cell.unit, f"{table.where}, column '{cell.text}'", units)
-            if not measures(column, cell.unit or ""):
+            if cell.unit is not None and not measures(column, cell.unit):
+                units.append(_of_scale(column, cell.unit, f"{table.where}, column '{cell.text}'"))
                 wrong[column] = source_of(column, cell)
             taken.append(index)
         fields[column] = Field(index, cell.unit or SI_UNITS.get(column, "um"))
     return [(k, c) for k, c in cells if k not in taken], unclear
+
+
+def _is_right(column: str, unit: str) -> bool:
+    """Whether a unit measures what a column holds, or is none at all, which is told elsewhere."""
+    return measures(column, unit) or unit_named(unit, common=False) is None
+
+
+def _of_scale(column: str, unit: str, where: str) -> Question:
+    """Return the question what 1 in the file is, where the unit measures something else."""
+    what, cure = mismatch(COLUMNS[column], unit)
+    return Question(f"{where}: {what}", Ask.SCALE, cure)
 
 
 def _are_equal(table: Table, cells: Sequence[tuple[int, Cell]]) -> bool:
@@ -249,13 +275,15 @@ def _open(
             for name, own in unclear.items()
         )
         examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
-        told.append(
-            f"{table.where}: {which}{'' if table.sizes else f'; write {examples} in the header'}"
-        )
+        cure = "" if table.sizes else f"write {examples} in the header"
+        told.append(Question(f"{table.where}: {which}", Ask.UNIT, cure))
     known = {name: field for name, field in fields.items() if name not in unclear}
     told += [
-        f"{table.where}: the column '{name}' is missing (found: {_listed(known, cells)})"
-        + ("" if table.sizes else f"; add it to the header as '{COLUMNS[name].example}'")
+        Question(
+            f"{table.where}: the column '{name}' is missing (found: {_listed(known, cells)})",
+            Ask.COLUMN,
+            "" if table.sizes else f"add it to the header as '{COLUMNS[name].example}'",
+        )
         for name in missing
     ]
     main = _main_size(table)

@@ -114,6 +114,13 @@ def measures(name: str, unit: str) -> bool:
 _SPECIAL = re.compile(r"[^\w.,=:+/%@-]")
 
 
+def mismatch(column: Column, unit: str) -> tuple[str, str]:
+    """Return that a unit does not measure what the column holds, and what to do about it."""
+    accepted = ", ".join(name for q in column.quantities for name in units_of(q))
+    what = f"the unit '{unit}' does not measure {column.quantities[0]}"
+    return what, f"correct it to one of {accepted}"
+
+
 def check_unit(column: Column, unit: str | None, where: str, problems: Problems) -> None:
     """Demand a unit that measures what the column holds."""
     accepted = ", ".join(name for q in column.quantities for name in units_of(q))
@@ -129,7 +136,4 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
         problems.add(f"{where}: {error}")
         return
     if not measures(column.name, unit):
-        problems.add(
-            f"{where}: the unit '{unit}' does not measure {column.quantities[0]}; correct it to "
-            f"one of {accepted}."
-        )
+        problems.add(f"{where}: {'; '.join(mismatch(column, unit))}.")

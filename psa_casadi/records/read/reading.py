@@ -25,6 +25,7 @@ from psa_casadi.records.read.join import joined, parts_of
 from psa_casadi.records.read.samples import Outcome, samples_of
 from psa_casadi.records.read.table import Columns
 from psa_casadi.records.read.table import Table as FileTable
+from psa_casadi.records.read.text import label_of
 from psa_casadi.records.record import Record
 from psa_casadi.units import parse_unit, to_si
 
@@ -163,7 +164,7 @@ def _table_of(table: Table, name: str) -> FileTable:
         return Columns([c[:most] for c in cells], np.arange(1, longest + 1))
 
     header = [str(text) for text in own]
-    labels = [text.partition("[")[0].strip() for text in header]
+    labels = [label_of(text) for text in header]
     return FileTable(name, "", header, labels, f"{name}: column names", "row", load)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.choose import Choice, choose
+from psa_casadi.records.read.choose import Ask, Choice, Question, choose
 from psa_casadi.records.read.column_map import ALL
 from psa_casadi.records.read.columns import ColumnMap, ready_line
 from psa_casadi.records.read.convert import (
@@ -94,15 +94,12 @@ def _of_one(table: Table, request: Request, segment: str) -> Outcome:
     outcome, choice, told = _tried(table, request, segment)
     if not told:
         return outcome
-    said = list(told)
+    said = [f"{q.what}; {q.cure}" if q.cure else q.what for q in told]
     offer, key = _offer(table, request, choice, segment)
     if offer:
-        how = (
-            "say which column it is" if "is missing" in said[-1] else "say which, and in which unit"
-        )
-        how = "say what 1 in the file is" if "does not measure" in said[-1] else how
-        how = how if offer[0] else "give the time between samples"
-        join = ", or" if "; " in said[-1] else ";"
+        last = told[-1]
+        how = last.ask if offer[0] else "give the time between samples"
+        join = ", or" if last.cure else ";"
         said[-1] += f"{join} {how}: {ready_line(*offer, key or request.table)}"
     elif len(table.header) == 2 and not table.sizes:
         said[-1] += "; files of one channel each are joined as FILE+FILE"
@@ -133,7 +130,7 @@ def _offer(
     return None, ""
 
 
-def _tried(table: Table, request: Request, segment: str) -> tuple[Outcome, Choice, list[str]]:
+def _tried(table: Table, request: Request, segment: str) -> tuple[Outcome, Choice, list[Question]]:
     """Return what a table is read to, the choice of its columns, and what that leaves open."""
     problems = Problems()
     notes: list[str] = []
@@ -153,5 +150,5 @@ def _tried(table: Table, request: Request, segment: str) -> tuple[Outcome, Choic
             if not told:  # what is open is asked first: no table alone would be read
                 problems.add(str(several))
         except NoTimeOfTheirOwn as error:
-            told.append(str(error))
+            told.append(Question(str(error), Ask.UNIT))
     return outcome, choice, told

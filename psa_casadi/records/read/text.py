@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +130,7 @@ class _Part:
         return cells_of(row, self.layout.delimiter)
 
     def _load(self, asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
-        kept = self._kept()
+        kept = self._kept
         rows = [self.rows[k] for k in kept[:most]]
         lines = np.asarray(kept[:most], dtype=np.int64) + self.layout.first + 1
         quick = self._at_once(rows, asked)
@@ -152,6 +153,7 @@ class _Part:
         columns = [[cells[k] for cells in split] for k in asked]
         return Columns(columns, np.array(whole, dtype=np.int64))
 
+    @cached_property
     def _kept(self) -> list[int]:
         """Return the indices of the rows that hold cells, up to what stands below the numbers."""
         marks = tuple(m for m in _COMMENTS if m != self.layout.delimiter)
@@ -185,15 +187,17 @@ class _Part:
             return None
         if point == ",":
             body = body.translate(words.SWAPPED)
-        for _ in range(2):
-            body = body.replace(mark * 2, f"{mark}nan{mark}") if mark != " " else body
-        body = f"\n{body}\n".replace(f"{mark}\n", f"{mark}nan\n").replace(
-            f"\n{mark}", f"\nnan{mark}"
-        )
+        body = f"\n{body}\n"
+        if point == "," or any(gap in body for gap in (mark * 2, f"{mark}\n", f"\n{mark}")):
+            for gap, filled in (
+                (mark * 2, f"{mark}nan{mark}"), (mark * 2, f"{mark}nan{mark}"),
+                (f"{mark}\n", f"{mark}nan\n"), (f"\n{mark}", f"\nnan{mark}"),
+            ):  # fmt: skip
+                body = body.replace(gap, filled)
+            rows = body[1:-1].split("\n")
+        del body  # of a long record it is as large as the rows
         try:
-            values = np.loadtxt(
-                body[1:-1].split("\n"), delimiter=mark, comments=None, usecols=asked, ndmin=2
-            )
+            values = np.loadtxt(rows, delimiter=mark, comments=None, usecols=asked, ndmin=2)
         except ValueError:
             return None
         return None if np.any((np.abs(values) > 1e8) & np.isfinite(values)) else values
