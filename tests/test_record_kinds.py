@@ -297,6 +297,19 @@ def test_channels_in_files_of_their_own_are_joined(tmp_path: Path) -> None:
     assert "have no instants in common" in refused(Path(f"{one}+{other}"))
 
 
+def test_dates_of_files_to_be_joined_are_on_one_clock(tmp_path: Path) -> None:
+    def stamped(late: float) -> list[str]:
+        return [f"2024-03-05 14:11:02.{round(1e6 * (t + late)):06d}" for t in T]
+
+    drive = table("Timestamp,U [V]", columns=(stamped(0.0), V))
+    sensor = table("Timestamp,x [um]", columns=(stamped(2e-3), X))  # begins five samples later
+    paths = [written(tmp_path, drive, "v.csv"), written(tmp_path, sensor, "x.csv")]
+    (record,) = read_records(paths)
+    assert_is(record, t=T[5:], v=V[5:], x=X[:-5])
+    bare = written(tmp_path, channel(X, "um"), "bare.csv")
+    assert "some have dates or clock times, others numbers" in refused(Path(f"{paths[0]}+{bare}"))
+
+
 def tektronix(name: str, values: Any) -> str:
     head = {"Record Length": N, "Sample Interval": 4e-4, "Source": name, "Vertical Units": "V",
             "Horizontal Units": "s"}  # fmt: skip

@@ -39,12 +39,12 @@ def joined(
     Raises:
         InputError: a file is no table of a time and channels.
     """
-    clocks, channels, resampled = [], [], []
-    for path, tables, _ in files:
-        time, own = _channels(path, tables)
+    held = [(path, *_channels(path, tables)) for path, tables, _ in files]
+    clocks = _clocks([(path, cells, unit) for path, cells, unit, _ in held])
+    channels, resampled = [], []
+    for (path, _, _, own), time in zip(held, clocks, strict=True):
         if alone and len(own) != 1:
             raise InputError(f"{path}: holds {len(own)} channels beside the time, expected one.")
-        clocks.append(time)
         channels += [(path, name, unit, time, values) for name, unit, values in own]
     first = clocks[0]
     shared = (first >= max(t[0] for t in clocks)) & (first <= min(t[-1] for t in clocks))
@@ -75,10 +75,26 @@ def joined(
     return outcome, digest
 
 
+def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
+    """Return the times of files, each given by path, cells and unit, on one clock [s].
+
+    Dates and clock times are counted from the first of all files together.
+    """
+    texts = [[str(cell) for cell in cells] for _, cells, _ in times]
+    are_stamps = [clock.is_stamp(own[0]) for own in texts]
+    together = clock.seconds([cell for own in texts for cell in own]) if all(are_stamps) else None
+    if together is not None:
+        return np.split(together, np.cumsum([len(own) for own in texts])[:-1])
+    if any(are_stamps):
+        named = ", ".join(path for path, *_ in times)
+        raise InputError(f"{named}: some have dates or clock times, others numbers; give all one.")
+    return [to_si(_numbers(cells), unit) for _, cells, unit in times]
+
+
 def _channels(
     path: str, tables: Sequence[Table]
-) -> tuple[FloatArray, list[tuple[str, str | None, FloatArray]]]:
-    """Return the time [s] of a file and its channels: name, unit, values."""
+) -> tuple[Cells, str, list[tuple[str, str | None, FloatArray]]]:
+    """Return the times of a file with their unit, and its channels: name, unit, values."""
     table = tables[0] if tables else None
     at = next((k for k in range(len(table.header)) if rises(table, k)), None) if table else None
     if table is None or at is None:
@@ -86,19 +102,17 @@ def _channels(
     problems = Problems()
     columns = table.load(range(len(table.header)), None, problems)
     problems.raise_if_any()
-    numbers = [_numbers(cells) for cells in columns.cells]
     units = [stated_unit(text) for text in table.header]
-    time = to_si(numbers[at], units[at] or "s")
+    numbers = {k: _numbers(cells) for k, cells in enumerate(columns.cells) if k != at}
     own = [
-        (table.labels[k], units[k], numbers[k])
-        for k in range(len(numbers))
-        if k != at and np.isfinite(numbers[k]).any()
+        (table.labels[k], units[k], values)
+        for k, values in numbers.items()
+        if np.isfinite(values).any()
     ]
-    return time, own
+    return columns.cells[at], units[at] or "s", own
 
 
 def _numbers(cells: Cells) -> FloatArray:
     if isinstance(cells, np.ndarray):
         return cells.astype(np.float64)
-    stamps = clock.seconds(cells)
-    return words.numbers(cells, words.decimal_sign(cells), "").values if stamps is None else stamps
+    return words.numbers(cells, words.decimal_sign(cells), "").values
