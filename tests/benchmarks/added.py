@@ -18,7 +18,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.turns import reversals
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden_cases import names_of
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, share
 from tests.plants.base import simulate_base
 from tests.plants.hide import hide
 from tests.plants.stack import FloatArray, draw_stack

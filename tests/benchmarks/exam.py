@@ -16,7 +16,7 @@ from psa_casadi.diagnosis.task import Method
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record as Measured
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 from tests.exam.marks import Answer, Named, mark
 from tests.exam.play import write
 from tests.exam.record import Record

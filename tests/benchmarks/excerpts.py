@@ -19,7 +19,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 #: The seed, which no other benchmark uses; pieces; their samples.
 SEED, PIECES, QUICK_PIECES, LENGTHS = 740501, 200, 6, (300, 2500)

@@ -25,7 +25,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, share
 
 FloatArray = npt.NDArray[np.float64]
 

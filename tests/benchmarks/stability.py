@@ -20,7 +20,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.exam import read_back
 from tests.benchmarks.hidden_cases import Case, names_of, records_of, study
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, share
 from tests.exam.record import Record as ExamRecord
 from tests.exam.records import RECORDS
 from tests.plants.table import FOREIGN, KNOWN
