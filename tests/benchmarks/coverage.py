@@ -8,11 +8,8 @@ covariance of the fit gives it. Every stack has its own draws. Beside the share 
 stands what these draws alone give (`coverage_control`).
 """
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +24,7 @@ from psa_casadi.records import Record
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.records import Values, clean_set, with_noise
-from tests.benchmarks.table import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
 
 FloatArray = npt.NDArray[np.float64]
 _STEP, _RTOL = 1e-5, 1e-8
@@ -142,13 +139,8 @@ def run_sized(progress: Progress, count: int) -> Outcome:
 
 def _over(names: Sequence[str], seeds: int, progress: Progress) -> Outcome:
     """Identify the named stacks from `seeds` sets of records each, on all cores."""
-    runs: list[Run] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        for name in names:
-            jobs = [pool.submit(one_run, name, seed) for seed in range(seeds)]
-            for k, job in enumerate(jobs):
-                runs.append(job.result())
-                progress(f"{name}: {k + 1} of {seeds}")
+    jobs = [(name, seed) for name in names for seed in range(seeds)]
+    runs = on_all_cores(one_run, jobs, lambda run: run.stack, progress)
     return Outcome((_quantities(runs), _residuals(runs)))
 
 

@@ -1,12 +1,9 @@
 """The benchmark `diagnose`: hidden causes on independent plants, and what was named."""
 
 import itertools
-import os
 import tempfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +21,7 @@ from psa_casadi.records.split import Experiment, judging
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate_record
 from tests.benchmarks.hidden_cases import ORDINARY, Case, Found, limits_table, run_case, study
-from tests.benchmarks.table import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
 from tests.plants.again import play_again
 from tests.plants.make import Truth, make_record
 from tests.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
@@ -155,17 +152,11 @@ class Covered:
 
 def gain_table(known: Sequence[str], first: int, progress: Progress) -> TitledTable:
     """Diagnose one record with each effect and compare its gain with that of further records."""
-    found: list[Covered] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [
-            pool.submit(covered, effect, first + 100 * k) for k, effect in enumerate(known, start=1)
-        ]
-        for job in as_completed(jobs):
-            one = job.result()
-            if one is not None:
-                found.append(one)
-                progress(f"gain of {one.effect}: {one.reduction:.1f} %, blocks {one.blocks}")
-    return intervals_table(found)
+    jobs = [(effect, first + 100 * k) for k, effect in enumerate(known, start=1)]
+    found = on_all_cores(
+        covered, jobs, lambda one: f"gain of {one.effect}" if one else "", progress
+    )
+    return intervals_table([one for one in found if one])
 
 
 def intervals_table(found: Sequence[Covered]) -> TitledTable:
@@ -261,18 +252,7 @@ def diagnose_all(
     only: bool = False,
 ) -> list[Found]:
     """Diagnose the cases side by side; with `only`, by a table of the right effect alone."""
-    found: list[Found] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [pool.submit(run_case, case, method, only=only) for case in cases]
-        for job in as_completed(jobs):
-            one = job.result()
-            found.append(one)
-            hidden = " and ".join(one.case.hidden) or "nothing"
-            progress(
-                f"{len(found)} of {len(cases)}: {one.case.kind}, {hidden} ({one.case.seed}), rho"
-                f" {one.rho:.2f}: {one.verdict} {', '.join(one.within)} [{one.seconds:.0f} s]"
-            )
-    return found
+    return on_all_cores(run_case, [(case, method, only) for case in cases], str, progress)
 
 
 def result_tables(found: Sequence[Found]) -> list[TitledTable]:

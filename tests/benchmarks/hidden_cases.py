@@ -102,6 +102,12 @@ class Found:
     patch: str = ""
     patched: float = 0.0
 
+    def __str__(self) -> str:
+        """Return case and answer in a line."""
+        hidden = " and ".join(self.case.hidden) or "nothing"
+        case = f"{self.case.kind}, {hidden} ({self.case.seed}), rho {self.rho:.2f}"
+        return f"{case}: {self.verdict} {', '.join(self.within)} [{self.seconds:.0f} s]"
+
     @property
     def reached(self) -> bool:
         """Whether what is hidden is as visible as was asked for; true where nothing is hidden."""
@@ -142,7 +148,7 @@ def records_of(case: Case, folder: Path) -> tuple[Truth, list[Record]]:
     return truth, records
 
 
-def run_case(case: Case, method: Method | None = None, *, only: bool = False) -> Found:
+def run_case(case: Case, method: Method | None = None, only: bool = False) -> Found:
     """Make the records of a case, diagnose the files, and compare.
 
     With `only`, the right effect is the only one in the table.

@@ -1,14 +1,19 @@
 """The table of benchmarks: each is loaded when it is run."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
 from matplotlib.figure import Figure
 
 from psa_casadi.report.words.tables import Table
 
+T = TypeVar("T")
 #: Tells a step of long work.
 Progress = Callable[[str], None]
 
@@ -49,6 +54,23 @@ class Bench:
     run: Callable[[Progress, bool], Outcome]
     run_on: Callable[[Progress, Path], Outcome] | None = None
     run_sized: Callable[[Progress, int], Outcome] | None = None
+
+
+def on_all_cores(
+    function: Callable[..., T],
+    jobs: Iterable[tuple[Any, ...]],
+    tell: Callable[[T], str],
+    progress: Progress,
+) -> list[T]:
+    """Return function(*job) of every job, in their order, worked on side by side on all cores.
+
+    `tell` says in words what one has given.
+    """
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        futures = [pool.submit(function, *job) for job in jobs]
+        for k, future in enumerate(as_completed(futures), 1):
+            progress(f"{k} of {len(futures)}: {tell(future.result())}")
+    return [future.result() for future in futures]
 
 
 def share(count: int, of: int) -> str:
