@@ -5,7 +5,8 @@ from psa_casadi.scales import charge_scale, current_scale, voltage_scale
 from psa_casadi.variables import Input, Output, Parameter, State
 
 
-def _equations(s: Symbols) -> Equations:
+def _drive(s: Symbols) -> Equations:
+    """Drive stage: amplifier with gain and output resistance, charging the stack's capacitance."""
     return Equations(
         der={"u": s.voltage_rate},
         add={
@@ -23,7 +24,7 @@ DRIVE = Component(
     name="drive",
     description="amplifier of gain G and output resistance R_s charging the stack (C_p)",
     source="circuit of a stack on a voltage amplifier; supplies u' to Yang and Zhu 2015, eq. 8",
-    equations=_equations,
+    equations=_drive,
     equation_text="C_p u' = i,  i = (G v - u) / R_s",
     parameters=(
         Parameter("G", 1.0, "1", (1e-3, 1e4), "voltage gain of the amplifier"),

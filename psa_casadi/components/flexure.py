@@ -4,7 +4,8 @@ from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.variables import Input, Output, Parameter, State
 
 
-def _equations(s: Symbols) -> Equations:
+def _flexure(s: Symbols) -> Equations:
+    """A flexure stage that a stack pushes on through a contact spring: a second model to couple."""
     contact = s.k_c * (s.tip_position - s.x_f) + s.c_c * (s.tip_velocity - s.v_f)
     return Equations(
         der={"x_f": s.v_f, "v_f": (contact - s.c_f * s.v_f - s.k_f * s.x_f) / s.m_f},
@@ -17,7 +18,7 @@ FLEXURE = Component(
     description="guided stage (mass, damper, spring) behind a contact stiffness",
     source="Newton's second law; Yang and Zhu 2015, eq. 44 for the mechanism",
     equation_text="m_f x_f'' + c_f x_f' + k_f x_f = F,  F = k_c (x - x_f) + c_c (x' - x_f')",
-    equations=_equations,
+    equations=_flexure,
     parameters=(
         Parameter("m_f", 0.2, "kg", (1e-6, 1e3), "mass of the stage", log=True),
         Parameter("c_f", 50.0, "N.s/m", (0.0, 1e9), "damping of the flexure"),

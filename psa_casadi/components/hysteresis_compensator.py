@@ -12,7 +12,7 @@ from psa_casadi.scales import voltage_scale
 from psa_casadi.variables import Input, Output, Parameter, State, Values
 
 
-def _equations(s: Symbols) -> Equations:
+def _hysteresis_compensator(s: Symbols) -> Equations:
     """`free_force - k_L u` is what `bouc_wen` and its extensions add to the linear force."""
     excess = s.free_force - s.k_L * s.u
     return Equations(
@@ -43,7 +43,7 @@ HYSTERESIS_COMPENSATOR = Component(
     ),
     belongs_to="drive",
     needs=("linear_force", "bouc_wen"),
-    equations=_equations,
+    equations=_hysteresis_compensator,
     parameters=(
         Parameter("drive_gain", 1.0, "1", (1e-3, 1e4), "volts at the electrodes per command"),
         Parameter(

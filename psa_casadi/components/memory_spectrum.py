@@ -14,7 +14,8 @@ _THRESHOLDS = tuple(0.0125 * 2.0**i for i in range(8))
 _COUNTS = (5, 3, 3)
 
 
-def _equations(s: Symbols) -> Equations:
+def _memory_spectrum(s: Symbols) -> Equations:
+    """The hysteresis as a spectrum of elements: what stands in the place of Bouc-Wen's."""
     elements = [getattr(s, f"z_{i + 1}") for i in range(len(_THRESHOLDS))]
     return Equations(
         der={
@@ -56,5 +57,5 @@ MEMORY_SPECTRUM = Component(
         HOLD_RATE,
     ),
     states=tuple(_state(i + 1) for i in range(len(_THRESHOLDS))),
-    equations=_equations,
+    equations=_memory_spectrum,
 )

@@ -79,7 +79,7 @@ def gathered(values: list[Expression]) -> Memory:
     )
 
 
-def _equations(s: Symbols) -> Equations:
+def _online_identification(s: Symbols) -> Equations:
     c = constants({p.name: getattr(s, p.name) for p in _PARAMETERS})
     now = gathered([getattr(s, state.name) for state in SAMPLED])
     after = advance(c, now, s.voltage, s.position)
@@ -131,7 +131,7 @@ ONLINE_IDENTIFICATION = Component(
         "  P+ = S (P - P d d'P/(noise^2 + d'P d)) S;  d: derivatives of the prediction"
     ),
     belongs_to="drive",
-    equations=_equations,
+    equations=_online_identification,
     parameters=_PARAMETERS,
     sampled=SAMPLED,
     sample_period="period",

@@ -27,7 +27,7 @@ def _notch(s: Symbols, error: Expression) -> tuple[Expression, Expression, Expre
     return filtered, first, b_2 * error - a_2 * filtered
 
 
-def _equations(s: Symbols) -> Equations:
+def _position_controller(s: Symbols) -> Equations:
     error, first, second = _notch(s, s.reference - s.filtered_position)
     integral = s.integral + 0.5 * s.integral_gain * s.sample_time * (error + s.last_error)
     wanted = s.proportional_gain * error + integral + s.feed_forward * s.reference
@@ -67,7 +67,7 @@ POSITION_CONTROLLER = Component(
         "  N = (s^2 + 2 floor w_n s + w_n^2) / (s^2 + 2 width w_n s + w_n^2), Tustin at w_n"
     ),
     belongs_to="drive",
-    equations=_equations,
+    equations=_position_controller,
     sample_period="sample_time",
     parameters=(
         Parameter("sample_time", 5e-5, "s", (1e-7, 10.0), "period of the controller", "us"),

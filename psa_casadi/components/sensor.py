@@ -5,7 +5,8 @@ from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Output
 
 
-def _equations(s: Symbols) -> Equations:
+def _sensor(s: Symbols) -> Equations:
+    """The displacement sensor: shows the displacement, plus whatever the sensor's effects add."""
     return Equations(
         add={"measured_displacement": s.displacement},
         out={"measured_displacement": s.measured_displacement},
@@ -18,7 +19,7 @@ SENSOR = Component(
     source="definition",
     equation_text="x_m = x",
     belongs_to="sensor",
-    equations=_equations,
+    equations=_sensor,
     outputs=(
         Output(
             "measured_displacement", "m", "displacement as the sensor shows it", stroke_scale, "um"

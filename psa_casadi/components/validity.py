@@ -19,7 +19,7 @@ def _beyond(value: Expression, low: Expression, high: Expression) -> Expression:
     return ca.fmax(0.0, ca.fmax(low - value, value - high) / size - MARGIN)
 
 
-def _equations(s: Symbols, *, temperature: bool) -> Equations:
+def _validity(s: Symbols, *, temperature: bool) -> Equations:
     rate = s.voltage_rate / s.G
     outside = _beyond(s.voltage, s.seen_voltage_low, s.seen_voltage_high)
     outside += ca.fmax(0.0, ca.fabs(rate) / s.seen_voltage_rate - 1.0 - MARGIN)
@@ -57,7 +57,7 @@ def _component(name: str, *, temperature: bool) -> Component:
         name=name,
         description="tells how far a run has left what the records behind the model have shown",
         source="definition; the ranges are those of the records",
-        equations=partial(_equations, temperature=temperature),
+        equations=partial(_validity, temperature=temperature),
         equation_text=_TEXT.format(" + beyond(T)" if temperature else ""),
         parameters=(*_RANGES, *(_WARM if temperature else ())),
         outputs=(Output(OUTPUT, "1", meaning),),

@@ -15,7 +15,13 @@ from psa_casadi.variables import Parameter, State
 _WIDTH = 1e-9
 
 
-def _equations(s: Symbols) -> Equations:
+def _ageing(s: Symbols) -> Equations:
+    """Ageing: the gain falls with the logarithm of time, or of the cycles that the stack has made.
+
+    Time counts from the zero of the record's clock; before it nothing ages. What went on earlier,
+    since the poling of the ceramic, is part of k_L. Where cycles age it, one at rated voltage
+    counts as one second does; which of the two it is, is not fitted but tried.
+    """
     age = s.time + s.ageing_by_travel * (s.travel - s.time)
     ages = age / s.ageing_time
     since = 0.5 * (ages + ca.sqrt(ages**2 + _WIDTH**2))
@@ -50,7 +56,7 @@ AGEING = Component(
     states=(
         State("travel", "s", "cycles at rated voltage, 1 s each", 1.0, memory=True, settles=False),
     ),
-    equations=_equations,
+    equations=_ageing,
     probe={"ageing_time": (0.1, 10.0), "ageing_by_travel": (0.0, 1.0)},
     remedy=Remedy("identify_again", "record"),
     looks_like="the gain falls by the same share with every decade of time, or of cycles made",

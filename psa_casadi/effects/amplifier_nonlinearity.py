@@ -10,7 +10,13 @@ from psa_casadi.effects.bend import ANGLES, BEND_TEXT, bend, shape_parameters
 from psa_casadi.variables import Parameter
 
 
-def _equations(s: Symbols) -> Equations:
+def _amplifier_nonlinearity(s: Symbols) -> Equations:
+    """Amplifier nonlinearity: the amplifier's gain changes with its output.
+
+    A stack whose strain per volt changes with the voltage bends the displacement in the same way,
+    but for the hysteresis, which an amplifier bends as well. A monitor of the output voltage tells
+    them apart: the effect is looked for where there is one.
+    """
     share = s.G * s.voltage / s.u_rated
     bent = s.amplifier_gain * s.u_rated * bend(share, s.amplifier_angle, s.amplifier_wave)
     return Equations(add={"drive_voltage": bent})
@@ -37,7 +43,7 @@ AMPLIFIER_NONLINEARITY = Component(
         ),
         *shape_parameters("amplifier"),
     ),
-    equations=_equations,
+    equations=_amplifier_nonlinearity,
     needs_column=("monitor_voltage",),
     probe={"amplifier_angle": ANGLES},
     remedy=Remedy("measure_voltage", "range"),

@@ -15,7 +15,14 @@ from psa_casadi.variables import Parameter, State, Values
 _SHARPNESS = 4.0
 
 
-def _equations(s: Symbols) -> Equations:
+def _backlash(s: Symbols) -> Equations:
+    """Backlash: the output dwells after every reversal until a gap of fixed width is crossed.
+
+    Play is the motion minus a stop: z follows the output mass until |z| = w and then rests. After a
+    reversal z moves from one end to the other and the output, at gain 1, stands still over 2 w. A
+    guide with dry friction does the same in the displacement: it holds the output back over a fixed
+    width.
+    """
     full = stroke(s)
     ratio = s.z_b / (s.backlash_width * full)
     speed = smooth_magnitude(s.v_x, s.hold_rate * full / s.u_rated)
@@ -61,7 +68,7 @@ BACKLASH = Component(
             settles=False,
         ),
     ),
-    equations=_equations,
+    equations=_backlash,
     probe={"backlash_width": (0.003, 0.01)},
     remedy=Remedy("preload", "reversal"),
     looks_like="a dwell of one fixed width after every reversal, whatever the amplitude",

@@ -1,4 +1,4 @@
-"""Current limit: the amplifier cannot deliver more than a certain current; steps become ramps."""
+"""Current limit: the amplifier delivers no more than a certain current; steps become ramps."""
 
 import casadi as ca
 
@@ -12,7 +12,8 @@ _SHARPNESS = 8
 _TRIED = tuple(0.1 * 1.5**k for k in range(15))
 
 
-def _equations(s: Symbols) -> Equations:
+def _current_limit(s: Symbols) -> Equations:
+    """Current limit: the amplifier delivers no more than a certain current; steps become ramps."""
     # i / (1 + (g i)^m)^(1/m) without overflow for large g i
     magnitude = ca.sqrt((s.inverse_current_limit * s.drive_current) ** 2 + 1e-30)
     larger = ca.fmax(1.0, magnitude)
@@ -40,7 +41,7 @@ CURRENT_LIMIT = Component(
             "inverse_current_limit", 0.0, "1/A", (0.0, 1e9), "one over the limit", scale=_scale
         ),
     ),
-    equations=_equations,
+    equations=_current_limit,
     remedy=Remedy("more_current", "slew"),
     looks_like="steps become ramps; the rate of the displacement is capped at one value",
 )

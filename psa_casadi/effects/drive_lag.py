@@ -12,7 +12,12 @@ from psa_casadi.variables import Parameter, State
 _FLOOR = 1e-6
 
 
-def _equations(s: Symbols) -> Equations:
+def _drive_lag(s: Symbols) -> Equations:
+    """Drive lag: the amplifier follows its command through a lag of second order.
+
+    v_d = G v / (1 + s T + shape s^2 T^2): one pole for a shape of 0, two equal ones for 1/4, the
+    maximally flat pair for 1/2. Beside the base's R_s C_p a single pole hardly shows.
+    """
     command, time = s.G * s.voltage, s.drive_lag_time + _FLOOR
     behind = s.drive_lag_voltage - command
     return Equations(
@@ -55,7 +60,7 @@ DRIVE_LAG = Component(
         State("drive_lag_voltage", "V", "command behind the lag", voltage_scale),
         State("drive_lag_slope", "V", "its rate times the time constant", voltage_scale),
     ),
-    equations=_equations,
+    equations=_drive_lag,
     probe={"drive_lag_shape": (0.01, 0.4)},
     remedy=Remedy("better_drive", "slew"),
     looks_like=(

@@ -13,7 +13,13 @@ from psa_casadi.variables import Parameter
 _WIDTH = 1e-3
 
 
-def _equations(s: Symbols) -> Equations:
+def _field_dependent_capacitance(s: Symbols) -> Equations:
+    """Field-dependent capacitance: the stack takes more charge per volt at high voltage.
+
+    dq/du = C_p (1 + capacitance_gain |u|/u_rated), Rayleigh's law of the polarisation. The
+    displacement shows no more of it than a drive whose lag grows with the voltage, so that it is
+    looked for where a charge or a current was measured.
+    """
     share = smooth_magnitude(s.u, _WIDTH * s.u_rated) / s.u_rated
     grown = s.capacitance_gain * share
     return Equations(
@@ -43,7 +49,7 @@ FIELD_DEPENDENT_CAPACITANCE = Component(
             scale=0.1,
         ),
     ),
-    equations=_equations,
+    equations=_field_dependent_capacitance,
     needs_column=("charge", "current"),
     remedy=Remedy("control_charge", "slew"),
     looks_like="charge per volt grows with the amplitude; the drive's lag grows with the voltage",

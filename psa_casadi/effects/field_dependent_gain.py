@@ -15,7 +15,15 @@ from psa_casadi.variables import Parameter
 _WIDTH = 1e-3
 
 
-def _equations(s: Symbols) -> Equations:
+def _field_dependent_gain(s: Symbols) -> Equations:
+    """Field-dependent gain: the displacement per volt grows with the voltage.
+
+    Rayleigh's law is d(E_0) = d_0 + alpha E_0 for an amplitude E_0: strain d_0 E + alpha E_0 E,
+    with loops (alpha/2) (E_0^2 - E^2) around it. A drive that swings from 0 to a peak and back has
+    its reversals at u = 0 and at the peak, and along its first branch, from the unpolarised rest,
+    the law is d_0 E + alpha E |E|. The loops around this curve are the hysteresis force's business;
+    the bend of their middle line is what the base lacks.
+    """
     share = smooth_magnitude(s.u, _WIDTH * s.u_rated) / s.u_rated
     return Equations(add={"free_force": s.k_L * s.field_gain * s.u * share})
 
@@ -34,7 +42,7 @@ FIELD_DEPENDENT_GAIN = Component(
             "field_gain", 0.0, "1", (0.0, 2.0), "growth of the gain at rated voltage", scale=0.05
         ),
     ),
-    equations=_equations,
+    equations=_field_dependent_gain,
     remedy=Remedy("undo_curve", "range"),
     looks_like="the gain grows in proportion to the amplitude; both branches curve upwards",
 )

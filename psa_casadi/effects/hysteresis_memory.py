@@ -1,4 +1,4 @@
-"""Hysteresis memory: the error depends on past reversal points; minor loops nest differently."""
+"""Hysteresis memory: the error depends on past reversals; minor loops nest differently."""
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.plays import spectrum_force, spectrum_parameters
@@ -19,7 +19,8 @@ _ORDINARY = 0.02
 _WEIGHTS = tuple(spectrum_parameters("memory_", _COUNTS, (_ORDINARY, 0.5 * _ORDINARY)))
 
 
-def _equations(s: Symbols) -> Equations:
+def _hysteresis_memory(s: Symbols) -> Equations:
+    """Hysteresis memory: the error depends on past reversals; minor loops nest differently."""
     elements = [getattr(s, f"z_m{i + 1}") for i in range(len(_RATIOS))]
     first = s.memory_threshold * s.u_rated
     total = spectrum_force(s, "memory_", elements, _COUNTS)
@@ -76,7 +77,7 @@ HYSTERESIS_MEMORY = Component(
         *_WEIGHTS,
     ),
     states=tuple(_state(i + 1) for i in range(len(_RATIOS))),
-    equations=_equations,
+    equations=_hysteresis_memory,
     probe={"memory_threshold": (0.015, 0.12)},
     remedy=Remedy("undo_hysteresis", "reversal"),
     looks_like=(

@@ -20,7 +20,17 @@ from psa_casadi.variables import Parameter
 _MOST = 0.5
 
 
-def _equations(s: Symbols) -> Equations:
+def _load_stiffness(s: Symbols) -> Equations:
+    """Load stiffness: an elastic load or guide whose stiffness changes with displacement.
+
+    A linear load is no effect of its own: it stiffens k_B (or k) and, for the same stroke per volt,
+    scales k_L, so that voltage and displacement cannot tell a stack with a spring from a stiffer
+    one. Only a factor that depends on displacement shows: contacts and disc springs bow the curve,
+    flexures that stretch bend it at the end (Duffing's cubic force 20 sin(a) gain q^3 is the angle
+    a = atan(1/5)). Below the resonances a load and a bent sensor are the same curve over the
+    displacement, so that both have the same forms. A force near half of what the stack can exert
+    levels off: a load that softens would run away.
+    """
     force = s.load_gain * bend(s.x / stroke(s), s.load_angle, s.load_wave)
     levelled = force / ca.sqrt(1 + (force / _MOST) ** 2)
     return Equations(add={"tip_force": -static_stiffness(s) * stroke(s) * levelled})
@@ -46,7 +56,7 @@ LOAD_STIFFNESS = Component(
         ),
         *shape_parameters("load"),
     ),
-    equations=_equations,
+    equations=_load_stiffness,
     curve="displacement",
     measured_by="load_force",
     probe={"load_angle": ANGLES},

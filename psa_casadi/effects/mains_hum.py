@@ -17,7 +17,16 @@ from psa_casadi.variables import Parameter, State
 _TWO_PI = 6.283185307179586
 
 
-def _equations(s: Symbols) -> Equations:
+def _mains_hum(s: Symbols) -> Equations:
+    """Mains hum: a line at one frequency in the reading, whatever the drive does.
+
+    The hum is an undamped oscillator w1' = w w2, w2' = -w w1 whose amplitude and phase are each
+    record's own. It is written in the frame that turns with it: w1 = a cos(w t) + b sin(w t) with
+    a' = b' = 0, the exact solution. So it costs no steps, keeps its amplitude for any number of
+    periods, and a line above the sampling rate shows up at its alias. a and b are memories that
+    rest at any value; at the start (0, 0) there is no hum. The gain has either sign, so that one
+    start serves both phases.
+    """
     angle = _TWO_PI * s.hum_frequency * s.time
     hum = s.hum_cosine * ca.cos(angle) + s.hum_sine * ca.sin(angle)
     return Equations(
@@ -50,7 +59,7 @@ MAINS_HUM = Component(
         Parameter("hum_frequency", 50.0, "Hz", (0.05, 1e5), "frequency of the line", log=True),
     ),
     states=(_part("cosine"), _part("sine")),
-    equations=_equations,
+    equations=_mains_hum,
     probe={"hum_frequency": SPECTRAL_PEAKS},
     remedy=Remedy("shield", "record"),
     looks_like="a narrow line in the residual's spectrum, as strong when the voltage rests",

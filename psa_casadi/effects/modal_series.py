@@ -17,7 +17,13 @@ _TWO_PI = 6.283185307179586
 FEWEST, MOST = 2, 9
 
 
-def _equations(count: int, s: Symbols) -> Equations:
+def _modal_series(count: int, s: Symbols) -> Equations:
+    """Modal series: several resonances of the mount, the guide or the load that the stack moves.
+
+    Every mode is driven by the force of the wafers and adds its share to the displacement. A
+    residue that is not in phase with the force, of damping that is not proportional, has a part
+    ahead of it. There is a component for every number of modes.
+    """
     der, total, rest = {}, 0.0, s.wafer_force * _compliance(s)
     for k in range(1, count + 1):
         q, rate = getattr(s, f"q_s{k}"), getattr(s, f"r_s{k}")
@@ -81,7 +87,7 @@ def modal_series(count: int) -> Component:
         ),
         parameters=(gain, *(p for k in numbers for p in _parameters(k))),
         states=tuple(s for k in numbers for s in _states(k)),
-        equations=partial(_equations, count),
+        equations=partial(_modal_series, count),
         remedy=Remedy("avoid_resonance", "resonance"),
         looks_like="the residual rings at several tones that are no poles of the stack",
         more_of=STRUCTURAL_MODE.name,

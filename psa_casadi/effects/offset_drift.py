@@ -5,7 +5,8 @@ from psa_casadi.scales import stroke_scale
 from psa_casadi.variables import Parameter, Values
 
 
-def _equations(s: Symbols) -> Equations:
+def _offset_drift(s: Symbols) -> Equations:
+    """Offset drift: the sensor's zero moves with time alone."""
     bend = s.drift_bend * s.time / s.drift_span
     return Equations(add={"measured_displacement": s.drift_rate * s.time * (1 + bend)})
 
@@ -32,7 +33,7 @@ OFFSET_DRIFT = Component(
             "drift_span", 10.0, "s", (1e-6, 1e9), "time over which drift_bend counts", fitted=False
         ),
     ),
-    equations=_equations,
+    equations=_offset_drift,
     probe={"drift_span": RECORD_DURATION, "drift_bend": (-0.5, 0.0)},
     remedy=Remedy("zero_again", "record"),
     looks_like="the residual is a slow function of time alone, also at constant voltage",

@@ -17,7 +17,16 @@ from psa_casadi.variables import Parameter
 _WIDTH = 5e-3
 
 
-def _equations(s: Symbols) -> Equations:
+def _preload_loss(s: Symbols) -> Equations:
+    """Preload loss: on one side of a certain displacement a spring has lost contact.
+
+    With a positive gain the output meets the spring at x_c and beyond, and below there is a gap.
+    With a negative one the spring, which elsewhere stiffens k_B and scales k_L unseen, leaves it
+    there: beyond x_c its stiffness is missing, -k max(0, x_c - x) being -k (x_c - x) - k max(0, x -
+    x_c). The spring that is lost was part of the stack's stiffness, so that the gain stays above
+    -1. A guide that is stiffer on one side of a displacement than on the other bends the curve
+    there in the same way.
+    """
     full = stroke(s)
     depth = s.x - s.contact_position * full
     pressed = 0.5 * (depth + ca.sqrt(depth**2 + (_WIDTH * full) ** 2))
@@ -51,7 +60,7 @@ PRELOAD_LOSS = Component(
             scale=0.1,
         ),
     ),
-    equations=_equations,
+    equations=_preload_loss,
     probe={"contact_position": (0.2, 0.4, 0.65)},
     remedy=Remedy("preload", "range"),
     looks_like="the slope changes abruptly at one displacement, the same on both branches",

@@ -24,7 +24,19 @@ _SHARE = 0.3
 _ONSET = 6.0
 
 
-def _equations(s: Symbols) -> Equations:
+def _rate_dependent_hysteresis(s: Symbols) -> Equations:
+    """Rate-dependent hysteresis: the loop's width changes with the logarithm of the voltage rate.
+
+    Two forms, of which one is tried after the other, with c - 1 = exp(rate_gain L) - 1 and L = lg
+    sqrt(1 + (u'/(rate_onset u_rated))^2), the decades above the onset:
+
+    * the hysteresis force acts c-fold, at every amplitude alike;
+    * play elements' thresholds w grow c-fold (Al Janaideh): nothing is added after a reversal,
+      and (c - 1) w behind the motion once the element moves, whatever the amplitude.
+
+    A positive gain widens loops and lowers the stroke as the rate rises. The rate acts at once and
+    leaves the memory as it is.
+    """
     relative = s.voltage_rate / (s.rate_onset * s.u_rated)
     grown = ca.exp(s.rate_gain * 0.5 * ca.log10(1 + relative**2)) - 1
     width = s.rate_threshold * s.u_rated
@@ -98,7 +110,7 @@ RATE_DEPENDENT_HYSTERESIS = Component(
             whole=voltage_scale,
         ),
     ),
-    equations=_equations,
+    equations=_rate_dependent_hysteresis,
     probe={"rate_onset": (0.1, 3.0), "rate_by_threshold": (0.0, 1.0)},
     remedy=Remedy("undo_hysteresis", "slew"),
     looks_like="loops grow wider, or narrower, by the same share with every decade of rate",

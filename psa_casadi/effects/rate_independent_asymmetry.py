@@ -1,11 +1,12 @@
-"""Rate-independent asymmetry: the two branches curve differently, equally at every frequency."""
+"""Rate-independent asymmetry: the branches curve differently, equally at every frequency."""
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.smooth import magnitude_power, rate_magnitude
 from psa_casadi.variables import Parameter, Values
 
 
-def _equations(s: Symbols) -> Equations:
+def _rate_independent_asymmetry(s: Symbols) -> Equations:
+    """Rate-independent asymmetry: the branches curve differently, equally at every frequency."""
     bend = s.asymmetry_bend * s.u_rated * magnitude_power(s.f_H / s.h_ref, s.n)
     return Equations(add={"hysteresis_rate": s.delta_r * (s.u + bend) * rate_magnitude(s)})
 
@@ -35,7 +36,7 @@ RATE_INDEPENDENT_ASYMMETRY = Component(
             scale=1.0,
         ),
     ),
-    equations=_equations,
+    equations=_rate_independent_asymmetry,
     probe={"asymmetry_bend": (-2.0, 0.0, 2.0)},
     remedy=Remedy("undo_hysteresis", "reversal"),
     looks_like=(

@@ -14,7 +14,14 @@ from psa_casadi.variables import Parameter, State
 _STEPS = (0.0, 2.0, 4.0)
 
 
-def _equations(s: Symbols) -> Equations:
+def _reciprocal_coupling(s: Symbols) -> Equations:
+    """Reciprocal coupling: the wafers feel the bonding layers too, as Newton's third law demands.
+
+    Stable for every gain g from 0 to 1 + m_B/m_P: with q = 1 - g + g^2 the characteristic
+    polynomial is m_P m_B s^4 + (m_P c_B + m_B (c_P + g c_B)) s^3 + (m_P k_B + m_B (k_P + g k_B) + q
+    c_P c_B) s^2 + q (c_P k_B + k_P c_B) s + q k_P k_B, and Hurwitz' determinant is a sum of
+    positive terms.
+    """
     g = s.reciprocal_gain
     pull = s.c_B * (s.v_x - s.v_y) + s.k_B * (s.x - s.y)
     held = s.c_B * s.v_x + s.k_B * s.x + (s.c_P + g * s.c_B) * s.v_r + (s.k_P + g * s.k_B) * s.y_r
@@ -61,7 +68,7 @@ RECIPROCAL_COUPLING = Component(
         ),
         State("v_r", "m/s", "its rate", velocity_scale, display_unit="um/s"),
     ),
-    equations=_equations,
+    equations=_reciprocal_coupling,
     remedy=Remedy("extended_model", "resonance"),
     looks_like="the resonances and the zero between them do not fit the one-way cascade",
 )

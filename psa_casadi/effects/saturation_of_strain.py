@@ -6,7 +6,8 @@ from psa_casadi.component import Component, Equations, Remedy, Symbols
 from psa_casadi.variables import Parameter
 
 
-def _equations(s: Symbols) -> Equations:
+def _saturation_of_strain(s: Symbols) -> Equations:
+    """Saturation of strain: the curve flattens at high voltage, on both branches alike."""
     share = 1 / ca.sqrt(1 + s.saturation_gain * (s.u / s.u_rated) ** 2) - 1
     return Equations(add={"free_force": s.k_L * s.u * share})
 
@@ -30,7 +31,7 @@ SATURATION_OF_STRAIN = Component(
             scale=0.05,
         ),
     ),
-    equations=_equations,
+    equations=_saturation_of_strain,
     remedy=Remedy("undo_curve", "range"),
     looks_like="the curve flattens towards high voltage on both branches, at every rate",
 )

@@ -11,7 +11,14 @@ from psa_casadi.smooth import magnitude_power, rate_magnitude
 from psa_casadi.variables import Parameter, State, Values
 
 
-def _equations(s: Symbols) -> Equations:
+def _self_heating(s: Symbols) -> Equations:
+    """Self-heating: losses warm the stack under fast drive, and its gain changes with the warmth.
+
+    The loss is what the hysteresis dissipates: f_H u' less the rate of the energy f_H^2/(2 A) that
+    it stores leaves beta |u'| |f_H| r^n / A, which grows with the third power of a small swing and
+    more slowly with a large one. Share of heat, heat capacity and the gain's temperature
+    coefficient act as one number, heating_gain.
+    """
     loss = rate_magnitude(s) / s.u_rated * magnitude_power(s.f_H / s.h_ref, s.n + 1)
     return Equations(
         der={"heat": loss - s.heat / s.heating_time},
@@ -59,7 +66,7 @@ SELF_HEATING = Component(
     states=(
         State("heat", "1", "loss not cooled off, in rated swings at h_ref", _heat, memory=True),
     ),
-    equations=_equations,
+    equations=_self_heating,
     probe={"heating_time": (1.0, 10.0)},
     remedy=Remedy("cool", "record"),
     looks_like="the gain climbs while the drive is fast and recovers when it rests",

@@ -9,7 +9,8 @@ from psa_casadi.variables import Parameter, State
 _FLOOR = 1e-6
 
 
-def _equations(s: Symbols) -> Equations:
+def _sensor_delay(s: Symbols) -> Equations:
+    """Sensor delay: the measured displacement arrives late by a fixed time."""
     half = s.sensor_delay / 2
     a1, b1, first = pade_section(half, _FLOOR, s.displacement, s.z_d1, s.r_d1)
     a2, b2, second = pade_section(half, _FLOOR, first, s.z_d2, s.r_d2)
@@ -52,7 +53,7 @@ SENSOR_DELAY = Component(
         Parameter("sensor_delay", 0.0, "s", (0.0, 0.1), "delay of the sensor", "ms", scale=1e-4),
     ),
     states=(*_states(1), *_states(2)),
-    equations=_equations,
+    equations=_sensor_delay,
     remedy=Remedy("align_clocks", "slew"),
     looks_like="phase linear in frequency; the residual follows the displacement's rate",
 )

@@ -19,7 +19,12 @@ from psa_casadi.scales import reading_scale, stroke_scale
 from psa_casadi.variables import Parameter, Values
 
 
-def _equations(s: Symbols) -> Equations:
+def _sensor_jump(s: Symbols) -> Equations:
+    """Sensor jump: the reading jumps where the displacement passes one place, on both branches.
+
+    It is narrow: a wide one would be a bent sensor. A reading that stays off after a jump, as of an
+    interferometer that has lost a count, is not this.
+    """
     width = s.jump_width * stroke(s)
 
     def side(x: Expression) -> Expression:
@@ -63,7 +68,7 @@ SENSOR_JUMP = Component(
             limit=True,
         ),
     ),
-    equations=_equations,
+    equations=_sensor_jump,
     probe={"jump_place": DISPLACEMENT_STEPS, "jump_width": (0.003, 0.03)},
     remedy=Remedy("calibrate_sensor", "range"),
     looks_like="the residual jumps at one displacement, the same on both branches",

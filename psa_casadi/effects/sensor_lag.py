@@ -9,7 +9,8 @@ from psa_casadi.variables import Parameter, State
 _FLOOR = 1e-6
 
 
-def _equations(s: Symbols) -> Equations:
+def _sensor_lag(s: Symbols) -> Equations:
+    """Sensor lag: the sensor's electronics follow the displacement with a time constant."""
     time = s.sensor_lag_time + _FLOOR
     behind = s.sensor_lag_displacement - s.displacement
     return Equations(
@@ -40,7 +41,7 @@ SENSOR_LAG = Component(
             display_unit="um",
         ),
     ),
-    equations=_equations,
+    equations=_sensor_lag,
     remedy=Remedy("faster_sensor", "slew"),
     looks_like="phase of a first-order lag, which saturates at 90 degrees, and roll-off with it",
 )

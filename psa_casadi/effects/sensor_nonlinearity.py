@@ -10,7 +10,12 @@ from psa_casadi.effects.sizes import stroke
 from psa_casadi.variables import Parameter
 
 
-def _equations(s: Symbols) -> Equations:
+def _sensor_nonlinearity(s: Symbols) -> Equations:
+    """Sensor nonlinearity: the reading is a bent function of the displacement.
+
+    A constant and a slope are the sensor's offset and its sensitivity, which a fit takes for the
+    stack's own; what remains of a smooth curve is a bow, an S and a W.
+    """
     full = stroke(s)
     curve = bend(s.displacement / full, s.nonlinearity_angle, s.nonlinearity_wave)
     return Equations(add={"measured_displacement": s.nonlinearity_gain * full * curve})
@@ -37,7 +42,7 @@ SENSOR_NONLINEARITY = Component(
         ),
         *shape_parameters("nonlinearity"),
     ),
-    equations=_equations,
+    equations=_sensor_nonlinearity,
     curve="displacement",
     probe={"nonlinearity_angle": ANGLES},
     remedy=Remedy("calibrate_sensor", "range"),

@@ -25,7 +25,12 @@ def _wave(s: Symbols, angle: Expression) -> Expression:
     return ca.sin(angle + s.ripple_phase) + second
 
 
-def _equations(s: Symbols) -> Equations:
+def _sensor_ripple(s: Symbols) -> Equations:
+    """Sensor ripple: an error of the reading that repeats with the displacement.
+
+    A grating, a fringe or a pitch repeats with the period L. Offsets of its two signals make an
+    error of that period, unequal amplitudes and a phase that is not 90 degrees one of half of it.
+    """
     wave = _wave(s, 2 * pi * s.displacement / s.ripple_period)
     return Equations(add={"measured_displacement": s.ripple_gain * (wave - _wave(s, ca.SX(0)))})
 
@@ -67,7 +72,7 @@ SENSOR_RIPPLE = Component(
         _second("cosine"),
         _second("sine"),
     ),
-    equations=_equations,
+    equations=_sensor_ripple,
     probe={"ripple_period": DISPLACEMENT_PEAKS, "ripple_phase": (0.0, 0.5 * pi)},
     remedy=Remedy("calibrate_sensor", "range"),
     looks_like="the residual repeats many times over the displacement, the same on both branches",

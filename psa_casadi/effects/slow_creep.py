@@ -8,7 +8,8 @@ from psa_casadi.variables import Parameter, State, Values
 _RATIOS = (1.0, 10.0, 100.0)
 
 
-def _equations(s: Symbols) -> Equations:
+def _slow_creep(s: Symbols) -> Equations:
+    """Slow creep: displacement that keeps growing for seconds to hours at constant voltage."""
     relaxed = [s.z_c1, s.z_c2, s.z_c3]
     names = ("z_c1", "z_c2", "z_c3")
     return Equations(
@@ -55,7 +56,7 @@ SLOW_CREEP = Component(
         ),
     ),
     states=(_state(1), _state(2), _state(3)),
-    equations=_equations,
+    equations=_slow_creep,
     probe={"creep_time": (0.03, 0.3, 3.0)},
     remedy=Remedy("wait_or_feed_forward", "hold"),
     looks_like="the residual is a straight line in log time after every change of voltage",

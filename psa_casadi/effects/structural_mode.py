@@ -11,7 +11,13 @@ from psa_casadi.variables import Parameter, State, Values
 _TWO_PI = 6.283185307179586
 
 
-def _equations(s: Symbols) -> Equations:
+def _structural_mode(s: Symbols) -> Equations:
+    """Structural mode: a resonance of the mount or the guide that the two-mass model lacks.
+
+    What drives it may run ahead of the output mass or behind it: the lead turns the phase of the
+    resonance by its arc tangent, so that a mode driven by the force ahead of its lag is told as
+    well.
+    """
     omega = _TWO_PI * s.mode_frequency
     return Equations(
         der={
@@ -46,7 +52,7 @@ STRUCTURAL_MODE = Component(
         State("q", "m", "modal displacement", stroke_scale, display_unit="um"),
         State("r_q", "m/s", "modal velocity", _rate_scale, display_unit="um/s"),
     ),
-    equations=_equations,
+    equations=_structural_mode,
     probe={"mode_frequency": SPECTRAL_PEAKS, "mode_damping": (0.03,)},
     remedy=Remedy("avoid_resonance", "resonance"),
     looks_like="the residual rings at a tone that is neither pole of the stack",

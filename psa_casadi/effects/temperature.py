@@ -17,7 +17,19 @@ from psa_casadi.variables import Input, Parameter, State
 _ROOM = 293.15
 
 
-def _equations(s: Symbols) -> Equations:
+def _temperature(s: Symbols) -> Equations:
+    """Temperature: the stack's length and its gain follow the record's temperature column.
+
+    A thermometer beside the stack leads it: stack and frame follow it through a lag, of
+    milliseconds where it sits on the ceramic, of minutes where it hangs in the room.
+
+    Sizes: a stack of length L moves 1.0e-3 to 1.3e-3 L at rated voltage. Poled multilayer ceramic
+    expands by -3.5e-6 L per kelvin along its length (co-fired) or +11e-6 L (glued high-voltage
+    discs), a steel frame by 11e-6 L: some -0.4 to +1.4 % of the stroke per kelvin. The
+    piezoelectric coefficient of soft PZT grows by one or a few tenths of a percent per kelvin. A
+    kelvin is an ordinary change in a laboratory and 0.1 % of the stroke is noticeable: 1e-3 per
+    kelvin is ordinary.
+    """
     warmer = s.temperature - s.temperature_reference
     expansion = s.expansion_gain * s.stack_warmer
     return Equations(
@@ -70,7 +82,7 @@ TEMPERATURE = Component(
     ),
     inputs=(Input("temperature", "K", "temperature of the stack", start=_ROOM, nominal=300.0),),
     states=(State("stack_warmer", "K", "temperature of the stack above the reference", 1.0),),
-    equations=_equations,
+    equations=_temperature,
     probe={"temperature_gain_ratio": (-1.0, 0.0, 1.0), "temperature_lag": (0.01, 1.0)},
     remedy=Remedy("steady_surroundings", "record"),
     looks_like="the residual follows the temperature, by an offset and in proportion to the stroke",
