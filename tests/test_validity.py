@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components.validity import OUTPUT
+from psa_casadi.components.outputs import OUTPUT
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.fmu import evidence_files as files

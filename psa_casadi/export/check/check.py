@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from psa_casadi.component import Component
-from psa_casadi.components.validity import OUTPUT as VALIDITY
+from psa_casadi.components.outputs import OUTPUT as VALIDITY
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import (

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from psa_casadi.components.validity import OUTPUT, VALIDITY, VALIDITY_WITH_TEMPERATURE
+from psa_casadi.components.outputs import OUTPUT, VALIDITY, VALIDITY_WITH_TEMPERATURE
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 

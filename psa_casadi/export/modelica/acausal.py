@@ -5,7 +5,7 @@ one-way cascade is none, since its bonding layers do not push back on the wafers
 reaction, `reciprocal_coupling` at a gain of 1, and says so.
 """
 
-from psa_casadi.effects.reciprocal_coupling import RECIPROCAL_COUPLING
+from psa_casadi.effects.mechanics import RECIPROCAL_COUPLING
 from psa_casadi.export.modelica.annotations import about, documentation, equations_table
 from psa_casadi.export.modelica.class_text import Ports, class_lines
 from psa_casadi.model.compose import Model

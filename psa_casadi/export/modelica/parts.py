@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from psa_casadi.component import Expression, Symbols
-from psa_casadi.effects.sizes import static_stiffness, stroke
-from psa_casadi.smooth import direction, magnitude_power, rate_magnitude, signed_power
+from psa_casadi.scales import static_stiffness, stroke
+from psa_casadi.shapes import direction, magnitude_power, rate_magnitude, signed_power
 
 
 @dataclass(frozen=True)
