@@ -25,8 +25,8 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.export.ssp.archive import export_ssp
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.records import read_record
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.words.tables import Table

@@ -15,8 +15,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.model.system.nanopositioner import nanopositioner, positioner_plant
-from psa_casadi.model.system.tuning import margins_of
+from psa_casadi.model.nanopositioner import margins_of, nanopositioner, positioner_plant
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.nonlinearity_figure import picture
 from tests.benchmarks.nonlinearity_plant import Case, Run, simulate_positioner

@@ -22,7 +22,7 @@ from psa_casadi.any_model.effects.attached import (
 )
 from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Expression, Symbols
-from psa_casadi.model.from_casadi.ports import Port, true_output
+from psa_casadi.model.ports import Port, true_output
 from psa_casadi.shapes import ANGLES, pade_section, softplus
 from psa_casadi.variables import Parameter, State
 

@@ -17,7 +17,7 @@ import casadi as ca
 
 from psa_casadi.component import Balance, Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
-from psa_casadi.units import parse_unit, si_unit
+from psa_casadi.units import rate_unit, si_unit
 
 Kind = Literal["input", "rate", "output"]
 _PREFIX: dict[Kind, str] = {"input": "applied_", "rate": "rate_", "output": "shown_"}
@@ -61,7 +61,7 @@ def ports_of(model: Model) -> tuple[Port, ...]:
     return (
         *(Port("input", i.name, _si(i.unit)) for c in base for i in c.inputs),
         *(
-            Port("rate", q.name, rate_unit(q.unit))
+            Port("rate", q.name, rate_unit(_si(q.unit)))
             for q in states
             if not _is_definition(s.der[q.name])
         ),
@@ -96,25 +96,6 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
 def state_unit(model: Model, name: str) -> str:
     """Return the SI unit of a state."""
     return next(_si(q.unit) for q in model.structure.states if q.name == name)
-
-
-def rate_unit(unit: str) -> str:
-    """Return the SI unit of the rate of something in a unit: "m" gives "m/s", "m/s" "m/s2"."""
-    si = _si(unit)
-    if "/" not in si:
-        return f"{si}/s"
-    above, _, below = si.partition("/")
-    parts = below.strip("()").split(".")
-    if "s" in parts:
-        parts[parts.index("s")] = "s2"
-    elif "s2" in parts:
-        parts[parts.index("s2")] = "s3"
-    else:
-        parts.append("s")
-    joined = ".".join(parts)
-    text = f"{above}/{joined if len(parts) == 1 else f'({joined})'}"
-    parse_unit(text)
-    return text
 
 
 def _si(unit: str) -> str:
