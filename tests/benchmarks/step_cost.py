@@ -13,11 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fixed_step.export import export_c
-from psa_casadi.export.fixed_step.planning import fixed_step
+from psa_casadi.export.fixed_step.export import export_c, fixed_step
 from psa_casadi.export.fixed_step.probe import VOLTAGES
-from psa_casadi.export.fmu.sources import compiled_files
-from psa_casadi.export.fmu.texts import exported_texts
+from psa_casadi.export.fmu.sources import compiled_files, exported_texts
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.words.tables import Table

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.publication import code_license
-from psa_casadi.export.fixed_step.plan import CodePlan, bounded, limit_words, timed
+from psa_casadi.export.fixed_step.code import CodePlan, bounded, limit_words, timed
 from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, VoltageError, shown_output
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.export.fixed_step.matrices import FloatArray
-from psa_casadi.export.fixed_step.plan import CodePlan
+from psa_casadi.export.fixed_step.code import CodePlan
+from psa_casadi.export.fixed_step.step import FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.stepper import SimulationError, run

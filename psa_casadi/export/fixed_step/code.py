@@ -1,20 +1,106 @@
-"""The source of a fixed step in C99: start, step and outputs in straight lines of numbers."""
+"""The source of a fixed step in C99: start, step and outputs in straight lines of numbers.
 
+For a controller it is `name_init` and `name_step`, for an FMU a function of the states that
+remembers nothing between calls.
+"""
+
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Expression
-from psa_casadi.export.fixed_step.expressions import Printer
-from psa_casadi.export.fixed_step.plan import (
-    CodePlan,
-    bounded,
-    moves,
-    outputs_of,
-    sampled_of,
-    timed,
-)
+from psa_casadi.errors import InputError
+from psa_casadi.export.fixed_step.expressions import Precision, Printer
+from psa_casadi.export.fixed_step.step import StepExpression, with_numbers
+from psa_casadi.model.compose import Model
+
+#: Words that C keeps for itself.
+_KEYWORDS = """
+    auto break case char const continue default do double else enum extern float for goto if inline
+    int long register restrict return short signed sizeof static struct switch typedef union
+    unsigned void volatile while
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class CodePlan:
+    """What is to be generated: a model's step, how often it is taken in a call, and how it looks.
+
+    `step` is the time between two calls [s], `substeps` how many `expression`s it takes. With
+    `held` inputs a value holds over the step that it is given for; else it is reached at its end,
+    along a line from the value before. An instant of the sampled states ends `every` so many
+    calls, 0 where there are none. A voltage beyond `limit` [V], up or down, is limited to it.
+    """
+
+    model: Model
+    expression: StepExpression
+    name: str
+    step: float
+    substeps: int
+    held: bool
+    precision: Precision
+    every: int = 0
+    limit: float = math.inf
+
+
+def bounded(plan: CodePlan) -> bool:
+    """Whether there is a voltage that is limited."""
+    return math.isfinite(plan.limit)
+
+
+def limit_words(limit: float) -> str:
+    """Say up to which voltage [V] a step was measured; nothing where there is none."""
+    if not math.isfinite(limit):
+        return ""
+    return (
+        f"A voltage beyond {limit:.6g} V, in either direction, is limited to it; up to there jumps"
+        " err no more than is stated, or 0.1 % of the range."
+    )
+
+
+def timed(plan: CodePlan) -> bool:
+    """Whether the equations depend on the time itself."""
+    e, s = plan.expression, plan.model.structure
+    every = (e.change, e.port_end, outputs_of(plan.model), sampled_of(plan.model))
+    return bool(ca.depends_on(ca.vertcat(*every), s.time))
+
+
+def moves(plan: CodePlan) -> bool:
+    """Whether there is something to do between sample instants: states, or the clock."""
+    return bool(plan.model.structure.states) or timed(plan)
+
+
+def outputs_of(model: Model) -> Expression:
+    """Return the outputs of a model with its values."""
+    return with_numbers(model, model.structure.y)
+
+
+def sampled_of(model: Model) -> Expression:
+    """Return the sampled states of a model after an instant, with its values."""
+    return with_numbers(model, model.structure.znext)
+
+
+def check_names(plan: CodePlan) -> None:
+    """Refuse names that C does not take as fields.
+
+    Raises:
+        InputError: a state, an input or an output has the name of a keyword or of another field.
+    """
+    s = plan.model.structure
+    own = ["last_input", "steps_done", "steps_to_instant", "unused"]
+    own += [f"low_of_{q.name}" for q in s.states]
+    own += [f"port_of_{q}" for q in plan.expression.port_names]
+    names = [q.name for table in (s.states, s.sampled, s.inputs, s.outputs) for q in table]
+    wrong = sorted({n for n in names if n in _KEYWORDS.split() or n in own})
+    if wrong:
+        raise InputError(
+            f"{', '.join(wrong)} cannot name a field in C, where it is a keyword or taken; rename"
+            " it in the effect that declares it."
+        )
+
 
 #: Size over a state's usual one below which it counts as 0: next to it numbers become slow ones.
 NOTHING = 1e-15
@@ -36,7 +122,7 @@ def source_code(plan: CodePlan) -> str:
             "",
             *(_advance(plan) if moves(plan) else []),
             *_sample(plan),
-            *_output(plan),
+            *_outputs_code(plan),
             "",
             *_step(plan),
             "",
@@ -109,7 +195,7 @@ def _advance(plan: CodePlan) -> list[str]:
     """Return the function that takes one step of the expression."""
     e, s, p = plan.expression, plan.model.structure, plan.precision
     gone = [] if p.single else [e.low]
-    change, ports = _held(plan, [e.change, e.port_end], gone)
+    change, ports = _without_change(plan, [e.change, e.port_end], gone)
     lines, texts = _printer(plan, "state").lines([change, ports])
     n, nominal = len(s.states), plan.model.state_nominals()
     head = f"static void advance({plan.name}_state *state"
@@ -133,7 +219,7 @@ def _advance(plan: CodePlan) -> list[str]:
     return [told, head + ") {", *unused, *body, "}", ""]
 
 
-def _held(
+def _without_change(
     plan: CodePlan, expressions: Sequence[Expression], gone: Sequence[Expression]
 ) -> list[Expression]:
     """Return a step's expressions as they are needed: without the change of inputs that hold.
@@ -171,7 +257,7 @@ def _sample(plan: CodePlan) -> list[str]:
     ]
 
 
-def _output(plan: CodePlan) -> list[str]:
+def _outputs_code(plan: CodePlan) -> list[str]:
     s, name = plan.model.structure, plan.name
     printer = _printer(plan, "state")
     lines, texts = printer.lines([outputs_of(plan.model)])
@@ -243,3 +329,51 @@ def _within(plan: CodePlan) -> list[str]:
         f"    within.voltage = v > {limit} ? {limit} : v < -{limit} ? -{limit}",
         "                     : beyond ? state->last_input.voltage : v; /* if it is no number */",
     ]
+
+
+def function_code(plan: CodePlan, function: str) -> str:
+    """Return `void function(t, x, u, change)`: a step of states that remembers nothing else.
+
+    The ports are evaluated at the start of every substep, so that the states are all there is.
+    """
+    e, s = plan.expression, plan.model.structure
+    (change,) = ca.substitute(
+        [e.change], [e.low, e.port], [ca.SX.zeros(e.low.numel()), e.port_start]
+    )
+    printer = Printer(
+        plan.precision,
+        {"t": s.time, "x": s.x, "v": ca.vertcat(s.u, e.du)},
+        {
+            "t": ["t"],
+            "x": [f"x[{k}]" for k in range(len(s.states))],
+            "v": [f"{of}[{k}]" for of in ("u", "change") for k in range(len(s.inputs))],
+        },
+    )
+    lines, texts = printer.lines([change])
+    given = "double t, double *x, const double *u, const double *change"
+    nothing = [plan.precision.literal(NOTHING * abs(q)) for q in plan.model.state_nominals()]
+    body = [f"    {line}" for line in lines]
+    body += [f"    const double end{k} = {text};" for k, text in enumerate(texts)]
+    body += [f"    x[{k}] = (x[{k}] + end{k} + {q}) - {q};" for k, q in enumerate(nothing)]
+    inputs, count = max(1, len(s.inputs)), plan.substeps
+    return "\n".join(
+        [
+            "",
+            f"static void {function}_part({given}) {{",
+            "    (void)t, (void)u, (void)change;",
+            *body,
+            "}",
+            "",
+            f"void {function}({given}) {{",
+            f"    double now[{inputs}] = {{0.0}}, part[{inputs}] = {{0.0}};",
+            f"    for (int k = 0; k < {count}; ++k) {{",
+            f"        for (int i = 0; i < {len(s.inputs)}; ++i) {{",
+            f"            part[i] = change[i] * {1.0 / count!r};",
+            "            now[i] = u[i] + k * part[i];",
+            "        }",
+            f"        {function}_part(t + k * {plan.step / count!r}, x, now, part);",
+            "    }",
+            "}",
+            "",
+        ]
+    )

@@ -1,9 +1,17 @@
 """A run inside the FMU to try an importer on: inputs, parameters and the outputs to expect.
 
-The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives alike.
+The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives alike. On this run
+is measured how short a communication step must be where an importer holds the inputs over it. A
+held signal is late by half a step h on average: an output that moves at the rate dy/dt errs by
+h/2 |dy/dt|. So the step for an error of a share e of the range R follows from the signal alone,
 
-Source: FMI Layered Standard References (FMI-LS-REF) 1.0.0-beta.1 and the Experiments Format of
-the Modelica Association that it refers to.
+    h = 2 e R / max |dy/dt|,  for a sine of frequency f over the whole range  h = 2 e / (pi f),
+
+as long as h is short against what the model adds of its own: lags, resonances, the slope of a loop.
+
+Sources: FMI Layered Standard References (FMI-LS-REF) 1.0.0-beta.1 and the Experiments Format of the
+Modelica Association; Astrom and Wittenmark 1997, Computer-Controlled Systems (a hold delays by half
+a period).
 """
 
 import math
@@ -192,3 +200,57 @@ def _manifest(more: Mapping[str, Related]) -> str:
         }  # fmt: skip
         ET.SubElement(root, "Related", attributes)
     return xml_text(root)
+
+
+#: Error that the step must meet, over the range of the output.
+SHARE = 1e-3
+#: Steps in a period of a sine over the whole range: pi / (2 SHARE), and a quarter more for a loop.
+STEPS_PER_PERIOD = 2000
+_FIRST, _MOST = 4, 64
+_HELD_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class HeldStep:
+    """The step [s] with which an output's error on the reference run is `error` of its range.
+
+    It is the longest one that divides the rows of the run and keeps the error within `SHARE`, or
+    the shortest one tried where none does. `rate` is the steepest motion in ranges per second.
+    """
+
+    output: str
+    step: float
+    error: float
+    rate: float
+
+
+def held_step(model: Model) -> HeldStep | None:
+    """Return the step for the displacement, or for the first output of a model that has none.
+
+    None if the model has no input or no output, or the output does not move.
+    """
+    if not (model.input_names and model.output_names):
+        return None
+    output = "displacement" if "displacement" in model.output_names else model.output_names[0]
+    column = model.output_names.index(output)
+    times, inputs = reference_inputs(model)
+    start = np.array([s.start for s in model.structure.states])
+    truth = run(model, times, inputs, start, rtol=_HELD_TOLERANCE).y[:, column]
+    span = float(np.ptp(truth))
+    if span == 0.0:
+        return None
+    rate = float(np.max(np.abs(np.diff(truth)))) / float(times[1]) / span
+
+    def error(parts: int) -> float:
+        grid = np.linspace(times[0], times[-1], parts * (len(times) - 1) + 1)
+        fine = np.array([np.interp(grid, times, c) for c in inputs.T]).T
+        found = run(model, grid, fine, start, rtol=_HELD_TOLERANCE, hold="zero").y[::parts, column]
+        return float(np.max(np.abs(found - truth))) / span
+
+    parts, worst = _FIRST, error(_FIRST)
+    wanted = min(_MOST, max(1, math.ceil(parts * worst / SHARE)))
+    while wanted != parts:
+        parts, worst = wanted, error(wanted)
+        if worst > SHARE and parts < _MOST:
+            wanted = min(_MOST, parts + max(1, parts // 8))
+    return HeldStep(output, float(times[1]) / parts, worst, rate)
