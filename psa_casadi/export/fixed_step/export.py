@@ -6,18 +6,35 @@ Whether it fits is planned, in how many substeps, and how far it errs.
 import math
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.errors import InputError
-from psa_casadi.export.common.publication import refuse_foreign
-from psa_casadi.export.fixed_step.code import CodePlan, check_names, source_code, timed
+from psa_casadi.export.common.markup import generation_tool
+from psa_casadi.export.common.publication import code_license, refuse_foreign
+from psa_casadi.export.common.templates import filled
+from psa_casadi.export.fixed_step.code import (
+    CodePlan,
+    check_names,
+    limit_words,
+    names_of,
+    source_code,
+    timed,
+)
 from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
-from psa_casadi.export.fixed_step.header import header_code
-from psa_casadi.export.fixed_step.probe import VoltageError, errors, reach, shown_output
+from psa_casadi.export.fixed_step.probe import (
+    STEPS,
+    VOLTAGES,
+    VoltageError,
+    errors,
+    reach,
+    shown_output,
+)
 from psa_casadi.export.fixed_step.step import step_of
 from psa_casadi.files import atomic_write, make_folder
 from psa_casadi.model.compose import Model
@@ -30,6 +47,8 @@ USELESS = 0.1
 #: Two times that differ by less than this share are one.
 _SAME = 1e-9
 _HELD = {"linear": False, "zero": True}
+#: Plans a model's step, or says why it has none.
+Attempt = Callable[[Model], tuple[CodePlan, str] | str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +88,14 @@ def fixed_step(
             f"The model '{model.name}' reads its inputs at sample instants; --hold zero is for"
             " inputs of continuous models: leave it out."
         )
-    chosen = PRECISIONS[precision]
     found: list[FixedStep] = []
     counts = SUBSTEPS if model.structure.states else SUBSTEPS[:1]
     for count in counts if substeps is None else (substeps,):
-        plan, source = _planned(model, _Wish(name, step, count, _HELD[hold], chosen))
+        attempt = partial(
+            _plan_or_reason, name=name, step=step, substeps=count, held=_HELD[hold],
+            precision=PRECISIONS[precision],
+        )  # fmt: skip
+        plan, source = _planned(model, attempt)
         texts = {f"{name}.h": header_code(plan), f"{name}.c": source}
         measured = errors(plan, texts)
         texts[f"{name}.h"] = header_code(plan, measured)
@@ -85,6 +107,24 @@ def fixed_step(
     if not best.worst.error <= USELESS:
         raise InputError(_useless(best))
     return _limited(best)
+
+
+def header_code(plan: CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
+    """Return the header; its comment tells the `errors` that were measured."""
+    model = plan.model
+    return filled(
+        "fixed_step.h",
+        **names_of(plan),
+        model=model,
+        numbers={name: repr(value) for name, value in model.values.items()},
+        errors=errors,
+        steps=STEPS,
+        voltages=VOLTAGES,
+        shown=shown_output(model) if errors else "",
+        limit_words=limit_words(plan.limit),
+        licence="\n".join(code_license().splitlines()),
+        tool=generation_tool(),
+    )
 
 
 def _limited(found: FixedStep) -> FixedStep:
@@ -123,28 +163,17 @@ def _check(name: str, step: float, precision: str, hold: str, substeps: int | No
         raise InputError(f"The substeps are {substeps}; give a number from 1 to 1000.")
 
 
-@dataclass(frozen=True)
-class _Wish:
-    """How a step is wanted, whatever the model."""
-
-    name: str
-    step: float
-    substeps: int
-    held: bool
-    precision: Precision
-
-
-def _planned(model: Model, wish: _Wish) -> tuple[CodePlan, str]:
+def _planned(model: Model, attempt: Attempt) -> tuple[CodePlan, str]:
     """Return the plan of a step and its source.
 
     Raises InputError where the model does not fit, with the effect to blame and the reason.
     """
-    found = _plan_or_reason(model, wish)
+    found = attempt(model)
     if not isinstance(found, str):
         check_names(found[0])
         return found
     own = {c.name for c in (*BASE, *SIMPLIFIED)}
-    without = [c.name for c in model.components if _fits_without(model, c.name, wish)]
+    without = [c.name for c in model.components if _fits_without(model, c.name, attempt)]
     blamed = [name for name in without if name not in own]
     if not blamed:
         raise InputError(
@@ -159,17 +188,17 @@ def _planned(model: Model, wish: _Wish) -> tuple[CodePlan, str]:
     )
 
 
-def _plan_or_reason(model: Model, wish: _Wish) -> tuple[CodePlan, str] | str:
+def _plan_or_reason(
+    model: Model, *, name: str, step: float, substeps: int, held: bool, precision: Precision
+) -> tuple[CodePlan, str] | str:
     if not model.output_names:
         return "it has no outputs"
-    expression = step_of(model, wish.step / wish.substeps)
+    expression = step_of(model, step / substeps)
     if isinstance(expression, str):
         return expression
-    plan = CodePlan(
-        model, expression, wish.name, wish.step, wish.substeps, wish.held, wish.precision,
-        _steps_of_a_period(model, wish.step),
-    )  # fmt: skip
-    if wish.precision.single and timed(plan):
+    every = _steps_of_a_period(model, step)
+    plan = CodePlan(model, expression, name, step, substeps, held, precision, every)
+    if precision.single and timed(plan):
         return (
             "its equations depend on the time itself, which single precision knows to 0.2 ms after"
             " an hour; double precision does not have this limit"
@@ -195,12 +224,12 @@ def _steps_of_a_period(model: Model, step: float) -> int:
     return count
 
 
-def _fits_without(model: Model, name: str, wish: _Wish) -> bool:
+def _fits_without(model: Model, name: str, attempt: Attempt) -> bool:
     try:
         other = model.without([name])
     except InputError:
         return False  # others need it
-    return not isinstance(_plan_or_reason(other, wish), str)
+    return not isinstance(attempt(other), str)
 
 
 @dataclass(frozen=True)
