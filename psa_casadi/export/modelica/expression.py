@@ -9,7 +9,6 @@ variables is not Modelica outside functions: `a <= b and a >= b` says the same.
 Source: Modelica Language Specification 3.6, sections 2.3 (words), 3.2 (precedence), 3.7.
 """
 
-import html
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -283,11 +282,6 @@ def modifier(attributes: Iterable[tuple[str, str | None]]) -> str:
     """Return the attributes that have a value in parentheses, or nothing if none has."""
     given = [f"{name}={value}" for name, value in attributes if value is not None]
     return f"({', '.join(given)})" if given else ""
-
-
-def escaped(text: str) -> str:
-    """Return a text as HTML."""
-    return html.escape(text, quote=False)
 
 
 # how tightly an operator binds
