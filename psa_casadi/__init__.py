@@ -58,14 +58,13 @@ if TYPE_CHECKING:
     from psa_casadi.identification.identify import Identification
     from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
-    from psa_casadi.model.from_casadi.ode_model import ode_model
     from psa_casadi.model.model_file import load_model, save_model
+    from psa_casadi.model.nanopositioner import controller_for, margins_of, nanopositioner
+    from psa_casadi.model.ode_model import ode_model
     from psa_casadi.model.own_effects import own_effects
     from psa_casadi.model.parts import PARTS, compensator_for, part_model
     from psa_casadi.model.stacks import STACKS, stack_model
-    from psa_casadi.model.system.nanopositioner import nanopositioner
-    from psa_casadi.model.system.system import System, connect
-    from psa_casadi.model.system.tuning import controller_for, margins_of
+    from psa_casadi.model.system import System, connect
     from psa_casadi.posterior.result import Posterior
     from psa_casadi.posterior.sample import sample
     from psa_casadi.records import (
@@ -143,16 +142,12 @@ _HOMES = {
         "part_model",
         "compensator_for",
     ),
-    "psa_casadi.model.system.tuning": (
-        "controller_for",
-        "margins_of",
-    ),
-    "psa_casadi.model.system.system": (
+    "psa_casadi.model.system": (
         "System",
         "connect",
     ),
-    "psa_casadi.model.system.nanopositioner": ("nanopositioner",),
-    "psa_casadi.model.from_casadi.ode_model": ("ode_model",),
+    "psa_casadi.model.nanopositioner": ("controller_for", "margins_of", "nanopositioner"),
+    "psa_casadi.model.ode_model": ("ode_model",),
     "psa_casadi.export.importer.fmu_model": ("fmu_model",),
     "psa_casadi.variables": (
         "Input",

@@ -20,7 +20,7 @@ from psa_casadi.any_model.effects.table import effects_of
 from psa_casadi.any_model.runs import runs_of
 from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.from_casadi.ports import ports_of, with_ports
+from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.own_words import own_verdict_sentence
 from tests import own_plants as plants

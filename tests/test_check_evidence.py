@@ -13,7 +13,7 @@ from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.playback import played_again
 from psa_casadi.export.check.rows import CheckRow
-from psa_casadi.export.fmu import evidence_files as files
+from psa_casadi.export.fmu import evidence
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.identification.certainty.determinacy import determinacy
@@ -105,11 +105,14 @@ def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
         values[column] = repr(1.01 * float(values[column]))
         return "\n".join([*lines[:100], ",".join(values), *lines[101:], ""]).encode()
 
-    changes = {files.OUTPUTS: moved, files.PAGE: lambda c: c.replace(b"held-out", b"hold-out")}
+    changes = {
+        evidence.OUTPUTS: moved,
+        evidence.PAGE: lambda c: c.replace(b"held-out", b"hold-out"),
+    }
     path = rewritten(evident_fmu(), tmp_path / "m.fmu", changes)
     with Archive(path) as archive:
         assert list(wrong_evidence(archive, carried(path))) == [
-            f"{files.PAGE} is not what the model says"
+            f"{evidence.PAGE} is not what the model says"
         ]
     with Archive(evident_fmu()) as archive:
         assert list(wrong_evidence(archive, carried(path))) == []

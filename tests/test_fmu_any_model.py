@@ -19,8 +19,8 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.from_casadi.ode_model import ode_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.ode_model import ode_model
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Parameter, State
 from tests.modelica_runs import simulated

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components import MONITOR
-from psa_casadi.components.flexure import FLEXURE
+from psa_casadi.components.outputs import MONITOR
+from psa_casadi.components.surroundings import FLEXURE
 from psa_casadi.diagnosis.columns import decision_sentence
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError

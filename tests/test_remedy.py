@@ -11,7 +11,7 @@ from psa_casadi.components import BASE
 from psa_casadi.diagnosis.remedy.size import Size, example, sizes
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.modal_series import MODAL_SERIES
+from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Covariance, Evidence, SeenRange
 from psa_casadi.records import Record

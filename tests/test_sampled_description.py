@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.export.check.check import check_fmu
-from psa_casadi.export.fmu.sources import STRICT
-from psa_casadi.export.fmu.texts import write_sources
+from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.export.importer.fmu import CO_SIMULATION, DISCARD, ERROR, Fmu, FmuError
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.sampled_fmus import exported

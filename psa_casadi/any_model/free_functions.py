@@ -30,7 +30,7 @@ from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.screening.screen import independent, whitened_jacobian, without
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
-from psa_casadi.model.from_casadi.ports import Port, ports_of, true_output
+from psa_casadi.model.ports import Port, ports_of, true_output
 from psa_casadi.variables import Parameter
 
 FloatArray = npt.NDArray[np.float64]

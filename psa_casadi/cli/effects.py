@@ -33,7 +33,7 @@ def effects(
 ) -> None:
     """List the effects that a diagnosis looks for; show one: equation, signature, size, remedy."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.effects.modal_series import MODAL_SERIES
+    from psa_casadi.effects.mechanics import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.report.words.tables import effects_table
     from psa_casadi.report.words.text import effect_page

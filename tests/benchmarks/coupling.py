@@ -21,8 +21,8 @@ from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.archive import export_ssp
 from psa_casadi.export.ssp.master import couple, points
 from psa_casadi.export.ssp.read_archive import SspArchive
-from psa_casadi.model.system.nanopositioner import nanopositioner, positioner_plant
-from psa_casadi.model.system.system import System
+from psa_casadi.model.nanopositioner import nanopositioner, positioner_plant
+from psa_casadi.model.system import System
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.stepper import run as integrate

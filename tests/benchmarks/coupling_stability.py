@@ -17,7 +17,7 @@ from psa_casadi.export.ssp.archive import wiring_of
 from psa_casadi.export.ssp.master import couple, points
 from psa_casadi.export.ssp.read_archive import SspArchive
 from psa_casadi.export.ssp.steps import stable_step
-from psa_casadi.model.system.system import System
+from psa_casadi.model.system import System
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.table import TitledTable

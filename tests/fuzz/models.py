@@ -14,8 +14,8 @@ import numpy as np
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.design.tracking.targets import read_target
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.fmu.evidence_files import evidence_texts
-from psa_casadi.export.fmu.texts import DESCRIPTIONS
+from psa_casadi.export.fmu.description import model_description
+from psa_casadi.export.fmu.evidence import evidence_texts
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import (
     Covariance,
@@ -121,8 +121,8 @@ def _load(data: bytes, folder: Path) -> Iterator[Found]:
 
 def _undescribed(model: Model) -> Iterator[Found]:
     """Yield what is wrong with the descriptions of the model as FMUs."""
-    for fmi, describe in DESCRIPTIONS.items():
-        text = describe(model.plant(), "m", "{token}", ["model.c"])
+    for fmi in (2, 3):
+        text = model_description(model.plant(), "m", "{token}", ["model.c"], fmi)
         try:
             root = ET.fromstring(text.encode("utf-8"))
         except (ET.ParseError, UnicodeEncodeError) as error:

@@ -17,10 +17,10 @@ from psa_casadi.any_model.effects.attached import (
 from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of
 from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Expression, Symbols
-from psa_casadi.effects.bend import ANGLES
 from psa_casadi.model.compose import Model
-from psa_casadi.model.from_casadi.ports import Port, ports_of, rate_unit, state_unit
-from psa_casadi.smooth import magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.model.ports import Port, ports_of, state_unit
+from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.units import rate_unit
 from psa_casadi.variables import Parameter, State
 
 #: A rate below this share of its size has no direction.

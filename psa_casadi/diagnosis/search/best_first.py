@@ -34,7 +34,7 @@ from psa_casadi.diagnosis.search.several import fit_from_other_parents, fit_sets
 from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
+from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from psa_casadi.component import Component
-from psa_casadi.components.validity import OUTPUT as VALIDITY
+from psa_casadi.components.outputs import OUTPUT as VALIDITY
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import (
@@ -36,8 +36,8 @@ from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, CheckRow, count, s
 from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
-from psa_casadi.export.fmu.fixed import fixed_step_of
-from psa_casadi.export.fmu.validity import with_validity
+from psa_casadi.export.fmu.evidence import with_validity
+from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.unpack import archive_problems
 from psa_casadi.files import why_not_read

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.playback import ERROR_LIMIT, Playback
 from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, stopped
-from psa_casadi.export.common.posterior import MOST_SAMPLES
-from psa_casadi.export.fmu.evidence_files import (
+from psa_casadi.export.common.parameter_sets import MOST_SAMPLES
+from psa_casadi.export.fmu.evidence import (
     OUTPUTS,
     SETS,
     VALIDATION,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from ctypes import byref, c_double, c_int, c_size_t, c_uint
 
-from psa_casadi.export.fmu.fixed import fixed_step_of
+from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.calls import (
     CO_SIMULATION,
     ERROR,

@@ -35,7 +35,7 @@ from psa_casadi.export.check.structure import (
 from psa_casadi.export.check.task import Task
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.common.variable_table import INPUT_LINE
-from psa_casadi.export.fmu.fixed import fixed_step_of
+from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 
 _EQUATION_LIMIT = 1e-9

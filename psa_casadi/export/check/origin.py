@@ -9,10 +9,14 @@ import casadi as ca
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.archive import planned_step
-from psa_casadi.export.fmu.dependencies import Key, at_the_start, dependencies, without_sampled
-from psa_casadi.export.fmu.fixed import FIXED_ENTRY, fixed_entry, fixed_step_of
-from psa_casadi.export.fmu.sources import FROM_CASADI
-from psa_casadi.export.fmu.texts import exported_texts
+from psa_casadi.export.fmu.description import Key, at_the_start, dependencies, without_sampled
+from psa_casadi.export.fmu.sources import (
+    FIXED_ENTRY,
+    FROM_CASADI,
+    exported_texts,
+    fixed_entry,
+    fixed_step_of,
+)
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.model.compose import Model
 

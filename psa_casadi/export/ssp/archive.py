@@ -15,7 +15,7 @@ from psa_casadi.export.ssp.steps import master_step
 from psa_casadi.export.ssp.structure import WiredParts, structure_description
 from psa_casadi.export.ssp.wiring_picture import save_wiring, wiring_svg
 from psa_casadi.files import atomic_path
-from psa_casadi.model.system.system import System
+from psa_casadi.model.system import System
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.variables import Publication
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.export.web.module import begun_module
+from psa_casadi.export.web import begun_module
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
