@@ -1,11 +1,9 @@
 """The periodicity of a drive voltage: its dominant line and harmonics."""
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.records.record import Record
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 _DOMINANT = 0.5
 _SIDE_LINES = 5

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import scipy
+from numpy.typing import NDArray
 
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 def filtered(
@@ -44,7 +44,7 @@ def without_line(parts: FloatArray) -> FloatArray:
     return rest
 
 
-def peaks(values: FloatArray, apart: int, most: int) -> npt.NDArray[np.int64]:
+def peaks(values: FloatArray, apart: int, most: int) -> NDArray[np.int64]:
     """Return the places of the highest local maxima, at least `apart` samples apart, in order."""
     inner = values[1:-1]
     places = np.flatnonzero((inner > values[:-2]) & (inner >= values[2:])) + 1

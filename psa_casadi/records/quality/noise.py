@@ -1,11 +1,9 @@
 """The noise floor of a measured displacement, and how a residual compares with it."""
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.records.quality.filtering import without_line
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Fewer samples than this are noise as a whole; third differences of this many standard deviations
 #: are steps, if their share is no larger.

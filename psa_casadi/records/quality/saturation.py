@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.quality.quantum import last_place_of
 from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.quality.stuck import LIMIT
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -15,7 +16,7 @@ BoolArray = NDArray[np.bool_]
 #: Readings at an end of the range that are few enough for a turn, and samples of a run that counts.
 FEWEST, LONGEST = 8, 3
 #: The motion that a run hides must exceed this share of the range, and so often the noise.
-HIDDEN, LIMIT = 0.02, 8.0
+HIDDEN = 0.02
 #: How many times what the voltage does a reading may move to an end and be no jump there.
 REACHED = 4.0
 
