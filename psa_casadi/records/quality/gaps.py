@@ -5,9 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from psa_casadi.records.checks import FEWEST_SAMPLES
 from psa_casadi.records.quality.saturation import HIDDEN
-from psa_casadi.records.record import Record
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
 
 #: An interval is a gap from so many times the intervals beside it on.
 _LONG = 10.0

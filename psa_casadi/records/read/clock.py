@@ -10,8 +10,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.records.checks import FEWEST_SAMPLES
 from psa_casadi.records.read.table import Cells
+from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import FloatArray, to_si
 
 _DAY = 86400.0

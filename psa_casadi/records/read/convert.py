@@ -7,7 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.checks import (
+from psa_casadi.records.read import clock, words
+from psa_casadi.records.read.column_map import ALL
+from psa_casadi.records.read.columns import ColumnMap, Field, ready_line
+from psa_casadi.records.read.file_bytes import check_size
+from psa_casadi.records.read.table import Cells, Columns, Table
+from psa_casadi.records.record import (
     FEWEST_SAMPLES,
     Located,
     check_complete,
@@ -16,11 +21,6 @@ from psa_casadi.records.checks import (
     check_length,
     check_time,
 )
-from psa_casadi.records.read import clock, words
-from psa_casadi.records.read.column_map import ALL
-from psa_casadi.records.read.columns import ColumnMap, Field, ready_line
-from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.table import Cells, Columns, Table
 from psa_casadi.units import FloatArray
 
 #: The most tables and segments that are named in one sentence.

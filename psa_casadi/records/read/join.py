@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.checks import FEWEST_SAMPLES
 from psa_casadi.records.read import clock, words
 from psa_casadi.records.read.arrays import Series, array_tables
 from psa_casadi.records.read.choose import rises
@@ -17,6 +16,7 @@ from psa_casadi.records.read.convert import Request
 from psa_casadi.records.read.names import stated_unit
 from psa_casadi.records.read.samples import Outcome, samples_of
 from psa_casadi.records.read.table import Cells, Table
+from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import FloatArray, to_si
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.checks import FEWEST_SAMPLES
 from psa_casadi.records.read import words
 from psa_casadi.records.read.clock import is_stamp, unit_of_times
 from psa_casadi.records.read.columns import COLUMNS, measures
@@ -27,6 +26,7 @@ from psa_casadi.records.read.layout import (
 )
 from psa_casadi.records.read.names import stated_unit, understood, unit_named
 from psa_casadi.records.read.table import Cells, Columns, Table
+from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import units_of
 
 #: The most lines below a table that are told as no samples: sums, means, an end mark.
