@@ -21,7 +21,7 @@ from psa_casadi.records import Record, hold, read_record, sine, steps, time_grid
 from psa_casadi.records import excerpts as long_records
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.excerpts import LEAST, MOST, PARTS, excerpts
-from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.noise import fast_noise
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
 from tests.tiers import slow

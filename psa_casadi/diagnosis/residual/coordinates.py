@@ -7,7 +7,7 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.residual.views import COARSE, FINE, Axis
-from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.quality.repetitions import held
 from psa_casadi.records.record import Record
 from psa_casadi.records.turns import reversals

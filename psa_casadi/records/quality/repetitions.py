@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.noise import runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.records.quality.noise import high_frequency_noise
-from psa_casadi.records.quality.quantum import last_place_of
-from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.noise import high_frequency_noise, last_place_of, runs_of
 from psa_casadi.records.quality.stuck import LIMIT
 from psa_casadi.units import FloatArray
 

@@ -4,8 +4,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from psa_casadi.records.quality.noise import high_frequency_noise
-from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.noise import high_frequency_noise, runs_of
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]

@@ -11,8 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from psa_casadi.records.quality.quantum import quantum_of
-from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.noise import quantum_of, runs_of
 from psa_casadi.records.quality.saturation import FlatEnd, flat_ends
 from psa_casadi.records.quality.stuck import (
     AFTER,
