@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from psa_casadi.records.quality.saturation import HIDDEN
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
+from psa_casadi.records.suspects import HIDDEN
 
 #: An interval is a gap from so many times the intervals beside it on.
 _LONG = 10.0
