@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.records.quality.repetitions import held
 from psa_casadi.records.record import Record
+from psa_casadi.records.repeats import held
 from psa_casadi.records.turns import reversals
 
 #: Turns by less than this share of the span are no reversals here; sizes of rises and falls are
