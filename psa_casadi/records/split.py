@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.repeats import held
 from psa_casadi.records.suspects import HIDDEN
-from psa_casadi.records.turns import reversals
 
 #: Turns by less than this share of the span are no reversals here; sizes of rises and falls are
 #: told apart at these shares of it, durations by this factor.
