@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import Problems
 from psa_casadi.records.read.clock import unit_of_times
-from psa_casadi.records.read.column_map import MARKS
-from psa_casadi.records.read.columns import SI_UNITS
+from psa_casadi.records.read.columns import MARKS, SI_UNITS, stated_unit, understood, unit_named
 from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.names import stated_unit, understood, unit_named
 from psa_casadi.records.read.table import Cells, Columns, Table
 
 #: The attributes and properties that state a unit, in lower case.

@@ -7,8 +7,16 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from psa_casadi.records.read.columns import COLUMNS, Source, measures, usual_source
-from psa_casadi.records.read.names import column_named, stated_unit, understood, words_of
+from psa_casadi.records.read.columns import (
+    COLUMNS,
+    Source,
+    column_named,
+    measures,
+    stated_unit,
+    understood,
+    usual_source,
+    words_of,
+)
 from psa_casadi.units import parse_unit
 
 #: The quantities that tell the columns which every record has.

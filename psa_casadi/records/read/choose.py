@@ -18,11 +18,14 @@ from psa_casadi.records.read.columns import (
     Field,
     Source,
     check_unit,
+    column_named,
     measures,
     mismatch,
+    stated_unit,
+    unit_for,
+    unit_named,
     usual_source,
 )
-from psa_casadi.records.read.names import column_named, stated_unit, unit_for, unit_named
 from psa_casadi.records.read.table import Table
 from psa_casadi.units import parse_unit
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read import clock, words
-from psa_casadi.records.read.column_map import ALL
-from psa_casadi.records.read.columns import ColumnMap, Field, ready_line
+from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.table import Cells, Columns, Table
 from psa_casadi.records.record import (

@@ -8,8 +8,7 @@ import numpy as np
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.choose import choose
-from psa_casadi.records.read.columns import Field
-from psa_casadi.records.read.names import stated_unit
+from psa_casadi.records.read.columns import Field, stated_unit
 from psa_casadi.records.read.table import Cells, Table, parts_of_file
 
 #: The columns that a diagnosis needs; a cell that may be one of them is a guess worth showing.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from psa_casadi.records.read import words
 from psa_casadi.records.read.clock import is_stamp
-from psa_casadi.records.read.names import columns_known, stated_unit, units_row
+from psa_casadi.records.read.columns import columns_known, stated_unit, units_row
 
 #: Lines in which the first header is looked for, and the most that are asked for further ones.
 _MOST_LINES, _MOST_HEADERS = 500, 20_000

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from psa_casadi.records.read.arrays import Series, array_tables, series_in
+from psa_casadi.records.read.columns import name_without_unit, stated_unit
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.hdf5 import checked_datasets
-from psa_casadi.records.read.names import name_without_unit, stated_unit
 from psa_casadi.records.read.table import Table
 
 

@@ -18,8 +18,7 @@ import numpy.typing as npt
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.column_map import ALL, TABLE, columns_of, parse_columns
-from psa_casadi.records.read.columns import ColumnMap, Source
+from psa_casadi.records.read.columns import ALL, TABLE, ColumnMap, Source, columns_of, parse_columns
 from psa_casadi.records.read.convert import Request
 from psa_casadi.records.read.join import joined, parts_of
 from psa_casadi.records.read.samples import Outcome, samples_of

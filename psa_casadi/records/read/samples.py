@@ -5,8 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.choose import Ask, Choice, Question, choose
-from psa_casadi.records.read.column_map import ALL
-from psa_casadi.records.read.columns import ColumnMap, ready_line
+from psa_casadi.records.read.columns import ALL, ColumnMap, ready_line
 from psa_casadi.records.read.convert import (
     MOST_NAMED,
     NoTimeOfTheirOwn,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import Problems
-from psa_casadi.records.read.column_map import MARKS
+from psa_casadi.records.read.columns import MARKS
 
 #: The cells of one column: numbers or instants (n,), or texts.
 Cells = NDArray[Any] | Sequence[str]

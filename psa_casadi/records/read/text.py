@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read import words
 from psa_casadi.records.read.clock import is_stamp, unit_of_times
-from psa_casadi.records.read.columns import COLUMNS, measures
+from psa_casadi.records.read.columns import COLUMNS, measures, stated_unit, understood, unit_named
 from psa_casadi.records.read.instruments import instrument_lines, stated_step
 from psa_casadi.records.read.layout import (
     SPACES,
@@ -24,7 +24,6 @@ from psa_casadi.records.read.layout import (
     holds,
     laid_out,
 )
-from psa_casadi.records.read.names import stated_unit, understood, unit_named
 from psa_casadi.records.read.table import Cells, Columns, Table
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import units_of

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
-from psa_casadi.records.read.names import unit_named
+from psa_casadi.records.read.columns import unit_named
 from psa_casadi.units import FloatArray, parse_unit
 
 #: What instruments and programs write where there is no reading, in lower case: Keysight's OVLD and
