@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import Problems
-from psa_casadi.records.read.clock import unit_of_times
 from psa_casadi.records.read.columns import MARKS, SI_UNITS, stated_unit, understood, unit_named
 from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.table import Cells, Columns, Table
+from psa_casadi.records.read.table import Cells, Columns, Table, unit_of_times
 
 #: The attributes and properties that state a unit, in lower case.
 UNITS = ("units", "unit", "unit_string")

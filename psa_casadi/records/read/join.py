@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read import clock, words
+from psa_casadi.records.read import table
 from psa_casadi.records.read.arrays import Series, array_tables
 from psa_casadi.records.read.choose import rises
 from psa_casadi.records.read.columns import stated_unit
@@ -81,8 +81,8 @@ def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
     Dates and clock times are counted from the first of all files together.
     """
     texts = [[str(cell) for cell in cells] for _, cells, _ in times]
-    are_stamps = [clock.is_stamp(own[0]) for own in texts]
-    together = clock.seconds([cell for own in texts for cell in own]) if all(are_stamps) else None
+    are_stamps = [table.is_stamp(own[0]) for own in texts]
+    together = table.seconds([cell for own in texts for cell in own]) if all(are_stamps) else None
     if together is not None:
         return np.split(together, np.cumsum([len(own) for own in texts])[:-1])
     if any(are_stamps):
@@ -115,4 +115,4 @@ def _channels(
 def _numbers(cells: Cells) -> FloatArray:
     if isinstance(cells, np.ndarray):
         return cells.astype(np.float64)
-    return words.numbers(cells, words.decimal_sign(cells), "").values
+    return table.numbers(cells, table.decimal_sign(cells), "").values

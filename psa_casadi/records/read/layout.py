@@ -5,9 +5,9 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from psa_casadi.records.read import words
-from psa_casadi.records.read.clock import is_stamp
+from psa_casadi.records.read import table
 from psa_casadi.records.read.columns import columns_known, stated_unit, units_row
+from psa_casadi.records.read.table import is_stamp
 
 #: Lines in which the first header is looked for, and the most that are asked for further ones.
 _MOST_LINES, _MOST_HEADERS = 500, 20_000
@@ -97,7 +97,7 @@ def end_of_rows(lines: Sequence[str], layout: Layout, end: int) -> int:
     while end > layout.first and not (
         (cells := cells_of(lines[end - 1], layout.delimiter))
         and len(cells) >= len(layout.header)
-        and (words.is_number(cells[0]) or is_stamp(cells[0]))
+        and (table.is_number(cells[0]) or is_stamp(cells[0]))
     ):
         end -= 1
     return end
@@ -107,7 +107,7 @@ def _is_remark(line: str, delimiter: str) -> bool:
     """Whether a line below a header holds words and no number."""
     cells = [c for c in cells_of(line, delimiter) if c.strip()]
     return bool(cells) and not any(
-        words.is_number(c) or is_stamp(c) or words.is_missing(c) or words.unit_in([c])
+        table.is_number(c) or is_stamp(c) or table.is_missing(c) or table.unit_in([c])
         for c in cells
     )
 
@@ -145,7 +145,7 @@ def _numbers(line: str, mark: str) -> str:
     """
     for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), ";", "\t", " ")):
         cells = [c for c in cells_of(line, delimiter) if c.strip()]
-        if len(cells) > 1 and all(map(words.is_number, cells)):
+        if len(cells) > 1 and all(map(table.is_number, cells)):
             return delimiter
     return ""
 
@@ -162,7 +162,7 @@ def _above_numbers(lines: Sequence[str], start: int, mark: str) -> int:
     if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
         return first - 2
     alike = len(cells) > 1 and len(cells[-2]) == len(cells[-1])
-    return first - 1 if alike and not words.is_number(cells[-2][0]) else start
+    return first - 1 if alike and not table.is_number(cells[-2][0]) else start
 
 
 def _named(
@@ -186,7 +186,7 @@ def _named(
 def _follow(lines: Sequence[str], k: int, mark: str) -> bool:
     """Whether a line that begins with a number comes within three lines of line k."""
     return any(
-        words.is_number(cells_of(line, mark or delimiter_of(line))[0])
+        table.is_number(cells_of(line, mark or delimiter_of(line))[0])
         for line in lines[k + 1 : k + 4]
         if line.strip()
     )

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read import words
-from psa_casadi.records.read.clock import is_stamp, unit_of_times
+from psa_casadi.records.read import table
 from psa_casadi.records.read.columns import COLUMNS, measures, stated_unit, understood, unit_named
 from psa_casadi.records.read.instruments import instrument_lines, stated_step
 from psa_casadi.records.read.layout import (
@@ -24,7 +23,7 @@ from psa_casadi.records.read.layout import (
     holds,
     laid_out,
 )
-from psa_casadi.records.read.table import Cells, Columns, Table
+from psa_casadi.records.read.table import Cells, Columns, Table, is_stamp, unit_of_times
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import units_of
 
@@ -169,13 +168,13 @@ class _Part:
         cells = self._cells(self.rows[k])
         wordy = cells[0].strip() if cells else ""
         return bool(WORDY.match(wordy)) and not (
-            words.is_missing(wordy) or is_stamp(wordy) or WORDY.match(self.rows[0])
+            table.is_missing(wordy) or is_stamp(wordy) or WORDY.match(self.rows[0])
         )
 
     def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> NDArray[np.float64] | None:
         """Let NumPy read all rows; None if any of them needs a closer look."""
         body, mark = "\n".join(rows), self.layout.delimiter
-        point = words.decimal_sign([c for row in rows[:20] for c in self._cells(row)])
+        point = table.decimal_sign([c for row in rows[:20] for c in self._cells(row)])
         if not body or '"' in body or (point == "," and mark == ","):
             return None
         if mark == " ":
@@ -185,7 +184,7 @@ class _Part:
         if body.count(mark) != len(rows) * (width - 1):
             return None
         if point == ",":
-            body = body.translate(words.SWAPPED)
+            body = body.translate(table.SWAPPED)
         body = f"\n{body}\n"
         if point == "," or any(gap in body for gap in (mark * 2, f"{mark}\n", f"\n{mark}")):
             for gap, filled in (
@@ -235,10 +234,10 @@ def _with_unit(text: str, cells: Cells) -> str:
     if not isinstance(filled, np.ndarray):
         if filled and is_stamp(filled[0]):
             return f"{text.strip()} [s]"
-        own = words.unit_in(filled)
+        own = table.unit_in(filled)
         if own:
             return f"{text.strip()} [{own}]"
-        filled = words.numbers(filled[:9], words.decimal_sign(filled[:9]), "s").values
+        filled = table.numbers(filled[:9], table.decimal_sign(filled[:9]), "s").values
     own = unit_of_times(filled[:9]) if name and name.column == "time" else None
     return f"{text.strip()} [{own}]" if own else text
 
@@ -263,7 +262,7 @@ def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
     cells = [cells_of(row.rstrip(delimiter), delimiter) for row in rows]
     width = len(cells[0])
     if width <= FEWEST_SAMPLES or any(
-        len(row) != width or words.is_number(row[0]) or not all(map(words.is_number, row[1:9]))
+        len(row) != width or table.is_number(row[0]) or not all(map(table.is_number, row[1:9]))
         for row in cells
     ):
         return None
