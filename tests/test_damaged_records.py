@@ -16,7 +16,7 @@ from pyarrow import parquet
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import apart, file_bytes
-from psa_casadi.records.read.binary import READERS
+from psa_casadi.records.read.formats import READERS
 from tests.laboratory_bytes import hdf5, npy, npz, tdms, xlsx
 from tests.mutations import sentences
 
