@@ -19,11 +19,10 @@ import numpy as np
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import Source
-from psa_casadi.records.read.convert import Request, Samples
 from psa_casadi.records.read.file_bytes import check_there, read_text, reason_of
 from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
 from psa_casadi.records.read.head import Head, head_of_tables
-from psa_casadi.records.read.samples import Outcome, samples_of
+from psa_casadi.records.read.samples import Outcome, Request, Samples, samples_of
 from psa_casadi.records.read.table import Table
 from psa_casadi.records.read.text import decoded, text_tables
 from psa_casadi.scratch import temporary_folder

@@ -12,9 +12,8 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read import table
 from psa_casadi.records.read.choose import rises
 from psa_casadi.records.read.columns import stated_unit
-from psa_casadi.records.read.convert import Request
 from psa_casadi.records.read.formats import Series, array_tables
-from psa_casadi.records.read.samples import Outcome, samples_of
+from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Cells, Table
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import FloatArray, to_si

@@ -19,9 +19,8 @@ from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import ALL, TABLE, ColumnMap, Source, columns_of, parse_columns
-from psa_casadi.records.read.convert import Request
 from psa_casadi.records.read.join import joined, parts_of
-from psa_casadi.records.read.samples import Outcome, samples_of
+from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Columns
 from psa_casadi.records.read.table import Table as FileTable
 from psa_casadi.records.read.text import label_of
