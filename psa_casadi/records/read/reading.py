@@ -21,8 +21,7 @@ from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import ALL, TABLE, ColumnMap, Source, columns_of, parse_columns
 from psa_casadi.records.read.join import joined, parts_of
 from psa_casadi.records.read.samples import Outcome, Request, samples_of
-from psa_casadi.records.read.table import Columns
-from psa_casadi.records.read.table import Table as FileTable
+from psa_casadi.records.read.table import Columns, Table
 from psa_casadi.records.read.text import label_of
 from psa_casadi.records.record import Record
 from psa_casadi.units import parse_unit, to_si
@@ -43,9 +42,9 @@ class Frame(Protocol):
         ...
 
 
-Table = Frame | Mapping[str, npt.ArrayLike]
+TableLike = Frame | Mapping[str, npt.ArrayLike]
 #: What stands for one record wherever records are asked for.
-OneRecord = Record | AnyPath | Table
+OneRecord = Record | AnyPath | TableLike
 #: What stands for the records of one device.
 Records = OneRecord | Iterable[OneRecord]
 
@@ -124,7 +123,7 @@ def read_records(
 
 
 def record_from(
-    table: Table,
+    table: TableLike,
     *,
     name: str = "record",
     need_displacement: bool = True,
@@ -152,7 +151,7 @@ def record_from(
     return _record(name, outcome, digest.hexdigest(), source="")
 
 
-def _table_of(table: Table, name: str) -> FileTable:
+def _table_of(table: TableLike, name: str) -> Table:
     """Return a table in memory as the tables of files are."""
     own = list(table if isinstance(table, Mapping) else table.columns)
 
@@ -163,7 +162,7 @@ def _table_of(table: Table, name: str) -> FileTable:
 
     header = [str(text) for text in own]
     labels = [label_of(text) for text in header]
-    return FileTable(name, "", header, labels, f"{name}: column names", "row", load)
+    return Table(name, "", header, labels, f"{name}: column names", "row", load)
 
 
 def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
@@ -263,7 +262,7 @@ def _is_one(given: Records) -> TypeGuard[OneRecord]:
     return isinstance(given, Record | str | os.PathLike) or _is_table(given)
 
 
-def _is_table(given: object) -> TypeGuard[Table]:
+def _is_table(given: object) -> TypeGuard[TableLike]:
     return isinstance(given, Mapping) or hasattr(given, "columns")
 
 
