@@ -26,7 +26,7 @@ from psa_casadi.records.read.columns import (
     usual_source,
     words_of,
 )
-from psa_casadi.records.read.table import Table
+from psa_casadi.records.read.table import Table, as_times, decimal_sign, evened, numbers_in
 from psa_casadi.units import parse_unit
 
 #: The quantities that tell the columns which every record has.
@@ -77,7 +77,7 @@ class Cell:
     unit: str | None
     hint: str | None
     column: str | None
-    table: frozenset[str]
+    words: frozenset[str]
 
     def speaks(self, column: str) -> int:
         """Return 1 where the words of the name speak for a column, -1 against it, else 0."""
@@ -272,16 +272,16 @@ def choose(table: Table, required: Sequence[str], wanted: ColumnMap, problems: P
 def rises(table: Table, index: int) -> bool:
     """Whether a column is one of instants, or of numbers each of which is larger than the last."""
     cells = table.glance[index]
-    times = table.times(cells, "s")
+    times = as_times(cells, "s")
     if times is None:
         is_array = isinstance(cells, np.ndarray)
         texts = [] if is_array else [str(cell) for cell in cells]
-        sign = table.decimal_sign(texts)
-        times = np.asarray(cells) if is_array else table.numbers(texts, sign, "s").values
+        sign = decimal_sign(texts)
+        times = np.asarray(cells) if is_array else numbers_in(texts, sign, "s").values
     if times.size < 2 or times.dtype.kind not in "biuf":
         return False
     steps = np.diff(times)
-    if table.evened(times):
+    if evened(times):
         return True
     counts = np.all(steps == 1.0) and times[0] in (0.0, 1.0)  # rows, not seconds
     starts_anew = (steps < 0.0).sum() <= 0.1 * steps.size and np.all(steps != 0.0)
@@ -462,7 +462,7 @@ def _usual_length(table: Table, index: int) -> str:
     """Return the unit in which numbers are a stroke that a stack may have: 1 nm to 1 mm."""
     cells = table.glance[index]
     if not isinstance(cells, np.ndarray):
-        cells = table.numbers(cells, table.decimal_sign(cells), "").values
+        cells = numbers_in(cells, decimal_sign(cells), "").values
     finite = cells[np.isfinite(cells)] if cells.dtype.kind in "biuf" else np.zeros(0)
     span = float(np.ptp(finite)) if finite.size else 0.0
     return "m" if 1e-9 <= span < 1e-3 else "nm" if span > 3e3 else "um"

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
-from psa_casadi.records.read import apart, table
+from psa_casadi.records.read import apart
 from psa_casadi.records.read.choose import rises
 from psa_casadi.records.read.columns import (
     ALL,
@@ -37,7 +37,15 @@ from psa_casadi.records.read.columns import (
 )
 from psa_casadi.records.read.formats import Series, array_tables
 from psa_casadi.records.read.samples import Outcome, Request, samples_of
-from psa_casadi.records.read.table import Cells, Columns, Table
+from psa_casadi.records.read.table import (
+    Cells,
+    Columns,
+    Table,
+    decimal_sign,
+    is_stamp,
+    numbers_in,
+    seconds_of,
+)
 from psa_casadi.records.read.text import label_of
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.units import FloatArray, parse_unit, to_si
@@ -104,8 +112,8 @@ def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
     Dates and clock times are counted from the first of all files together.
     """
     texts = [[str(cell) for cell in cells] for _, cells, _ in times]
-    are_stamps = [table.is_stamp(own[0]) for own in texts]
-    together = table.seconds([cell for own in texts for cell in own]) if all(are_stamps) else None
+    are_stamps = [is_stamp(own[0]) for own in texts]
+    together = seconds_of([cell for own in texts for cell in own]) if all(are_stamps) else None
     if together is not None:
         return np.split(together, np.cumsum([len(own) for own in texts])[:-1])
     if any(are_stamps):
@@ -138,7 +146,7 @@ def _channels(
 def _numbers(cells: Cells) -> FloatArray:
     if isinstance(cells, np.ndarray):
         return cells.astype(np.float64)
-    return table.numbers(cells, table.decimal_sign(cells), "").values
+    return numbers_in(cells, decimal_sign(cells), "").values
 
 
 _NAME = re.compile(r"[a-z]\w*(?:\.\w+)* \[(?P<unit>[^\[\]]+)\]", re.IGNORECASE)

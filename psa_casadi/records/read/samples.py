@@ -7,11 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read import table
 from psa_casadi.records.read.choose import Ask, Choice, Question, choose
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.table import Cells, Columns, Table, parts_of_file
+from psa_casadi.records.read.table import (
+    Cells,
+    Columns,
+    Parsed,
+    Table,
+    as_times,
+    decimal_sign,
+    evened,
+    is_number,
+    numbers_in,
+    parts_of_file,
+    starts_of,
+    without_overload,
+)
 from psa_casadi.records.record import (
     FEWEST_SAMPLES,
     Located,
@@ -102,7 +114,7 @@ def converted(
     columns = table.load([f.index for f in fields.values()], None, problems)
     if _lengths_differ(table, fields, columns, problems):
         return None
-    point = table.decimal_sign(c for row in zip(*_texts(columns), strict=False) for c in row)
+    point = decimal_sign(c for row in zip(*_texts(columns), strict=False) for c in row)
     found = {
         name: _numbers(table, name, own.unit, cells, columns.lines, point, problems)
         for (name, own), cells in zip(fields.items(), columns.cells, strict=True)
@@ -120,13 +132,11 @@ def converted(
                 " invented, as for a curve without time, rates, creep and lags mean nothing."
             )
         clear = np.zeros(len(lines), dtype=np.bool_)
-        found = {"time": table.Parsed(even, clear, 0), **found}
+        found = {"time": Parsed(even, clear, 0), **found}
         fields = {"time": Field(-1, "s"), **fields}
     elif "time" in found:
         part = _timed(table, found, lines, segment, notes)
-        found = {
-            n: table.Parsed(p.values[part], p.wrong[part], p.missing) for n, p in found.items()
-        }
+        found = {n: Parsed(p.values[part], p.wrong[part], p.missing) for n, p in found.items()}
         lines = lines[part]
     for name, parsed in found.items():
         if parsed.missing and name == "displacement":
@@ -149,26 +159,26 @@ def _texts(columns: Columns) -> list[Sequence[str]]:
 def _numbers(
     table: Table, name: str, unit: str, cells: Cells, lines: NDArray[np.int64], point: str,
     problems: Problems,
-) -> table.Parsed:  # fmt: skip
+) -> Parsed:  # fmt: skip
     """Return a column as numbers; what is none is told with its place."""
-    values = table.times(cells, unit) if name == "time" else None
+    values = as_times(cells, unit) if name == "time" else None
     if values is None and isinstance(cells, np.ndarray):
         values = cells.astype(np.float64)
     if values is not None:
-        return table.without_overload(values)
+        return without_overload(values)
     texts = [str(cell) for cell in cells]
-    parsed = table.numbers(texts, point, unit)
+    parsed = numbers_in(texts, point, unit)
     if table.sizes and parsed.wrong.all():
         problems.add(
             f"{table.path}: column '{name}': holds texts such as '{texts[0][:40]}', expected"
             " numbers; convert the column before the file is written."
         )
-        return table.Parsed(parsed.values, parsed.wrong, 0)
+        return Parsed(parsed.values, parsed.wrong, 0)
     for line, cell in zip(lines[parsed.wrong], np.array(texts)[parsed.wrong], strict=True):
         hint = "correct it, or leave the cell empty where the sample is missing"
         if name in ("time", "voltage"):
             hint = f"correct it or remove the {table.place}"
-        if table.is_number(cell) and table.decimal_sign([cell]) != point:
+        if is_number(cell) and decimal_sign([cell]) != point:
             other = "comma" if point == "," else "point"
             hint = f"other numbers of this file have a decimal {other}, write this one so too"
         problems.add(
@@ -180,7 +190,7 @@ def _numbers(
 
 def _timed(
     table: Table,
-    found: dict[str, table.Parsed],
+    found: dict[str, Parsed],
     lines: NDArray[np.int64],
     segment: str,
     notes: list[str],
@@ -192,7 +202,7 @@ def _timed(
         NoTimeOfTheirOwn: it begins anew after every few samples.
     """
     time = found["time"].values
-    starts = table.starts(np.nan_to_num(time, nan=-np.inf) if np.isnan(time).any() else time)
+    starts = starts_of(np.nan_to_num(time, nan=-np.inf) if np.isnan(time).any() else time)
     ends = [*starts[1:], time.size]
     sizes = np.diff([*starts, time.size])
     part = slice(0, time.size)
@@ -220,7 +230,7 @@ def _timed(
             )
     elif segment and segment != "1":
         raise InputError(f"{table.path}: there is no table '{segment}'; it holds one.")
-    even = None if _repeats(found, part) else table.evened(time[part])
+    even = None if _repeats(found, part) else evened(time[part])
     if even is not None:
         found["time"].values[part] = even[0]
         notes.append(
@@ -230,7 +240,7 @@ def _timed(
     return part
 
 
-def _repeats(found: Mapping[str, table.Parsed], part: slice) -> bool:
+def _repeats(found: Mapping[str, Parsed], part: slice) -> bool:
     """Whether whole samples are repeated where the time is: then lines are double, not rounded."""
     same = np.diff(found["time"].values[part]) == 0.0
     others = [p.values[part] for n, p in found.items() if n != "time"]
@@ -255,7 +265,7 @@ def _lengths_differ(
 
 def _check(
     table: Table,
-    found: Mapping[str, table.Parsed],
+    found: Mapping[str, Parsed],
     lines: NDArray[np.int64],
     problems: Problems,
     request: Request,

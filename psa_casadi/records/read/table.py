@@ -151,7 +151,7 @@ def without_overload(values: FloatArray) -> Parsed:
     return Parsed(values, np.zeros(values.size, np.bool_), int(np.isnan(values).sum()))
 
 
-def numbers(cells: Sequence[str], point: str, unit: str) -> Parsed:
+def numbers_in(cells: Sequence[str], point: str, unit: str) -> Parsed:
     """Return the numbers in texts with a decimal `point`; a cell's own unit is turned to `unit`."""
     plain = cells if point == "." else [c.translate(SWAPPED) for c in cells]
     try:
@@ -233,7 +233,7 @@ def unit_of_times(times: FloatArray) -> str | None:
     return "d" if 7.2e5 <= times[0] < 7.7e5 and 0.0 < step < 2e-6 else None
 
 
-def seconds(cells: Sequence[str]) -> FloatArray | None:
+def seconds_of(cells: Sequence[str]) -> FloatArray | None:
     """Return dates and clock times as seconds from the first (n,); None where a cell is neither.
 
     Of 3/4/2024 the day is what makes the record the shorter one; a clock that goes back by more
@@ -289,13 +289,13 @@ def _days(stamps: Sequence[re.Match[str]], *, day_first: bool) -> FloatArray | N
     return np.asarray(days - days[0])
 
 
-def times(cells: Cells, unit: str) -> FloatArray | None:
+def as_times(cells: Cells, unit: str) -> FloatArray | None:
     """Return instants, clock times and large numbers as times from the first, in a unit.
 
     A float would lose the last digits of large numbers. None for all others.
     """
     if not isinstance(cells, np.ndarray):
-        stamps = seconds(cells)
+        stamps = seconds_of(cells)
         return _large(cells) if stamps is None else stamps / float(to_si(1.0, unit))
     if cells.dtype.kind in "mM":
         since = (cells - cells[:1]).astype("timedelta64[ns]").astype(np.int64)
@@ -338,7 +338,7 @@ def evened(time: FloatArray) -> tuple[FloatArray, float] | None:
     return None
 
 
-def starts(time: FloatArray) -> NDArray[np.int64]:
+def starts_of(time: FloatArray) -> NDArray[np.int64]:
     """Return the indices at which the time begins anew, the first sample among them."""
     with np.errstate(invalid="ignore"):
         return np.flatnonzero(np.r_[True, np.diff(time) < 0.0])

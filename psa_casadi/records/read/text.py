@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read import table
 from psa_casadi.records.read.columns import (
     COLUMNS,
     columns_known,
@@ -21,7 +20,19 @@ from psa_casadi.records.read.columns import (
     units_row,
 )
 from psa_casadi.records.read.instruments import instrument_lines, stated_step
-from psa_casadi.records.read.table import Cells, Columns, Table, is_stamp, unit_of_times
+from psa_casadi.records.read.table import (
+    SWAPPED,
+    Cells,
+    Columns,
+    Table,
+    decimal_sign,
+    is_missing,
+    is_number,
+    is_stamp,
+    numbers_in,
+    unit_in,
+    unit_of_times,
+)
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import units_of
 
@@ -113,7 +124,7 @@ def end_of_rows(lines: Sequence[str], layout: Layout, end: int) -> int:
     while end > layout.first and not (
         (cells := cells_of(lines[end - 1], layout.delimiter))
         and len(cells) >= len(layout.header)
-        and (table.is_number(cells[0]) or is_stamp(cells[0]))
+        and (is_number(cells[0]) or is_stamp(cells[0]))
     ):
         end -= 1
     return end
@@ -123,8 +134,7 @@ def _is_remark(line: str, delimiter: str) -> bool:
     """Whether a line below a header holds words and no number."""
     cells = [c for c in cells_of(line, delimiter) if c.strip()]
     return bool(cells) and not any(
-        table.is_number(c) or is_stamp(c) or table.is_missing(c) or table.unit_in([c])
-        for c in cells
+        is_number(c) or is_stamp(c) or is_missing(c) or unit_in([c]) for c in cells
     )
 
 
@@ -161,7 +171,7 @@ def _numbers(line: str, mark: str) -> str:
     """
     for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), ";", "\t", " ")):
         cells = [c for c in cells_of(line, delimiter) if c.strip()]
-        if len(cells) > 1 and all(map(table.is_number, cells)):
+        if len(cells) > 1 and all(map(is_number, cells)):
             return delimiter
     return ""
 
@@ -178,7 +188,7 @@ def _above_numbers(lines: Sequence[str], start: int, mark: str) -> int:
     if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
         return first - 2
     alike = len(cells) > 1 and len(cells[-2]) == len(cells[-1])
-    return first - 1 if alike and not table.is_number(cells[-2][0]) else start
+    return first - 1 if alike and not is_number(cells[-2][0]) else start
 
 
 def _named(
@@ -202,7 +212,7 @@ def _named(
 def _follow(lines: Sequence[str], k: int, mark: str) -> bool:
     """Whether a line that begins with a number comes within three lines of line k."""
     return any(
-        table.is_number(cells_of(line, mark or delimiter_of(line))[0])
+        is_number(cells_of(line, mark or delimiter_of(line))[0])
         for line in lines[k + 1 : k + 4]
         if line.strip()
     )
@@ -349,13 +359,13 @@ class _Part:
         cells = self._cells(self.rows[k])
         wordy = cells[0].strip() if cells else ""
         return bool(WORDY.match(wordy)) and not (
-            table.is_missing(wordy) or is_stamp(wordy) or WORDY.match(self.rows[0])
+            is_missing(wordy) or is_stamp(wordy) or WORDY.match(self.rows[0])
         )
 
     def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> NDArray[np.float64] | None:
         """Let NumPy read all rows; None if any of them needs a closer look."""
         body, mark = "\n".join(rows), self.layout.delimiter
-        point = table.decimal_sign([c for row in rows[:20] for c in self._cells(row)])
+        point = decimal_sign([c for row in rows[:20] for c in self._cells(row)])
         if not body or '"' in body or (point == "," and mark == ","):
             return None
         if mark == " ":
@@ -365,7 +375,7 @@ class _Part:
         if body.count(mark) != len(rows) * (width - 1):
             return None
         if point == ",":
-            body = body.translate(table.SWAPPED)
+            body = body.translate(SWAPPED)
         body = f"\n{body}\n"
         if point == "," or any(gap in body for gap in (mark * 2, f"{mark}\n", f"\n{mark}")):
             for gap, filled in (
@@ -415,10 +425,10 @@ def _with_unit(text: str, cells: Cells) -> str:
     if not isinstance(filled, np.ndarray):
         if filled and is_stamp(filled[0]):
             return f"{text.strip()} [s]"
-        own = table.unit_in(filled)
+        own = unit_in(filled)
         if own:
             return f"{text.strip()} [{own}]"
-        filled = table.numbers(filled[:9], table.decimal_sign(filled[:9]), "s").values
+        filled = numbers_in(filled[:9], decimal_sign(filled[:9]), "s").values
     own = unit_of_times(filled[:9]) if name and name.column == "time" else None
     return f"{text.strip()} [{own}]" if own else text
 
@@ -443,8 +453,7 @@ def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
     cells = [cells_of(row.rstrip(delimiter), delimiter) for row in rows]
     width = len(cells[0])
     if width <= FEWEST_SAMPLES or any(
-        len(row) != width or table.is_number(row[0]) or not all(map(table.is_number, row[1:9]))
-        for row in cells
+        len(row) != width or is_number(row[0]) or not all(map(is_number, row[1:9])) for row in cells
     ):
         return None
     header = [_with_unit(row[0], row[1:]) for row in cells]
