@@ -12,9 +12,9 @@ from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.start.other_quantities import doubtful_quantity
-from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
+from psa_casadi.records.suspects import suspects
 from psa_casadi.report.words.text import story
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack

@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.residual.coordinates import drive_of
 from psa_casadi.diagnosis.residual.misfit import misfit
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, excitation, read_record
-from psa_casadi.records.turns import reversals
+from psa_casadi.records.drive import reversals
 from tests.misfit_cases import (
     LEVELS,
     MULTISINE,

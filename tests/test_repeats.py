@@ -11,8 +11,7 @@ from scipy.signal import lfilter
 from psa_casadi.diagnosis.noise.floor import noise_floor
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import Record, excitation, read_record
-from psa_casadi.records.quality.repeats import holds, repeats
-from psa_casadi.records.quality.repetitions import held, repetitions
+from psa_casadi.records.repeats import held, holds, repeats, repetitions
 
 FloatArray = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.records import Record
-from psa_casadi.records.quality.noise import correlation_inflation, high_frequency_noise
+from psa_casadi.records.drive import reversals
+from psa_casadi.records.noise import correlation_inflation, high_frequency_noise
 from psa_casadi.records.split import divided, split, whole
-from psa_casadi.records.turns import reversals
 
 FloatArray = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.fit import FittedOutput, OdeFit
-from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.records.noise import filtered
 from psa_casadi.variables import Interval
 
 FloatArray = npt.NDArray[np.float64]

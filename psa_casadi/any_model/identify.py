@@ -14,7 +14,7 @@ from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
 from psa_casadi.any_model.sizes import sized
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.noise import first_order_noise
+from psa_casadi.records.noise import first_order_noise
 from psa_casadi.records.signals import Hold, signals_given
 from psa_casadi.shown import StillReported, frame
 from psa_casadi.simulation.stepper import SimulationError

@@ -27,7 +27,7 @@ from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.diagnosis.screening.evidence import probabilities, temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
-from psa_casadi.records.checks import FEWEST_SAMPLES
+from psa_casadi.records.record import FEWEST_SAMPLES
 
 _FEW = (
     "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."

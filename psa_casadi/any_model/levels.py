@@ -10,7 +10,7 @@ from psa_casadi.any_model.fit import OdeFit, measured_outputs, refitted
 from psa_casadi.any_model.predict import shown_by
 from psa_casadi.any_model.runs import Run, noise_share
 from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, uncertain
-from psa_casadi.records.quality.noise import first_order_noise
+from psa_casadi.records.noise import first_order_noise
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -31,12 +31,10 @@ from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
-from psa_casadi.records.excerpts import excerpts
-from psa_casadi.records.quality.gaps import without_gaps
-from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, divided, in_one_order
+from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
+from psa_casadi.records.suspects import cleaned, masked, suspects
 from psa_casadi.simulation.ahead import compiled_ahead
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.timings import stage

@@ -6,10 +6,9 @@ import numpy as np
 
 from psa_casadi.diagnosis.result import Cause, NextExperiment, Verdict
 from psa_casadi.diagnosis.search.contenders import same_curve_note
-from psa_casadi.records.quality.repeats import repeats
-from psa_casadi.records.quality.repetitions import held
 from psa_casadi.records.record import Record
-from psa_casadi.records.stretches import counts, loop_sizes
+from psa_casadi.records.repeats import held, repeats
+from psa_casadi.records.split import counts, loop_sizes
 
 #: A hold lasts so long [s]; the durations of the largest rises lie in so many bands, each a factor
 #: of four wide, and loops have so many sizes.

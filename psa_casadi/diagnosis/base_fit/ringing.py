@@ -22,7 +22,7 @@ from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.search.force_start import force_of
-from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.records.noise import filtered
 from psa_casadi.records.split import Experiment, fitted
 
 FloatArray = npt.NDArray[np.float64]

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
 from psa_casadi.identification.start.linear_response import plays
-from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 

@@ -6,7 +6,7 @@ from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.start.doubts import doubtful_voltage
 from psa_casadi.identification.start.other_quantities import doubtful_quantity
-from psa_casadi.records.checks import FEWEST_SAMPLES
+from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment
 
 #: Gain [%] of an error that doubles.

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from psa_casadi.diagnosis.held_out.confirmation import too_few_held_out
-from psa_casadi.records.split import Experiment
-from psa_casadi.records.stretches import Kind, counts
+from psa_casadi.records.split import Experiment, Kind, counts
 
 #: Shares of the samples, and of the voltage's span, that are worth a word.
 _SAMPLES, _SPAN = 0.02, 0.01

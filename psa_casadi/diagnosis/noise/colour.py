@@ -7,9 +7,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.records.quality.filtering import filtered
-from psa_casadi.records.quality.noise import first_order_noise
-from psa_casadi.records.quality.repeats import autoregression_of
+from psa_casadi.records.noise import filtered, first_order_noise
+from psa_casadi.records.repeats import autoregression_of
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -11,10 +11,9 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, rms
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.records.quality.noise import first_order_noise
-from psa_casadi.records.quality.quantum import last_place_of, quantum_of
-from psa_casadi.records.quality.repeats import MeasuredNoise, holds, repeats
+from psa_casadi.records.noise import first_order_noise, last_place_of, quantum_of
 from psa_casadi.records.record import Record
+from psa_casadi.records.repeats import MeasuredNoise, holds, repeats
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]

@@ -7,10 +7,10 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.residual.views import COARSE, FINE, Axis
-from psa_casadi.records.quality.fast_noise import fast_noise
-from psa_casadi.records.quality.repetitions import held
+from psa_casadi.records.drive import reversals
+from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
-from psa_casadi.records.turns import reversals
+from psa_casadi.records.repeats import held
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]

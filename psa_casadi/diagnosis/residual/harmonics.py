@@ -7,8 +7,8 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.noise.floor import quantity
-from psa_casadi.records.quality.repetitions import Repetition, repetitions
 from psa_casadi.records.record import Record
+from psa_casadi.records.repeats import Repetition, repetitions
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]

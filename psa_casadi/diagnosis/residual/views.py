@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.floor import figure, quantity
-from psa_casadi.records.quality.noise import correlation_inflation
+from psa_casadi.records.noise import correlation_inflation
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.drive import tells_tone
-from psa_casadi.records.quality.filtering import peaks as highest_peaks
+from psa_casadi.records.noise import peaks as highest_peaks
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]

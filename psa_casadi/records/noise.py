@@ -1,11 +1,136 @@
 """The noise floor of a measured displacement, and how a residual compares with it."""
 
+from collections.abc import Sequence
+
 import numpy as np
-import numpy.typing as npt
+import scipy
+from numpy.typing import NDArray
 
-from psa_casadi.records.quality.filtering import without_line
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
+_WHITE = -0.6
+
+
+def fast_noise(signal: FloatArray) -> float:
+    """Return the standard deviation of a signal's white noise, 0 where its fast part is none.
+
+    Third differences of white noise of variance s^2 have variance 20 s^2 and a correlation of
+    -15/20 with their neighbours, while those of anything smooth over four samples are almost none
+    or follow their neighbours. A correlation above -0.6 is therefore taken for motion.
+    """
+    if signal.size < 8:
+        return 0.0
+    third = np.diff(signal, 3)
+    level = 1.482602218505602 * float(np.median(np.abs(third))) / float(np.sqrt(20.0))
+    usual = np.clip(third, -6 * np.sqrt(20.0) * level, 6 * np.sqrt(20.0) * level)
+    power = float(usual @ usual)
+    if power <= 0 or float(usual[1:] @ usual[:-1]) / power > _WHITE:
+        return 0.0
+    return level
+
+
+def filtered(
+    upper: Sequence[float] | FloatArray, lower: Sequence[float] | FloatArray, x: FloatArray
+) -> FloatArray:
+    """Return the response of upper(z)/lower(z), from rest, to x (n,) or its columns (n, k).
+
+    Both hold the coefficients of z^0, z^-1 ...; the first one of `lower` is 1.
+    """
+    found = upper[0] * x
+    for k, weight in enumerate(upper[1 : len(x)], 1):
+        found[k:] += weight * x[:-k]
+    if len(lower) == 1 or not x.size:
+        return found
+    bands = np.repeat(np.asarray(lower, dtype=float)[: len(x), None], len(x), axis=1)
+    solved = scipy.linalg.lapack.dtbtrs(bands, found.reshape(len(x), -1), uplo="L")[0]
+    recursive: FloatArray = solved.reshape(x.shape)
+    return recursive
+
+
+def convolved(x: FloatArray, kernel: FloatArray) -> FloatArray:
+    """Return the columns x (n, k) convolved with a symmetric kernel (2 m + 1,), centred."""
+    n, reach = len(x), len(kernel) // 2
+    size = scipy.fft.next_fast_len(n + len(kernel) - 1, real=True)
+    spectrum = scipy.fft.rfft(x, size, axis=0) * scipy.fft.rfft(kernel, size)[:, None]
+    whole: FloatArray = scipy.fft.irfft(spectrum, size, axis=0)[reach : reach + n]
+    return whole
+
+
+def without_line(parts: FloatArray) -> FloatArray:
+    """Return rows (k, n) less the straight line that fits each best."""
+    t = np.linspace(-1.0, 1.0, parts.shape[1])
+    flat = parts - np.mean(parts, axis=1, keepdims=True)
+    rest: FloatArray = flat - np.outer(flat @ t / (t @ t), t)
+    return rest
+
+
+def peaks(values: FloatArray, apart: int, most: int) -> NDArray[np.int64]:
+    """Return the places of the highest local maxima, at least `apart` samples apart, in order."""
+    inner = values[1:-1]
+    places = np.flatnonzero((inner > values[:-2]) & (inner >= values[2:])) + 1
+    chosen: list[int] = []
+    for k in places[np.argsort(-values[places], kind="stable")].tolist():
+        if len(chosen) == most:
+            break
+        if all(abs(k - other) >= apart for other in chosen):
+            chosen.append(k)
+    return np.array(chosen, dtype=np.int64)
+
+
+#: Fewer samples of each level than this, on average, show no levels.
+_VISITS = 4
+#: A signal with fewer levels than this is no measurement of a motion.
+_LEVELS = 3
+#: Decimal places that a file may have, in SI units; how near to them every value must be, over the
+#: last place; and least values over the last place: nearer to 0 any number has few places.
+_PLACES, _NEAR, _LEAST = range(3, 16), 1e-3, 10.0
+
+
+def quantum_of(signal: FloatArray) -> float | None:
+    """Return the step between the levels of a quantised signal, or None where it has no levels.
+
+    The signal (n,), without nan, is quantised where it takes few distinct values, a quarter of its
+    samples at most, and every distance between neighbouring ones is a whole multiple of one step
+    (to a tenth of it, because files hold rounded numbers).
+    """
+    levels = np.unique(signal)
+    if levels.size < _LEVELS or levels.size * _VISITS > signal.size:
+        return None
+    gaps = np.diff(levels)
+    apart = gaps[gaps > 1e-6 * (levels[-1] - levels[0])]
+    if not apart.size:
+        return None
+    single = apart[apart < 1.5 * np.min(apart)]
+    step = float(np.mean(single))
+    multiples = apart / step
+    if np.any(np.abs(multiples - np.round(multiples)) > 0.1 * np.maximum(1.0, multiples / 10.0)):
+        return None
+    return step
+
+
+def last_place_of(signal: FloatArray) -> float:
+    """Return the last decimal place 10^-k to which all values of a signal are rounded, 0 if none.
+
+    The signal (n,) is without nan. Rounding to it leaves an error of 10^-k/sqrt(12) rms.
+    """
+    largest = float(np.max(np.abs(signal), initial=0.0))
+    for k in _PLACES:
+        step = 10.0**-k
+        if largest < _LEAST * step:
+            continue
+        if largest > step / (_NEAR * np.finfo(float).eps):  # no double tells
+            break
+        places = signal / step
+        if np.all(np.abs(places - np.round(places)) < _NEAR):
+            return step
+    return 0.0
+
+
+def runs_of(found: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first sample of every run of True in (n,), and the one behind its last, (k,)."""
+    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8)))
+    return edges[::2], edges[1::2]
+
 
 #: Fewer samples than this are noise as a whole; third differences of this many standard deviations
 #: are steps, if their share is no larger.
@@ -18,7 +143,7 @@ _SQUARES = (0.5625, 0.09, 0.0025)
 _SEGMENT, _FEWEST_SEGMENTS, _FAST = 128, 4, 0.045
 _CORRELATIONS = np.arange(0.0, 0.96, 0.01)
 #: A correlation counts from here on, and from so many times 1/sqrt(n): three standard errors.
-_LEAST, _SURE = 0.1, 6.0
+_LEAST_noise, _SURE = 0.1, 6.0
 
 
 def high_frequency_noise(signal: FloatArray) -> float:
@@ -73,7 +198,7 @@ def first_order_noise(signal: FloatArray) -> tuple[float, float]:
     levels = np.median(flat, axis=1)
     best = int(np.argmin(np.sum(np.abs(flat - levels[:, None]), axis=1)))
     r = float(_CORRELATIONS[best])
-    if r < max(_LEAST, _SURE / np.sqrt(n)):
+    if r < max(_LEAST_noise, _SURE / np.sqrt(n)):
         return white, 0.0
     rms = float(np.sqrt(np.exp(levels[best]) / (1 - r**2)))
     return min(rms, float(np.std(signal))), r
