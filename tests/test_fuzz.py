@@ -40,7 +40,7 @@ FULL = {
     "records-xlsx": 40, "records-tdms": 40, "records-h5": 20, "records-npz": 40,
     "records-npy": 40, "records-lvm": 200, "records-dat": 200,
     "column-maps": 1500, "mapped-records": 300, "units": 1000, "models": 400, "paths": 500,
-    "binaries": 1500, "zips": 100, "descriptions": 300, "states": 250,
+    "zips": 100, "descriptions": 300, "states": 250,
 }  # fmt: skip
 #: Commands, which take seconds each. Kills and damaged caches are in `test_ended_commands` and
 #: `test_compiler_cache`.

@@ -14,11 +14,11 @@ from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
 from psa_casadi.export.ssp.layout import OUTSIDE, Port
 from psa_casadi.export.ssp.parameters import shared_parameters
-from psa_casadi.export.ssp.read_archive import SspArchive
 from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.model.system.system import System
 from tests.fmu_models import assert_valid, model_named
+from tests.ssp_master import SspArchive
 from tests.ssp_systems import archive_of, closed_loop, pushed_stage
 from tests.test_fmu_system import STACK
 from tests.tiers import slow, slow_but

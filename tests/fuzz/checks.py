@@ -1,6 +1,7 @@
 """The command `psa check` on hostile and damaged FMUs: it ends in order and passes none of them."""
 
 import json
+import struct
 import zipfile
 from collections.abc import Iterator
 from functools import cache
@@ -13,9 +14,8 @@ from psa_casadi.export.fmu.platforms import compile_library, host_platform
 from psa_casadi.model.model_file import dumps, loads
 from tests.fmu_models import entries
 from tests.fuzz.archives import STACK, damaged_xml, hostile, stored
-from tests.fuzz.binaries import damaged_library
 from tests.fuzz.commands import left_files, misbehaved, psa
-from tests.fuzz.mutators import damaged_bytes
+from tests.fuzz.mutators import EDGES, damaged_bytes
 from tests.fuzz.target import FALSE_PASS, Found, Target
 
 ROOM = "archives"
@@ -32,6 +32,39 @@ def _whole(rng: Random) -> bytes:
     damage = {1: damaged_xml, 4: damaged_library}.get(kind, damaged_bytes)
     content[name] = damage(content[name], rng)
     return stored(content)
+
+
+def damaged_library(data: bytes, rng: Random) -> bytes:
+    """Return a library with its headers damaged three times out of four, else anything in it."""
+    kind = rng.random()
+    if kind < 0.25:
+        return damaged_bytes(data, rng)
+    place, size = rng.choice(_headers(data)) if kind < 0.75 else (0, 4096)
+    part = bytearray(data[place : place + size])
+    for _ in range(rng.choice((1, 1, 2))):
+        width = rng.choice((1, 2, 4, 4, 8))
+        at = rng.randrange(max(1, len(part) // width)) * width
+        number = rng.choice((*EDGES, len(data), len(data) - 1, rng.randrange(len(data))))
+        part[at : at + width] = (number % (1 << 8 * width)).to_bytes(width, "little")
+    return data[:place] + bytes(part) + data[place + size :]
+
+
+def _headers(data: bytes) -> list[tuple[int, int]]:
+    """Return where the headers and tables of a sound library lie: place and size of each."""
+    if data[:4] == b"\x7fELF":
+        table, entry, count = (
+            struct.unpack_from("<Q", data, 40)[0], *struct.unpack_from("<2H", data, 58),
+        )  # fmt: skip
+        found = [(0, 64), (64, 56 * 8), (table, entry * count)]
+        for k in range(count):
+            kind, offset, size = struct.unpack_from("<4xI16x2Q", data, table + k * entry)
+            if kind in (3, 5, 6, 11, 0x6FFFFFFE, 0x6FFFFFFF, 0x6FFFFFF6):
+                found.append((offset, size))
+        return found
+    if data[:2] == b"MZ":
+        start = struct.unpack_from("<I", data, 0x3C)[0]
+        return [(0, 64), (start, 24 + 240), (start + 24, 240 + 40 * 8), (0x400, 0x400)]
+    return [(0, 32), (32, 1024), (len(data) - 4096, 4096)]
 
 
 def _check(data: bytes, folder: Path) -> Iterator[Found]:

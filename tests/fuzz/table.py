@@ -7,7 +7,6 @@ from psa_casadi.report.words.tables import Table
 from tests.benchmarks.table import TitledTable
 from tests.fuzz import (
     archives,
-    binaries,
     blobs,
     cache,
     checks,
@@ -26,7 +25,6 @@ TARGETS: dict[str, Target] = {
         readers,
         laboratory,
         models,
-        binaries,
         archives,
         checks,
         blobs,

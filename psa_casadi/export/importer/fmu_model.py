@@ -21,7 +21,6 @@ from psa_casadi.export.importer.imported import (
     digest_of,
     imported_of,
     opened,
-    states_of,
 )
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.variables import nominal_value
@@ -95,7 +94,7 @@ def _starts(imported: Imported, read: Read) -> list[float]:
     }
     try:
         with imported.initialised(values) as instance:
-            return [float(x) for x in states_of(instance, len(read.states))]
+            return list(instance.vector("GetContinuousStates", len(read.states)))
     except PsaError as error:
         raise InputError(
             f"{imported.fmu.path}: cannot be initialised ({error}); check `values`."

@@ -70,7 +70,7 @@ def communicate(
     for k, (begin, end) in enumerate(pairwise(times)):
         size = float(end - begin)
         instance.set(dict(zip(names, samples[k], strict=True)))
-        if rates and instance.has_input_rates and not inputs.held:
+        if rates and instance.fmu.version == 2 and not inputs.held:
             slope = (samples[k + 1] - samples[k]) / size
             instance.set_rates(dict(zip(names, slope, strict=True)))
         instance.step(float(begin), size)
