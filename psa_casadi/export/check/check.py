@@ -13,16 +13,17 @@ from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check import binaries
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.apart import OVERTIME, rows_apart
-from psa_casadi.export.check.description import DESCRIBED, published_as
-from psa_casadi.export.check.evidence import repeated, wrong_evidence
-from psa_casadi.export.check.fixed_step import fixed_truth, stated_step
-from psa_casadi.export.check.measured import Task
-from psa_casadi.export.check.origin import (
+from psa_casadi.export.check.description import (
+    DESCRIBED,
     not_compared,
+    published_as,
     unreproducible_parts,
     wrong_dependencies,
     wrong_start_values,
 )
+from psa_casadi.export.check.evidence import repeated, wrong_evidence
+from psa_casadi.export.check.fixed_step import fixed_truth, stated_step
+from psa_casadi.export.check.measured import Task
 from psa_casadi.export.check.rows import (
     LEFT_OUT,
     LEFT_OUT3,
