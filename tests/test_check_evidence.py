@@ -11,7 +11,7 @@ import psa_casadi as psa
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
-from psa_casadi.export.check.playback import Playback, played_again
+from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.fmu import evidence_files as files
 from psa_casadi.export.importer.archive import Archive

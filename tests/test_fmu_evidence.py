@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.export.check.evidence import repeated
-from psa_casadi.export.check.playback import Playback, played_again
+from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.fmu import evidence_files as files
 from psa_casadi.export.fmu.reference_results import FOLDER
 from psa_casadi.export.importer.fmu import Fmu

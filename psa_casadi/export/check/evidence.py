@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.check.playback import ERROR_LIMIT, Playback
+from psa_casadi.export.check.measured import ERROR_LIMIT, Playback
 from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, stopped
 from psa_casadi.export.common.posterior import MOST_SAMPLES
 from psa_casadi.export.fmu.evidence_files import (
