@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import generation_tool, xml_text
 from psa_casadi.export.common.parameter_sets import parameter_set
-from psa_casadi.export.ssp.layout import OUTSIDE
+from psa_casadi.export.ssp.drawing import OUTSIDE
 from psa_casadi.export.ssp.structure import Binding
 from psa_casadi.model.compose import Model
 

@@ -14,7 +14,7 @@ from psa_casadi.export.common.markup import (
     number,
     xml_text,
 )
-from psa_casadi.export.ssp.layout import OUTSIDE, Box, Layout, Port, Wire
+from psa_casadi.export.ssp.drawing import OUTSIDE, Box, Layout, Port, Wire
 from psa_casadi.model.compose import Model
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Publication
