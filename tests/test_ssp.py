@@ -13,8 +13,8 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
 from psa_casadi.export.ssp.drawing import OUTSIDE, Port
-from psa_casadi.export.ssp.parameters import shared_parameters
 from psa_casadi.export.ssp.steps import stable_step
+from psa_casadi.export.ssp.structure import shared_parameters
 from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.model.system.system import System
 from tests.fmu_models import assert_valid, model_named

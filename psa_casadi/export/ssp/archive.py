@@ -18,9 +18,8 @@ from psa_casadi.export.ssp.drawing import (
     save_wiring,
     wiring_picture,
 )
-from psa_casadi.export.ssp.parameters import parameter_files
 from psa_casadi.export.ssp.steps import master_step
-from psa_casadi.export.ssp.structure import WiredParts, structure_description
+from psa_casadi.export.ssp.structure import WiredParts, parameter_files, structure_description
 from psa_casadi.files import atomic_path
 from psa_casadi.model.system.system import System
 from psa_casadi.scratch import temporary_folder
