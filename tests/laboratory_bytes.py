@@ -3,7 +3,7 @@
 import io
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -45,7 +45,7 @@ def tdms(channels: Mapping[str, ArrayLike], properties: Mapping[str, Any]) -> by
     return stream.getvalue()
 
 
-def mat(arrays: Mapping[str, Any], version: str = "5", **options: Any) -> bytes:
+def mat(arrays: Mapping[str, Any], version: Literal["4", "5"] = "5", **options: Any) -> bytes:
     """Return a MATLAB file of version 4 or 5, without the date."""
     from scipy.io import savemat  # noqa: PLC0415 - slow to import
 

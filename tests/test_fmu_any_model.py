@@ -13,7 +13,7 @@ from psa_casadi.any_model.effects.table import effects_of
 from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Component, Equations
 from psa_casadi.export.check.check import as_exported, check_fmu
-from psa_casadi.export.check.origin import wrong_dependencies, wrong_start_values
+from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu

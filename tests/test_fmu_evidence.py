@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.export.check.evidence import repeated
-from psa_casadi.export.check.playback import played_again
+from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.fmu import evidence
 from psa_casadi.export.fmu.reference_run import FOLDER
 from psa_casadi.export.importer.fmu import Fmu
@@ -147,6 +147,7 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
     for file in sets.iterdir():
         assert found[f"{evidence.SETS}/{file.name}"] == file.read_bytes()
     with Fmu(path) as fmu:  # with the sensor, whose reading is compared then
-        (playback,) = repeated(fmu, evident_model(), [noisy_record()]).playbacks[1:]
+        playback = repeated(fmu, evident_model(), [noisy_record()])[-1]
+        assert isinstance(playback, Playback)
         assert playback.output == "measured_displacement"
         assert played_again(fmu, playback).figure < 1e-4

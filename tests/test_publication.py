@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.export.check.description import missing_notices, published_as
-from psa_casadi.export.check.origin import unreproducible_parts
+from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.modelica.package import modelica_text

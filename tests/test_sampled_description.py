@@ -70,7 +70,7 @@ def test_measured_dependencies_are_listed() -> None:
     """Whatever moves the voltage at an instant is among its dependencies, and the reverse."""
     listed = {"reference", "position", "k_p"}
     with Fmu(exported("controller", 2)) as fmu:
-        names = [*fmu.names("input"), *fmu.tunable()]
+        names = [*fmu.names("input"), *fmu.varying("tunable")]
         moving = set()
         for name in names:
             with fmu.start(CO_SIMULATION) as slave:

@@ -89,7 +89,7 @@ def ssp(
 
 
 def _ports(wiring: "WiredParts", quiet: bool) -> None:
-    from psa_casadi.export.ssp.layout import OUTSIDE, Port
+    from psa_casadi.export.ssp.drawing import OUTSIDE, Port
 
     for kind in ("input", "output"):
         named = [

@@ -12,6 +12,7 @@ from psa_casadi.diagnosis.held_out.errors import Errors
 from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
@@ -182,8 +183,11 @@ def effect_page(
 def check_sentence(report: "CheckReport") -> str:
     """Say how the check of an FMU ended."""
     against = "" if report.compared else " There was no model to compare it with."
-    if report.left_out:
-        against += f" Left out, as its step is fixed: {listing(report.left_out)}."
+    unseen = [name for name in report.left_out if name in OF_BINARIES]
+    if fixed := [name for name in report.left_out if name not in OF_BINARIES]:
+        against += f" Left out, as its step is fixed: {listing(fixed)}."
+    if unseen:
+        against += f" Left out, as lief is not installed (`pip install lief`): {listing(unseen)}."
     if report.passed:
         return f"{Path(report.path).name} passed all {len(report.rows)} checks.{against}"
     failed = listing([r.name for r in report.failures])
