@@ -25,7 +25,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.export.web import WEB_FLAGS, module_texts
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.simulation.codegen import generate_c
+from psa_casadi.simulation.compiler import generate_c
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import SOURCES

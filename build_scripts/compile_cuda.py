@@ -18,8 +18,8 @@ from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.simulation.device.kernel import OPTIONS, kernel_text
-from psa_casadi.simulation.ways import SHOWN
+from psa_casadi.simulation.device import OPTIONS, kernel_text
+from psa_casadi.simulation.simulate import SHOWN
 
 CAPABILITIES = ("80", "90")
 KERNEL = "psa_exact_sets"

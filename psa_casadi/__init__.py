@@ -83,9 +83,14 @@ if TYPE_CHECKING:
     from psa_casadi.report.page.population_page import write_population
     from psa_casadi.report.plots.figure import save_figure
     from psa_casadi.report.words.text import story
-    from psa_casadi.simulation.history import memory_after, settled_at
     from psa_casadi.simulation.many import simulate_many
-    from psa_casadi.simulation.simulate import Trajectory, simulate, simulate_record
+    from psa_casadi.simulation.simulate import (
+        Trajectory,
+        memory_after,
+        settled_at,
+        simulate,
+        simulate_record,
+    )
     from psa_casadi.simulation.stepper import run
     from psa_casadi.simulation.timings import Timings, timed
     from psa_casadi.variables import Input, Output, Parameter, Publication, State
@@ -160,7 +165,6 @@ _HOMES = {
         "load_model",
         "save_model",
     ),
-    "psa_casadi.simulation.history": ("memory_after", "settled_at"),
     "psa_casadi.simulation.many": ("simulate_many",),
     "psa_casadi.simulation.stepper": ("run",),
     "psa_casadi.simulation.timings": (
@@ -169,6 +173,8 @@ _HOMES = {
     ),
     "psa_casadi.simulation.simulate": (
         "Trajectory",
+        "memory_after",
+        "settled_at",
         "simulate",
         "simulate_record",
     ),

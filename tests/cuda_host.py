@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 from psa_casadi.cache import cached
-from psa_casadi.simulation import many
+from psa_casadi.simulation import device, many
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
-from psa_casadi.simulation.device import run
 
 _BEFORE = """\
 #define __global__ __attribute__((visibility("default")))
@@ -60,7 +59,7 @@ class HostCuda:
 def lend(monkeypatch: pytest.MonkeyPatch, free: int) -> HostCuda:
     """Put this processor with so much memory in the place of a GPU; return it."""
     host = HostCuda(free)
-    for module in (many, run):
+    for module in (many, device):
         monkeypatch.setattr(module, "device_module", lambda: host)
     return host
 

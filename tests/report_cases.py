@@ -29,8 +29,7 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.records import Record, multisine, sine, time_grid
 from psa_casadi.records.split import Experiment, split, whole
 from psa_casadi.report.words.series import Curve, Series
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.ways import EXACT, Way
+from psa_casadi.simulation.simulate import EXACT, Way, simulate
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval, Provenance
 

@@ -9,8 +9,8 @@ from psa_casadi.component import Component
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import MachineError
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation import ahead
-from psa_casadi.simulation.ahead import compiled, compiled_ahead
+from psa_casadi.simulation import side_by_side
+from psa_casadi.simulation.side_by_side import compiled, compiled_ahead
 from tests.stack_models import stack
 
 PATIENCE = 10.0
@@ -44,7 +44,7 @@ def test_models_are_compiled_while_the_block_runs(
         if len(done) == 3:
             all_done.set()
 
-    monkeypatch.setattr(ahead, "why_not", why_not)
+    monkeypatch.setattr(side_by_side, "why_not", why_not)
     models = _with_effects(base, "slow_creep", "sensor_lag")
     with compiled_ahead(models, first=[lambda: done.append(("first",))]):
         assert all_done.wait(PATIENCE)
@@ -61,7 +61,7 @@ def test_what_has_not_begun_at_the_end_is_left_out(
         begun.set()
         assert over.wait(PATIENCE)
 
-    monkeypatch.setattr(ahead, "why_not", lambda *given: compiled_models.append(given))
+    monkeypatch.setattr(side_by_side, "why_not", lambda *given: compiled_models.append(given))
     shutdown = ThreadPoolExecutor.shutdown
 
     def ended(pool: ThreadPoolExecutor, **how: bool) -> None:
@@ -84,7 +84,7 @@ def test_a_failure_ahead_is_left_to_who_needs_the_model(
         tried.append(output)
         raise MachineError("no compiler")
 
-    monkeypatch.setattr(ahead, "why_not", why_not)
+    monkeypatch.setattr(side_by_side, "why_not", why_not)
     compiled([base, *_with_effects(base, "slow_creep")])
     assert len(tried) == 2
 
@@ -93,6 +93,6 @@ def test_models_of_a_screening_are_compiled_at_the_same_time(
     monkeypatch: pytest.MonkeyPatch, base: Model
 ) -> None:
     both = Barrier(2)
-    monkeypatch.setattr(ahead, "why_not", lambda *given: both.wait(PATIENCE))
+    monkeypatch.setattr(side_by_side, "why_not", lambda *given: both.wait(PATIENCE))
     compiled(_with_effects(base, "slow_creep", "sensor_lag"))
     assert not both.broken

@@ -8,8 +8,7 @@ import pytest
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.ways import EXACT, STEPPER
+from psa_casadi.simulation.simulate import EXACT, STEPPER, simulate
 from tests.benchmarks.fits import (
     Point,
     cheapest,

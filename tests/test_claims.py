@@ -16,8 +16,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.model.parts import PARTS, part_model
-from psa_casadi.simulation.codegen import functions_of, generate_c
-from psa_casadi.simulation.compiler import shared_library
+from psa_casadi.simulation.compiler import functions_of, generate_c, shared_library
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import convert

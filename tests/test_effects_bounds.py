@@ -11,7 +11,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.strain import AGEING
 from psa_casadi.model.compose import compose
 from psa_casadi.scales import static_stiffness, stiffness_scale, stroke, stroke_scale
-from psa_casadi.simulation.codegen import functions_of
+from psa_casadi.simulation.compiler import functions_of
 from psa_casadi.simulation.simulate import simulate
 from tests.effect_runs import (
     HYSTERESIS,

@@ -15,9 +15,8 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.reference import Mechanics
 from psa_casadi.simulation.exact.run import run_exact
-from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, simulate
 from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.ways import EXACT, STEPPER, accurate
 from tests.benchmarks.fits import demonstration
 from tests.exact_cases import (
     BEAT,

@@ -13,8 +13,7 @@ from psa_casadi.identification.search.multistart import free_parameters
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.ways import EXACT, STEPPER, Way
+from psa_casadi.simulation.simulate import EXACT, STEPPER, Way, simulate
 from tests.test_fit import model_with
 
 FloatArray = NDArray[np.float64]

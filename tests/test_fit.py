@@ -21,9 +21,8 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, divided, whole
-from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.simulate import Way, simulate
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.simulation.ways import Way
 from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]

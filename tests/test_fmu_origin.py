@@ -10,7 +10,7 @@ import pytest
 from psa_casadi.export.check.check import CheckRow, check_fmu
 from psa_casadi.export.fmu import sources
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.simulation.codegen import c_code, generate_c
+from psa_casadi.simulation.compiler import c_code, generate_c
 from tests.fmu_models import model_named, rewritten
 from tests.tiers import slow_but
 

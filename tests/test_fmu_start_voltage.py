@@ -20,8 +20,7 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, F
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import simulate as reference
 from psa_casadi.scratch import temporary_folder
-from psa_casadi.simulation.history import settled_at
-from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.simulate import settled_at, simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.variables import Parameter, State
 from tests.fmi3_instances import Instance3

@@ -29,8 +29,7 @@ from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
 from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.ways import Way
+from psa_casadi.simulation.simulate import Way, simulate
 from tests.plants import further_columns as plants
 from tests.plants.excitations import ExcitationKind
 from tests.tiers import slow

@@ -14,8 +14,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record, write_record
-from psa_casadi.simulation.history import memory_after, settled_at
-from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.simulate import memory_after, settled_at, simulate
 from psa_casadi.units import FloatArray
 from tests.tiers import slow
 

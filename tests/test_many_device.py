@@ -12,11 +12,10 @@ from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import compose
-from psa_casadi.simulation.device import run as device
+from psa_casadi.simulation import device
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.starts import starts_on
+from psa_casadi.simulation.start import start_on, starts_on
 from tests.cuda_host import HostCuda, lend
 from tests.exact_cases import KINK
 from tests.stack_models import stack

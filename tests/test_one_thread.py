@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from psa_casadi.simulation.one_thread import one_thread_of_algebra
-from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
+from psa_casadi.simulation.side_by_side import VARIABLE, one_thread_of_algebra, side_by_side
 
 
 def _threads() -> set[int]:

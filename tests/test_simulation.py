@@ -17,7 +17,7 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.model.structure import structure_of
 from psa_casadi.simulation import compiler
-from psa_casadi.simulation.codegen import fingerprint, generate_c
+from psa_casadi.simulation.compiler import fingerprint, generate_c
 from psa_casadi.simulation.simulate import input_samples, simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import SOURCES, SimulationError, run

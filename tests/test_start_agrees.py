@@ -19,8 +19,7 @@ from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record, write_record
-from psa_casadi.simulation.history import memory_after, settled_at
-from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.simulate import memory_after, settled_at, simulate
 from psa_casadi.units import FloatArray
 from tests.fmu_models import exported, model_named
 

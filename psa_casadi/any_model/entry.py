@@ -20,8 +20,8 @@ from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold
-from psa_casadi.simulation.one_thread import one_thread_of_algebra
-from psa_casadi.simulation.ways import output_of
+from psa_casadi.simulation.side_by_side import one_thread_of_algebra
+from psa_casadi.simulation.simulate import output_of
 
 Progress = Callable[[str], None]
 

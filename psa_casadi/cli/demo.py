@@ -67,7 +67,7 @@ def demo(
     from psa_casadi.report.plots.figure import save_figure
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence, story
-    from psa_casadi.simulation.ahead import compiled_ahead
+    from psa_casadi.simulation.side_by_side import compiled_ahead
     from psa_casadi.simulation.stepper import make_ready
 
     directory, paths = _prepared(directory, output)

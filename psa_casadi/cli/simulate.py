@@ -58,8 +58,7 @@ def simulate(
     """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.records import write_record
-    from psa_casadi.simulation.history import memory_after
-    from psa_casadi.simulation.simulate import simulate_record
+    from psa_casadi.simulation.simulate import memory_after, simulate_record
 
     given = Given(effects)
     given.outputs({"--output": output}, [model, record])

@@ -8,7 +8,7 @@ from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.records import read_records
-from psa_casadi.simulation.ahead import compiled
+from psa_casadi.simulation.side_by_side import compiled
 
 
 def make_ready(job: Job, options: Options) -> None:

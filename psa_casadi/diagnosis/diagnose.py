@@ -35,8 +35,7 @@ from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
 from psa_casadi.records.suspects import cleaned, masked, suspects
-from psa_casadi.simulation.ahead import compiled_ahead
-from psa_casadi.simulation.one_thread import one_thread_of_algebra
+from psa_casadi.simulation.side_by_side import compiled_ahead, one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
 
 #: So many further stuck readings are worth a second search.

@@ -14,7 +14,7 @@ import psa_casadi as psa
 from psa_casadi.design.tracking.targets import raster_scan
 from psa_casadi.design.tracking.tracking import TrackedInput, track
 from psa_casadi.design.tracking.verification import Response, error_of, uncompensated
-from psa_casadi.simulation.linear_part import linear_part
+from psa_casadi.simulation.start import linear_part
 
 #: Lines of the scan, samples, and its stroke [m].
 LINES, SAMPLES, STROKE = 3, 600, 10e-6

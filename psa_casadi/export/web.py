@@ -19,14 +19,21 @@ import casadi as ca
 from psa_casadi.cache import cached
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.codegen import c_arguments, c_code, c_slopes, generate_c
-from psa_casadi.simulation.compiler import has_zig, run_compiler, sources_directory, zig_command
+from psa_casadi.simulation.compiler import (
+    c_arguments,
+    c_code,
+    c_slopes,
+    generate_c,
+    has_zig,
+    run_compiler,
+    sources_directory,
+    zig_command,
+)
 from psa_casadi.simulation.exact.generate import generate
-from psa_casadi.simulation.exact.graph import Unprintable
+from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.run import ALIKE, AT, FINEST, LENGTHS, MOST
 from psa_casadi.simulation.exact.split import split_of
-from psa_casadi.simulation.stepper import SOURCES
-from psa_casadi.simulation.ways import (
+from psa_casadi.simulation.simulate import (
     AGREE,
     LADDER,
     SHOWN,
@@ -35,6 +42,7 @@ from psa_casadi.simulation.ways import (
     STILL,
     TIGHTEST,
 )
+from psa_casadi.simulation.stepper import SOURCES
 
 _PAGE_SOURCES = ("page/page.c", "page/settle.c", "page/library.c")
 #: What a page calls, and how many bytes of stack it has.

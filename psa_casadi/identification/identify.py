@@ -37,7 +37,7 @@ from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
 from psa_casadi.shown import Reported, frame
-from psa_casadi.simulation.one_thread import one_thread_of_algebra
+from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 from psa_casadi.variables import Provenance
 from psa_casadi.version import __version__
 

@@ -6,9 +6,8 @@ import numpy as np
 
 from psa_casadi.model.compose import Model
 from psa_casadi.population.finding import Trace
-from psa_casadi.simulation.simulate import input_samples
+from psa_casadi.simulation.simulate import input_samples, output_of
 from psa_casadi.simulation.stepper import run
-from psa_casadi.simulation.ways import output_of
 
 
 def replayed(model: Model) -> Trace | None:

@@ -14,9 +14,8 @@ from psa_casadi.posterior.result import Posterior, figures_of, warnings_of
 from psa_casadi.posterior.task import task_of
 from psa_casadi.posterior.tree import data_tree
 from psa_casadi.records.read.reading import Records, records_given
-from psa_casadi.simulation.one_thread import one_thread_of_algebra
-from psa_casadi.simulation.side_by_side import one_thread
-from psa_casadi.simulation.ways import output_of
+from psa_casadi.simulation.side_by_side import one_thread, one_thread_of_algebra
+from psa_casadi.simulation.simulate import output_of
 
 Progress = Callable[[str], None]
 

@@ -25,7 +25,7 @@ from psa_casadi.posterior.within import Within
 from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level, whole, without_gaps
-from psa_casadi.simulation.ways import Way
+from psa_casadi.simulation.simulate import Way
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -16,15 +16,19 @@ import subprocess
 import sys
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
+import casadi as ca
 import numpy.lib.introspect
 
 from psa_casadi.cache import VARIABLE, cached, writable_room
 from psa_casadi.children import run_child
+from psa_casadi.component import Expression
 from psa_casadi.errors import MachineError
+from psa_casadi.model.compose import Structure
+from psa_casadi.scratch import temporary_folder
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
@@ -246,3 +250,147 @@ def _compile(
     if not (work / output).is_file():
         raise MachineError(f"The C compiler {command[0]} wrote no library; {_CURE}")
     return work / output
+
+
+#: What stands before generated C.
+PRAGMAS = """\
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#pragma GCC diagnostic ignored "-Wunused-function"
+#pragma GCC diagnostic ignored "-Wunused-variable"
+#endif
+#define CASADI_SYMBOL_EXPORT
+"""
+#: From so many numbers on, those of a function in C are in its caller's workspace: as variables of
+#: its own they could take more of the stack than a page, which not every thread has.
+_MANY = 200
+#: How a library reaches a function that is in another one; see `Foreign`.
+FOREIGN = """\
+#include "trajectory.h"
+
+typedef int function(const double **, double **, long long int *, double *, int);
+static function *value, *slope;
+
+PSA_API void connect_{name}(function *v, function *s);
+function {name}, fwd1_{name};
+
+void connect_{name}(function *v, function *s) {{
+    value = v;
+    slope = s;
+}}
+
+int {name}(const double **arg, double **res, long long int *iw, double *w, int mem) {{
+    return value(arg, res, iw, w, mem);
+}}
+
+int fwd1_{name}(const double **arg, double **res, long long int *iw, double *w, int mem) {{
+    return slope(arg, res, iw, w, mem);
+}}
+"""
+
+
+def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.Function]:
+    """Return the CasADi functions behind `model.h`, all of arguments (time, x, u, p).
+
+    psa_ode: xdot; psa_jacobian: df/dx dense (nx, nx); psa_outputs: y; psa_switches: zero
+    where xdot has a kink; psa_sample, with sampled states: their values after an instant. With
+    sensitivities also psa_sensitivity: (df/dx, df/dp) dense; psa_output_sensitivity: (dg/dx, dg/dp)
+    dense. See `c_arguments` for x and p.
+    """
+    s = structure
+    arguments = c_arguments(s)
+    x, xdot = arguments[1], c_slopes(s)
+    jacobian = ca.densify(s.jacobian(xdot, x))
+    switches: Expression = ca.vertcat(ca.SX(0, 1), *s.switches.values())
+    table = {
+        "psa_ode": [ca.densify(xdot)],
+        "psa_jacobian": [jacobian],
+        "psa_outputs": [ca.densify(s.y)],
+        "psa_switches": [ca.densify(switches)],
+    }
+    if s.sampled:
+        table["psa_sample"] = [ca.densify(s.znext)]
+    if sensitivities:
+        table["psa_sensitivity"] = [jacobian, ca.densify(s.jacobian(xdot, s.p))]
+        table["psa_output_sensitivity"] = [
+            ca.densify(s.jacobian(s.y, x)),
+            ca.densify(s.jacobian(s.y, s.p)),
+        ]
+    return {
+        name: ca.Function(name, arguments, ca.cse(outputs), {"cse": True})
+        for name, outputs in table.items()
+    }
+
+
+def c_arguments(structure: Structure) -> list[Expression]:
+    """Return the arguments (time, x, u, p) of the functions in C.
+
+    There the sampled states stand behind the parameters in p, as both are constant over a step; x
+    of a model that has only sampled states is one number that stays as it is.
+    """
+    s = structure
+    return [s.time, s.x if s.states else ca.SX.sym("unused"), s.u, ca.vertcat(s.p, s.z)]
+
+
+def c_slopes(structure: Structure) -> Expression:
+    """Return the derivative of `c_arguments`' x."""
+    return structure.xdot if structure.states else ca.SX(0)
+
+
+def generate_c(structure: Structure, *, sensitivities: bool) -> dict[str, str]:
+    """Return the generated files of a model: {"model.c": ..., "model_config.h": ...}."""
+    functions = functions_of(structure, sensitivities=sensitivities)
+    return {
+        **{f"{f.name}.c": FOREIGN.format(name=f.name) for f in structure.foreign},
+        "model.c": c_code("model.c", functions.values()),
+        "model_config.h": _config(structure, list(functions.values()), sensitivities),
+    }
+
+
+def c_code(name: str, functions: Collection[ca.Function]) -> str:
+    """Return the text of functions in C; `name` is that of the file."""
+    many = any(f.sz_w() > _MANY for f in functions)
+    generator = ca.CodeGenerator(name, {"with_header": False, "avoid_stack": many})
+    for function in functions:
+        generator.add(function)
+    with temporary_folder() as folder:
+        generator.generate(f"{folder}/")
+        body = (folder / name).read_text(encoding="utf-8")
+    if not body.endswith("#endif\n"):  # CasADi does not look whether its writing succeeded
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+    return PRAGMAS + body
+
+
+def fingerprint(structure: Structure) -> str:
+    """Return text that differs where the generated files differ, in a thirtieth of their time."""
+    s = structure
+    switches: Expression = ca.vertcat(ca.SX(0, 1), *s.switches.values())
+    period = [q.name for q in s.parameters].index(s.period) if s.period else None
+    equations = ca.Function("f", c_arguments(s), [c_slopes(s), s.y, switches, s.znext])
+    sizes = (len(s.states), len(s.parameters), len(s.sampled), period)
+    generator = Path(__file__).read_text(encoding="utf-8")
+    return repr((ca.CasadiMeta.version(), generator, sizes, equations.serialize()))
+
+
+def _config(structure: Structure, functions: list[ca.Function], sensitivities: bool) -> str:
+    sizes = {
+        "PSA_NX": max(1, len(structure.states)),
+        "PSA_STATES": len(structure.states),
+        "PSA_NU": len(structure.inputs),
+        "PSA_NP": len(structure.parameters),
+        "PSA_NY": len(structure.outputs),
+        "PSA_NZ": len(structure.switches),
+        "PSA_NS": len(structure.sampled),
+        "PSA_PERIOD": next(
+            (i for i, p in enumerate(structure.parameters) if p.name == structure.period), 0
+        ),
+        "PSA_SZ_ARG": max(4, *(f.sz_arg() for f in functions)),
+        "PSA_SZ_RES": max(2, *(f.sz_res() for f in functions)),
+        "PSA_SZ_IW": max(1, *(f.sz_iw() for f in functions)),
+        "PSA_SZ_W": max(1, *(f.sz_w() for f in functions)),
+    }
+    lines = ["#ifndef PSA_MODEL_CONFIG_H", "#define PSA_MODEL_CONFIG_H"]
+    lines += [f"#define {name} {value}" for name, value in sizes.items()]
+    if sensitivities:
+        lines.append("#define PSA_WITH_SENSITIVITIES 1")
+    return "\n".join([*lines, "#endif", ""])

@@ -11,18 +11,44 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.simulation.device.run import Numbers, Task, device_module, run_on_device
+from psa_casadi.simulation.device import Numbers, Summary, Task, device_module, run_on_device
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_sets
-from psa_casadi.simulation.reductions import REDUCTIONS, Reduction, ReductionName
 from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.starts import starts_on
+from psa_casadi.simulation.simulate import Way, output_of, record_inputs, trace
+from psa_casadi.simulation.start import start_on, starts_on
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.simulation.ways import Way, output_of, trace
 from psa_casadi.variables import nominal_value
 
 FloatArray = npt.NDArray[np.float64]
+
+ReductionName = Literal["range", "peak", "last", "misfit"]
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """One number [m]: of a displacement and what was measured, both (n,), or of a summary (m,)."""
+
+    of_row: Callable[[FloatArray, FloatArray], float]
+    of_summary: Callable[[Summary, int], FloatArray]
+
+    def beside(self, meant: FloatArray) -> Callable[[FloatArray], float]:
+        """Return the function of a displacement (n,) alone."""
+        return lambda row: self.of_row(row, meant)
+
+
+REDUCTIONS: dict[ReductionName, Reduction] = {
+    "range": Reduction(lambda row, _: float(np.ptp(row)), lambda s, _: s.largest - s.least),
+    "peak": Reduction(
+        lambda row, _: float(np.max(np.abs(row))),
+        lambda s, _: np.maximum(np.abs(s.least), np.abs(s.largest)),
+    ),
+    "last": Reduction(lambda row, _: float(row[-1]), lambda s, _: s.last),
+    "misfit": Reduction(
+        lambda row, meant: float(np.sqrt(np.mean((row - meant) ** 2))),
+        lambda s, n: np.sqrt(s.squares / n),
+    ),
+}
+
 
 Device = Literal["cpu", "cuda"]
 _Reduce = Callable[[FloatArray], npt.ArrayLike]

@@ -7,11 +7,18 @@ lose little to each other.
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from contextvars import ContextVar, copy_context
+from contextlib import contextmanager, suppress
+from contextvars import Context, ContextVar, copy_context
+from functools import partial
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
+from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.interruption import interruptible_work
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.exact.run import why_not
+from psa_casadi.simulation.simulate import output_of
 
 #: Environment variable with the number of threads; without it there is one for each core.
 VARIABLE = "PSA_CASADI_THREADS"
@@ -54,3 +61,47 @@ def threads() -> int:
         return 1
     wanted = os.environ.get(VARIABLE, "")
     return int(wanted) if wanted.isdecimal() and int(wanted) > 0 else os.cpu_count() or 1
+
+
+@contextmanager
+def one_thread_of_algebra() -> Iterator[None]:
+    """Keep the linear algebra of the process on one thread; also a decorator."""
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+@contextmanager
+def compiled_ahead(
+    models: Iterable[Model], first: Iterable[Callable[[], object]] = ()
+) -> Iterator[None]:
+    """Compile models for exact steps beside what runs inside, after the work that comes `first`.
+
+    At the end, what has begun is finished and the rest is left out. What fails is tried again by
+    whoever needs it, and fails there.
+    """
+    count = threads()
+    if count == 1:
+        yield
+        return
+    works: list[Callable[[], object]] = [*first, *(partial(_compile, m) for m in models)]
+    with ThreadPoolExecutor(count - 1) as pool:
+        for work in works:
+            pool.submit(_in_context(copy_context(), work))
+        try:
+            yield
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _in_context(context: Context, work: Callable[[], object]) -> Callable[[], object]:
+    return lambda: context.run(work)
+
+
+def compiled(models: Iterable[Model]) -> None:
+    """Compile models for exact steps on all cores; what fails is left to whoever needs it."""
+    side_by_side(_compile, models)
+
+
+def _compile(model: Model) -> None:
+    with suppress(PsaError, MachineError):
+        why_not(model.structure, output_of(model) or "")

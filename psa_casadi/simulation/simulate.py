@@ -1,21 +1,147 @@
 """Simulate a model on a record's voltage, or on any voltage given as samples."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import Problems
+from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.shown import Shown, frame, with_units
-from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.stepper import Steps
-from psa_casadi.simulation.ways import accurate
+from psa_casadi.simulation.exact.run import NotExact, run_exact
+from psa_casadi.simulation.start import memory_names, start_on, start_state
+from psa_casadi.simulation.stepper import Steps, run
 
 FloatArray = npt.NDArray[np.float64]
+
+#: Outputs that are the displacement a model shows, the first that it has.
+SHOWN = ("measured_displacement", "displacement")
+#: Names of the two ways in results.
+EXACT, STEPPER = "exact steps", "stepper"
+#: The stepper's tolerance of a step over the one asked of the whole run: with the 0.003 of the
+#: FMU (`fmu_src/instance.c`) clipped voltages and light resonances erred by 3 times what was asked.
+STEP_SHARE, SMALLEST_STEP_RTOL = 0.0005, 1e-12
+#: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
+#: Each is judged by the one before; a turn that one halving misses as well is seen after two.
+LADDER = ((0.03, 0), (0.01, 2), (3e-3, 4), (3e-3, 6))
+#: Share of the tolerance to which two runs agree: the finer one may err by a part of it that both
+#: have in common.
+AGREE = 0.5
+#: Below this tolerance two runs may share an error that is of its size: the stepper is taken.
+TIGHTEST = 1e-6
+#: Loosest tolerance of exact steps: beyond it nothing is won.
+LOOSEST = 1e-5
+#: Range below which a displacement counts as constant, over its nominal size.
+STILL = 1e-3
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a record is run: tolerance of an exact step, and of a step of the stepper.
+
+    Exact steps divide every sample by 2^`halved` at least; `stepped` rules them out.
+    """
+
+    rtol: float
+    step_rtol: float
+    halved: int = 0
+    stepped: bool = False
+
+    @property
+    def finer(self) -> "Way":
+        """A way whose error is far smaller: what this one's is judged by."""
+        return Way(0.1 * self.rtol, 0.1 * self.step_rtol, self.halved + 1, self.stepped)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """One output (n,), its derivatives (n, k), and the way that was taken."""
+
+    output: FloatArray
+    sensitivity: FloatArray
+    way: str
+
+
+def output_of(model: Model) -> str | None:
+    """Return the name of the displacement that a model shows, None if it has none."""
+    return next((n for n in SHOWN if n in model.output_names), None)
+
+
+def trace(
+    model: Model,
+    t: FloatArray,
+    u: FloatArray,
+    x0: FloatArray,
+    *,
+    way: Way,
+    output: str,
+    unknowns: Sequence[str | int] = (),
+    s0: FloatArray | None = None,
+    steps_limit: int = 0,
+    steps_most: int = 0,
+) -> Traced:
+    """Return one output of a run and its derivatives by `unknowns` (see `run`).
+
+    `steps_limit` bounds the stepper's work between two samples, `steps_most` that of the run.
+    Raises SimulationError where both ways fail.
+    """
+    none = np.zeros((len(t), 0))
+    if not way.stepped:
+        try:
+            found = run_exact(
+                model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
+                unknowns=unknowns, s0=s0, output=output,
+            )  # fmt: skip
+            slopes = none if found.sensitivity is None else found.sensitivity
+            return Traced(found.shown, slopes, EXACT)
+        except NotExact:
+            pass
+    steps = run(
+        model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, steps_most=steps_most,
+        unknowns=unknowns, s0=s0, output=output,
+    )  # fmt: skip
+    slopes = none if steps.sensitivity is None else steps.sensitivity
+    return Traced(steps.y[:, model.output_names.index(output)], slopes, STEPPER)
+
+
+def accurate(
+    model: Model, t: FloatArray, u: FloatArray, x0: FloatArray, *, rtol: float, hold: str
+) -> tuple[Steps, str]:
+    """Return a run whose displacement errs by less than `rtol` of its range, and the way taken.
+
+    Exact steps get finer until two runs agree to that; where they do not, or for tolerances below
+    1e-6, the stepper takes steps of 0.0005 `rtol`.
+    """
+    output = output_of(model)
+    before: FloatArray | None = None
+    nominal = 0.0 if output is None else model.output_nominals()[model.output_names.index(output)]
+    for share, coarsest in LADDER if output and rtol >= TIGHTEST else ():
+        try:
+            found = run_exact(
+                model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
+                output=output or "", everything=before is not None,
+            )  # fmt: skip
+        except NotExact:
+            break
+        size = max(float(np.ptp(found.shown)), STILL * nominal)
+        fine = before is not None and not found.forced
+        if (
+            before is not None
+            and fine
+            and np.max(np.abs(found.shown - before)) <= AGREE * rtol * size
+        ):
+            x, y = found.x, found.y
+            if x is not None and y is not None:
+                empty = np.empty((len(t), 0))
+                steps = Steps(x, empty, y, None, found.steps, found.rejected, 0)
+                return steps, EXACT
+        before = found.shown
+    share = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
+    return run(model, t, u, x0, rtol=share, hold=hold), STEPPER
 
 
 @dataclass(frozen=True, repr=False)
@@ -167,3 +293,85 @@ def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps, way: s
             **{o.name: o.unit for o in model.structure.outputs},
         },
     )
+
+
+#: Samples of a sweep and of a rest.
+_SAMPLES = 200
+
+
+def memory_after(
+    model: Model, voltages: Sequence[float], *, at: float, sweep: float = 1.0, rest: float = 0.0
+) -> dict[str, float]:
+    """Return the `memory` (see `simulate`) of a model after a virtual history.
+
+    A stack's hysteresis and creep begin a record where the voltage before it has left them. A
+    model that begins relaxed instead errs by up to half its loop at first, and by all of it at the
+    end of the range. So the history is played into the same equations:
+
+        0 V, relaxed -> V_1 -> V_2 -> ... -> V(0), one sweep each -> rest
+
+    Of the hysteresis only the paper's asymmetry delta depends on the duration of a sweep, and much
+    on a slow one; creep does, and on the rest. A voltage slower than `hold_rate` counts as held.
+
+    From relaxed at 0 V the voltage goes to each of the `voltages` [V] in turn and then to `at`, the
+    record's first one, in `sweep` [s] each, and stays there for `rest` [s]. Equal voltages in a row
+    count once. Take sweeps as long as those that the stack has made: `delta` and creep see them.
+
+    Raises InputError for bad numbers; SimulationError where the model cannot follow.
+    """
+    problems = Problems()
+    if not np.all(np.isfinite([*voltages, at])):
+        problems.add("The history has a voltage that is not finite; give numbers in V.")
+    if not (np.isfinite(sweep) and sweep > 0.0):
+        problems.add(f"A sweep of the history takes {sweep:g} s; give a duration above 0.")
+    if not (np.isfinite(rest) and rest >= 0.0):
+        problems.add(f"The rest after the history takes {rest:g} s; give a duration of 0 or more.")
+    problems.raise_if_any()
+    names = memory_names(model.structure)
+    turns = [0.0, *voltages, at]
+    share = np.linspace(0.0, 1.0, _SAMPLES + 1)
+    parts = [a + (b - a) * share[1:] for a, b in pairwise(turns) if a != b]
+    steps = [sweep / _SAMPLES] * (_SAMPLES * len(parts))
+    if rest > 0.0:
+        parts.append(np.full(_SAMPLES, at))
+        steps += [rest / _SAMPLES] * _SAMPLES
+    if not parts:
+        return dict.fromkeys(names, 0.0)
+    times, played_voltage = np.append(0.0, np.cumsum(steps)), np.concatenate([[0.0], *parts])
+    played = simulate(model, times, played_voltage, as_exported=False)
+    ended = {n: float(played.states[n][-1]) for n in names}
+    stays = {s.name: ended[s.name] for s in model.structure.states if s.memory and not s.settles}
+    settled = start_state(model, _held(model, at), memory=stays).x
+    for state, value in zip(model.structure.states, settled, strict=True):
+        if state.memory and state.settles:
+            ended[state.name] -= float(value)
+    return ended
+
+
+def settled_at(
+    model: Model,
+    voltage: float,
+    history: Sequence[float] = (),
+    *,
+    sweep: float = 1.0,
+    rest: float = 0.0,
+) -> Model:
+    """Return the model with start values where a `voltage` [V] holds it, for an export.
+
+    States and the voltage input start there: the memory after a virtual `history` (see
+    `memory_after`), all other continuous ones settled; sampled states keep theirs. Raises as
+    `memory_after`, and InputError without a voltage.
+    """
+    if "voltage" not in model.input_names:
+        raise InputError(
+            f"The model has no input 'voltage' to be held at; it has {model.input_names}."
+        )
+    memory = memory_after(model, history, at=voltage, sweep=sweep, rest=rest)
+    x = start_state(model, _held(model, voltage), memory=memory).x
+    starts = dict(zip(model.state_names, x.tolist(), strict=True))
+    return model.with_starts({**starts, "voltage": voltage})
+
+
+def _held(model: Model, voltage: float) -> list[float]:
+    """Return the inputs of a model at a voltage [V], the others at their start values."""
+    return [voltage if i.name == "voltage" else i.start for i in model.structure.inputs]

@@ -17,8 +17,7 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, Problems, PsaError
 from psa_casadi.interruption import flag_address
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.codegen import fingerprint, generate_c
-from psa_casadi.simulation.compiler import generated_library
+from psa_casadi.simulation.compiler import fingerprint, generate_c, generated_library
 from psa_casadi.simulation.timings import count_run
 
 FloatArray = npt.NDArray[np.float64]

@@ -21,7 +21,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from psa_casadi.simulation.linear_part import linear_part
+from psa_casadi.simulation.start import linear_part
 from tests.benchmarks.table import Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]

@@ -26,10 +26,9 @@ from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.exact.run import LANES, run_exact, run_sets
 from psa_casadi.simulation.many import simulate_many
-from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.simulate import EXACT, STEPPER, record_inputs
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run as run_stepper
-from psa_casadi.simulation.ways import EXACT, STEPPER
 from tests.benchmarks.fits_ways import diagnosis_table, ways_tables
 from tests.benchmarks.table import Outcome, Progress, TitledTable
 

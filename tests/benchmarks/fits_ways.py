@@ -35,14 +35,21 @@ from psa_casadi.records import (
 )
 from psa_casadi.report.words.phrases import number, plain
 from psa_casadi.report.words.tables import Table
-from psa_casadi.simulation import ways
+from psa_casadi.simulation import simulate as simulate_module
 from psa_casadi.simulation.exact.run import NotExact
 from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.simulate import input_samples, simulate
+from psa_casadi.simulation.simulate import (
+    EXACT,
+    STEP_SHARE,
+    STEPPER,
+    Way,
+    input_samples,
+    simulate,
+    trace,
+)
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
 from psa_casadi.simulation.timings import timed
-from psa_casadi.simulation.ways import EXACT, STEP_SHARE, STEPPER, Way, trace
 from tests.benchmarks.table import Progress, TitledTable, share
 from tests.plants.again import play_again
 from tests.plants.make import make_record
@@ -339,12 +346,12 @@ def stepper_alone() -> Iterator[None]:
         raise NotExact("left out for a benchmark")
 
     name = "run_exact"  # where `trace` and `accurate` look it up
-    kept = getattr(ways, name)
-    setattr(ways, name, refuse)
+    kept = getattr(simulate_module, name)
+    setattr(simulate_module, name, refuse)
     try:
         yield
     finally:
-        setattr(ways, name, kept)
+        setattr(simulate_module, name, kept)
 
 
 def _spent(work: str, samples: str, do: Callable[[], str]) -> Spent:

@@ -11,8 +11,7 @@ from psa_casadi.design.experiment.criterion import Criterion, Point
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.errors import PsaError
 from psa_casadi.records.record import Record
-from psa_casadi.simulation.one_thread import one_thread_of_algebra
-from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.side_by_side import one_thread_of_algebra, side_by_side
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 

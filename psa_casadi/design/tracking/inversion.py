@@ -27,7 +27,7 @@ from psa_casadi.design.tracking.verification import Response, TrackingError, err
 from psa_casadi.design.tracking.zero_phase import zero_phase_inverse
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.linear_part import LinearPart, linear_part
+from psa_casadi.simulation.start import LinearPart, linear_part
 
 FloatArray = npt.NDArray[np.float64]
 

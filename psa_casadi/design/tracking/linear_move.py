@@ -10,7 +10,7 @@ import scipy
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.linear_part import slopes_at_rest
+from psa_casadi.simulation.start import slopes_at_rest
 
 FloatArray = npt.NDArray[np.float64]
 

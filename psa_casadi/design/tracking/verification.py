@@ -8,9 +8,8 @@ import numpy.typing as npt
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.targets import Target
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.linear_part import linear_part
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.start import start_state
+from psa_casadi.simulation.start import linear_part, start_state
 from psa_casadi.simulation.stepper import run
 
 FloatArray = npt.NDArray[np.float64]

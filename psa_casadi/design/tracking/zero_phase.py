@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.simulation.linear_part import LinearPart
+from psa_casadi.simulation.start import LinearPart
 
 FloatArray = npt.NDArray[np.float64]
 

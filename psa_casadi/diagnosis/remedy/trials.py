@@ -26,10 +26,8 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.residual.signature import standard_voltage
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.simulation.linear_part import linear_part
-from psa_casadi.simulation.simulate import input_samples, record_inputs
-from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.ways import accurate, output_of
+from psa_casadi.simulation.simulate import accurate, input_samples, output_of, record_inputs
+from psa_casadi.simulation.start import linear_part, start_on
 
 FloatArray = npt.NDArray[np.float64]
 

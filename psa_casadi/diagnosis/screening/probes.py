@@ -26,10 +26,9 @@ from psa_casadi.identification.fitting.prediction import OUTPUT, measured, trace
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
-from psa_casadi.simulation.ahead import compiled
-from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.side_by_side import compiled, side_by_side
+from psa_casadi.simulation.simulate import Way
 from psa_casadi.simulation.start import memory_names
-from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -19,9 +19,8 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.scales import stiffness_scale
 from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.simulate import accurate, record_inputs
 from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.ways import accurate
 
 FloatArray = npt.NDArray[np.float64]
 

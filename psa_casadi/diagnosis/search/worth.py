@@ -13,7 +13,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
-from psa_casadi.simulation.linear_part import linear_part
+from psa_casadi.simulation.start import linear_part
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from psa_casadi.export.common.variable_table import starts_at_voltage
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
-from psa_casadi.simulation.history import settled_at
+from psa_casadi.simulation.simulate import settled_at
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value
 

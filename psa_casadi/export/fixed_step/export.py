@@ -38,7 +38,7 @@ from psa_casadi.export.fixed_step.probe import (
 from psa_casadi.export.fixed_step.step import step_of
 from psa_casadi.files import atomic_write, make_folder
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.exact.graph import Unprintable
+from psa_casadi.simulation.exact.printing import Unprintable
 
 #: Substeps that are tried where none are asked for, and the error that is good enough.
 SUBSTEPS, GOOD = (1, 2, 4, 8), 1e-3

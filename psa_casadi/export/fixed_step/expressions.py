@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from psa_casadi.component import Expression
-from psa_casadi.simulation.exact.graph import LEAVES, Graph, Unprintable
+from psa_casadi.simulation.exact.printing import LEAVES, Graph, Unprintable
 
 _FUNCTIONS = {
     "v_sqrt": "sqrt", "v_exp": "exp", "v_log": "log", "v_log_of_base": "log", "v_fabs": "fabs",

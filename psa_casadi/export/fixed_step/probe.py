@@ -10,8 +10,8 @@ from psa_casadi.export.fixed_step.code import CodePlan, probe_code
 from psa_casadi.export.fixed_step.step import FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.compiler import shared_library
+from psa_casadi.simulation.simulate import output_of
 from psa_casadi.simulation.stepper import SimulationError, run
-from psa_casadi.simulation.ways import output_of
 from psa_casadi.variables import nominal_value
 
 #: Steps of a reference voltage.

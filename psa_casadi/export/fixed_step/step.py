@@ -29,8 +29,7 @@ from psa_casadi.component import Expression
 from psa_casadi.export.fixed_step.way import Ends, Leaving, along_the_way, rosenbrock, solved
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
-from psa_casadi.simulation.exact.dependence import closure
-from psa_casadi.simulation.exact.split import Split, jumps, split_of
+from psa_casadi.simulation.exact.split import Split, closure, jumps, split_of
 from psa_casadi.variables import Input
 
 FloatArray = npt.NDArray[np.float64]

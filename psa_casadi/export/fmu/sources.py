@@ -34,8 +34,14 @@ from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.evidence import seen_duration, seen_inputs
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.codegen import c_arguments, c_code, c_slopes, generate_c
-from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
+from psa_casadi.simulation.compiler import (
+    OPTIMISE,
+    c_arguments,
+    c_code,
+    c_slopes,
+    generate_c,
+    sources_directory,
+)
 
 #: The hand-written files of `fmu_src` that every FMU consists of, C files first.
 LOGIC = (

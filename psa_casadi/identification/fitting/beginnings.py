@@ -21,7 +21,7 @@ from psa_casadi.identification.fitting.prediction import measured, trace_record
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
-from psa_casadi.simulation.ways import Way
+from psa_casadi.simulation.simulate import Way
 
 FloatArray = npt.NDArray[np.float64]
 

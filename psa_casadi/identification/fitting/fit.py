@@ -22,8 +22,8 @@ from psa_casadi.identification.fitting.prediction import (
 from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment, fitted
+from psa_casadi.simulation.simulate import Way
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.interruption import current_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.simulate import Way
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
 

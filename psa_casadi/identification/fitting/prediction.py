@@ -12,7 +12,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.simulate import Traced, Way, record_inputs, trace
 from psa_casadi.simulation.start import (
     initial_slope,
     memory_names,
@@ -20,7 +20,6 @@ from psa_casadi.simulation.start import (
     start_on,
     start_state,
 )
-from psa_casadi.simulation.ways import Traced, Way, trace
 
 FloatArray = npt.NDArray[np.float64]
 

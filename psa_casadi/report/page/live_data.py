@@ -14,7 +14,7 @@ from psa_casadi.model.model_file import dumps
 from psa_casadi.report.page.packed import packed
 from psa_casadi.report.words.grades import determined
 from psa_casadi.report.words.phrases import plain, shown_in
-from psa_casadi.simulation.ways import output_of
+from psa_casadi.simulation.simulate import output_of
 from psa_casadi.units import convert
 from psa_casadi.variables import Parameter
 

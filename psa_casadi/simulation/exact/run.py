@@ -16,10 +16,9 @@ import numpy.typing as npt
 
 from psa_casadi.interruption import flag_address
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.codegen import fingerprint
-from psa_casadi.simulation.compiler import generated_library, vector_flags
+from psa_casadi.simulation.compiler import fingerprint, generated_library, vector_flags
 from psa_casadi.simulation.exact.generate import generate
-from psa_casadi.simulation.exact.graph import Unprintable
+from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.timings import count_run
 

@@ -12,24 +12,183 @@ along one driver are evaluated in the order in which they feed each other; a por
 what it depends on (a load's stiffness) is solved for.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.component import Expression
 from psa_casadi.model.structure import Structure
-from psa_casadi.simulation.exact.dependence import (
-    BoolArray,
-    closure,
-    dependence,
-    others,
-    variables,
-)
-from psa_casadi.simulation.exact.order import Item, NoSplit, Port, order_of
-from psa_casadi.simulation.exact.paths import Group, along, groups_along
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+def dependence(of: Expression, on: Expression) -> BoolArray:
+    """Return which rows of an expression depend on which symbols, shape (rows, symbols)."""
+    return np.array(ca.DM(ca.jacobian_sparsity(of, on), 1).full(), dtype=bool)
+
+
+def closure(depends: BoolArray) -> BoolArray:
+    """Return [k, j]: a change of j reaches k sooner or later; each reaches itself."""
+    reach = depends | np.eye(len(depends), dtype=bool)
+    for _ in range(len(depends).bit_length()):
+        reach = (reach.astype(int) @ reach.astype(int)) > 0
+    return reach
+
+
+def variables(s: Structure) -> Expression:
+    """Return states, inputs and time, one above the other."""
+    return ca.vertcat(s.x, s.u, s.time)
+
+
+def others(s: Structure, i: int) -> Iterable[int]:
+    """Return the indices of all states but the i-th."""
+    return (j for j in range(len(s.states)) if j != i)
+
+
+@dataclass(frozen=True)
+class Group:
+    """States along the path of one driver, by their indices in the model's state vector.
+
+    `rate` is the symbol that stands for the driver's rate in `slopes`, the states' derivatives.
+    """
+
+    driver: int
+    states: tuple[int, ...]
+    rate: Expression
+    slopes: Expression
+
+
+def along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Expression] | None:
+    """Return driver, rate symbol and slope of a state that rests where its driver rests.
+
+    With the driver's rate at zero its derivative may depend on nothing but the state itself, and on
+    that linearly (a heat that decays).
+    """
+    rates = {j: name for j in others(s, i) if (name := _rate_name(s, j)) is not None}
+    for driver, name in rates.items():
+        if not reach[i, driver] or reach[driver, i]:
+            continue
+        rate = ca.SX.sym("rate")
+        keep = {name} if name in s.balances else set()
+        slope = _resolved(s, s.der[s.states[i].name], keep)
+        slope = ca.substitute(slope, s.symbols[name], rate)
+        if ca.depends_on(slope, s.time):
+            continue
+        if not ca.depends_on(slope, rate):
+            continue
+        resting = ca.substitute(slope, rate, ca.SX(0))
+        everything = ca.vertcat(s.x[list(others(s, i))], s.u, s.time)
+        own = ca.jacobian(resting, s.x[i])
+        if not ca.depends_on(resting, everything) and not ca.depends_on(own, s.x[i]):
+            return driver, rate, slope
+    return None
+
+
+def _rate_name(s: Structure, i: int) -> str | None:
+    """Return the name of the balance or state that is a state's derivative, if there is one."""
+    derivative: Expression = ca.SX(s.der[s.states[i].name])
+    return str(derivative.name()) if derivative.is_symbolic() else None
+
+
+def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expression:
+    """Return an expression with all balances but those kept substituted."""
+    names = [n for n in s.balances if n not in keep]
+    symbols, sums = [s.symbols[n] for n in names], [s.balances[n] for n in names]
+    unused = [q for n, q in s.symbols.items() if n not in s.balances and _is_balance(s, n)]
+    result = ca.substitute([ca.SX(expression)], unused, [ca.SX(0)] * len(unused))[0]
+    while any(ca.depends_on(result, q) for q in symbols):
+        result = ca.substitute([result], symbols, sums)[0]
+        result = ca.substitute([result], unused, [ca.SX(0)] * len(unused))[0]
+    return result
+
+
+def _is_balance(s: Structure, name: str) -> bool:
+    tables = (s.states, s.inputs, s.parameters, s.sampled)
+    return name != "time" and all(name not in [q.name for q in table] for table in tables)
+
+
+def groups_along(found: Mapping[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
+    """Return the states with driver, rate symbol and slope (`along`), one group for a driver."""
+    drivers = sorted({driver for driver, *_ in found.values()})
+    groups = []
+    for driver in drivers:
+        states = tuple(i for i, (d, *_) in found.items() if d == driver)
+        rate = found[states[0]][1]
+        slopes = [ca.substitute(found[i][2], found[i][1], rate) for i in states]
+        groups.append(Group(driver, states, rate, ca.vertcat(*slopes)))
+    return tuple(groups)
+
+
+#: A group (its index), a port, or ports that are solved for together (their indices).
+Item = tuple[str, tuple[int, ...]]
+
+
+class NoSplit(Exception):  # noqa: N818 - it says that a form does not fit, which is no mistake
+    """The model does not have the form of exact steps; the message says why."""
+
+
+@dataclass(frozen=True)
+class Port:
+    """What the linear part leaves of one state's derivative.
+
+    `chord` is the driver along whose path the port varies, -1 if there is none.
+    """
+
+    state: int
+    value: Expression
+    feedback: bool
+    chord: int
+
+
+def order_of(
+    s: Structure, groups: Sequence[Group], ports: Sequence[Port], reach: BoolArray
+) -> tuple[Item, ...]:
+    """Return the order in which groups and ports are evaluated, each after what feeds it."""
+    items: list[Item] = [("group", (k,)) for k in range(len(groups))]
+    label = np.argmax(reach & reach.T, axis=1)  # the first of those that reach each other
+    loops: dict[int, list[int]] = {}
+    for k, port in enumerate(ports):
+        if port.feedback:
+            loops.setdefault(int(label[port.state]), []).append(k)
+        else:
+            items.append(("port", (k,)))
+    items += [("loop", tuple(ks)) for ks in loops.values()]
+    feeds = [_feeds(groups, ports, item) for item in items]
+    reads = [_reads(s, groups, ports, item) for item in items]
+    waiting, done = list(range(len(items))), []
+    while waiting:
+        ready = [
+            k
+            for k in waiting
+            if not any(reach[r, f] for o in waiting if o != k for f in feeds[o] for r in reads[k])
+        ]
+        if not ready:
+            raise NoSplit("its nonlinear parts feed each other in a loop")
+        done += ready
+        waiting = [k for k in waiting if k not in ready]
+    return tuple(items[k] for k in done)
+
+
+def _feeds(groups: Sequence[Group], ports: Sequence[Port], item: Item) -> list[int]:
+    kind, members = item
+    if kind == "group":
+        return list(groups[members[0]].states)
+    return [ports[k].state for k in members]
+
+
+def _reads(s: Structure, groups: Sequence[Group], ports: Sequence[Port], item: Item) -> list[int]:
+    kind, members = item
+    if kind == "group":
+        group = groups[members[0]]
+        inside = np.any(dependence(group.slopes, s.x), axis=0)
+        return [int(j) for j in np.flatnonzero(inside) if j not in group.states] + [group.driver]
+    inside = np.any([dependence(ports[k].value, s.x)[0] for k in members], axis=0)
+    return [int(j) for j in np.flatnonzero(inside)]
+
 
 #: Operations whose value jumps.
 _JUMPS = frozenset(

@@ -1,1 +1,0 @@
-"""Exact steps of many sets of parameters on a GPU, where there is one."""
