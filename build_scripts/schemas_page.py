@@ -52,7 +52,7 @@ def section(name: str, schema: Schema) -> str:
     ]
     for record, inner in schema.get("$defs", {}).items():
         parts += [f"### {record} {{ #{_anchor(name, record)} }}", inner["description"]]
-        parts += [markdown_table(_members(name, inner))]
+        parts += [markdown_table(_members(name, inner))] if "properties" in inner else []
     return "\n\n".join(parts)
 
 

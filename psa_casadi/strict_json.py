@@ -1,34 +1,60 @@
-"""JSON that says one thing only: no name twice, no number or text that cannot be written again."""
+"""JSON files: read strictly, checked against the records that declare them, written back the same.
+
+A file's form is a frozen dataclass; msgspec converts the content to it and makes its schema. JSON
+that is read says one thing only: no name twice, no number or text that cannot be written again.
+"""
 
 import json
 import math
 import os
 import re
+import types
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
 
 from psa_casadi.characters import barred
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.files import why_not_read
 
-#: The most bytes of a file, and the deepest that lists and objects may lie in each other.
+Record = TypeVar("Record")
+
+#: The most bytes of a file.
 MOST_BYTES = 2**24
-DEEPEST = 64
-#: A text, whose brackets do not count, or a bracket.
-_BRACKETS = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?|[\[{]|[\]}]', re.DOTALL)
 #: A list of numbers only, over several lines; no text of JSON has a line end.
 _NUMBERS = re.compile(r"\[\n((?:\s*(?:-?\d[\d.eE+-]*|null),?\n)+)\s*\]")
+_WANTED = {
+    float: "a number",
+    int: "a whole number",
+    str: "a text",
+    bool: "true or false",
+    type(None): "null",
+}
+#: Stands for what a content lacks; it is of no type that JSON has.
+_LACKING = object()
 
 
-def read_json_text(path: str | os.PathLike[str]) -> str:
-    """Return the text of a file that is meant to hold JSON.
+def read_json(path: str | os.PathLike[str], advice: str, source: str = "") -> Any:
+    """Return the content of a JSON file, which messages call `source` if that is given.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: it is no UTF-8 text, or has more than `MOST_BYTES`.
+        InputError: it cannot be read, is no UTF-8 text, has more than `MOST_BYTES`, or is not what
+            `parse_json` takes.
     """
-    with Path(path).open("rb") as stream:
+    source = source or os.fspath(path)
+    try:
+        text = _read_text(Path(path))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{source}: cannot be read ({why_not_read(error)}); {advice}") from error
+    return parse_json(text, source, advice)
+
+
+def _read_text(path: Path) -> str:
+    with path.open("rb") as stream:
         data = stream.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise ValueError(f"it has more than {MOST_BYTES / 2**20:g} MiB")
@@ -39,22 +65,99 @@ def parse_json(text: str, source: str, advice: str) -> Any:
     """Return the content of a JSON text; `advice` ends the sentence that refuses it.
 
     Raises:
-        InputError: the text is no JSON or nests deeper than `DEEPEST`; it has a name twice in one
-            object, a number that is no finite double, or a character that no document can carry.
+        InputError: the text is no JSON or nests too deeply; it has a name twice in one object, a
+            number that is no finite double, or a character that no document can carry.
     """
     try:
-        _check_depth(text)
         content = json.loads(
-            text,
-            object_pairs_hook=_object,
-            parse_constant=_constant,
-            parse_float=_number,
-            parse_int=_integer,
+            text, object_pairs_hook=_object, parse_constant=_constant, parse_float=_number
         )
         check_texts(content)
-    except ValueError as error:
-        raise InputError(f"{source} is not JSON that can be used ({error}); {advice}") from error
+    except (ValueError, RecursionError) as error:
+        why = "its lists nest too deep" if isinstance(error, RecursionError) else error
+        raise InputError(f"{source} is not JSON that can be used ({why}); {advice}") from error
     return content
+
+
+def decode(kind: type[Record], content: Any, source: str) -> Record:
+    """Return a file's content as the record that declares it; unknown names are left out.
+
+    Raises:
+        InputError: every part that is missing or of another type, at most 20 of them.
+    """
+    problems = Problems()
+    for sentence in mistakes(kind, content):
+        problems.add(f"{source}: {sentence}")
+    problems.raise_if_any()
+    return msgspec.convert(content, kind)
+
+
+def part(kind: Any, content: Any) -> Any:
+    """Return what a part of a content is, None where it is nothing of the kind."""
+    try:
+        return msgspec.convert(content, kind)
+    except msgspec.ValidationError:
+        return None
+
+
+def mistakes(kind: Any, content: Any, place: str = "") -> Iterator[str]:
+    """Yield a sentence for each part of a content that its declared type does not allow."""
+    try:
+        msgspec.convert(content, kind)
+    except msgspec.ValidationError:
+        inside = [m for p, k, value in _parts(kind, content, place) for m in mistakes(k, value, p)]
+        name = f"'{place}'" if place else "the file"
+        found = "missing" if content is _LACKING else shown(content)
+        yield from inside or [f"{name} is {found}; give {_wanted(kind)}."]
+
+
+def _parts(kind: Any, content: Any, place: str) -> Iterable[tuple[str, Any, Any]]:
+    """Return place, type and value of each part of what may be a record, a mapping or a list."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return next((p for k in inner if (p := list(_parts(k, content, place)))), ())
+    if isinstance(content, dict):
+        before = f"{place}." if place else ""
+        if is_dataclass(kind) and isinstance(kind, type):
+            kinds = get_type_hints(kind)
+            needed = [f for f in fields(kind) if f.name in content or _has_no_default(f)]
+            return [(before + f.name, kinds[f.name], content.get(f.name, _LACKING)) for f in needed]
+        if origin is not None and issubclass(origin, Mapping):
+            return [(before + name[:80], inner[1], value) for name, value in content.items()]
+    if isinstance(content, list) and origin is tuple:
+        kinds_in = [inner[0]] * len(content) if inner[-1] is ... else inner
+        if len(kinds_in) == len(content):
+            pairs = enumerate(zip(kinds_in, content, strict=True))
+            return [(f"{place}[{i}]", k, value) for i, (k, value) in pairs]
+    return ()
+
+
+def _has_no_default(field: Any) -> bool:
+    return field.default is MISSING and field.default_factory is MISSING
+
+
+def _wanted(kind: Any) -> str:
+    """Return what a message asks for where a type is declared."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_wanted(k) for k in inner)
+    if origin is Literal:
+        return f"one of {', '.join(repr(v) for v in inner)}" if inner[1:] else repr(inner[0])
+    if origin is tuple:
+        return "a list" if inner[-1] is ... else f"a list of {len(inner)} values"
+    if isinstance(kind, type) and issubclass(kind, tuple):
+        return f"[{', '.join(get_type_hints(kind))}]"
+    return _WANTED.get(kind, "names with values")
+
+
+def plain(value: Any) -> Any:
+    """Return what a file has of a record: the names with values that are not the defaults."""
+    if is_dataclass(value):
+        own = [(f, getattr(value, f.name)) for f in fields(value)]
+        return {f.name: plain(v) for f, v in own if f.default is MISSING or v != f.default}
+    if isinstance(value, Mapping):
+        return {name: plain(v) for name, v in value.items()}
+    return [plain(v) for v in value] if isinstance(value, tuple) else value
 
 
 def json_text(content: Any) -> str:
@@ -83,15 +186,6 @@ def shown(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:80]}..."
 
 
-def _check_depth(text: str) -> None:
-    depth = 0
-    for found in _BRACKETS.finditer(text):
-        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(found[0], 0)
-        if depth > DEEPEST:
-            line = text.count("\n", 0, found.start()) + 1
-            raise ValueError(f"line {line}: lists and objects lie more than {DEEPEST} deep")
-
-
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
@@ -109,11 +203,6 @@ def _number(digits: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"the number {shown(digits)} is too large")
     return value
-
-
-def _integer(digits: str) -> int:
-    _number(digits)  # what a double cannot hold is refused
-    return int(digits)
 
 
 def _texts(content: Any) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from typing import NamedTuple
 
 Values = Mapping[str, float]
 Nominal = float | Callable[[Values], float]
@@ -91,8 +92,7 @@ class Output:
     display_unit: str | None = None
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """An estimate's 95 % confidence interval, in the unit of the parameter."""
 
     low: float

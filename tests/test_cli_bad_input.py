@@ -167,7 +167,7 @@ def test_a_model_from_nowhere_or_of_something_else(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere.json"
     out = tmp_path / "y.csv"
     said = refused("simulate", "--model", nowhere, "--input", good, "-o", out, outputs=tmp_path)
-    assert "nowhere.json cannot be read" in said
+    assert "nowhere.json: cannot be read" in said
     said = refused("simulate", "--model", other, "--input", good, "-o", out, outputs=tmp_path)
     assert "is no stack" in said
 
@@ -271,7 +271,7 @@ def test_the_command_itself_prints_no_traceback(tmp_path: Path) -> None:
         (("compare", "absent.json", "b.json"), "absent.json: cannot be read (there is no such"),
         (
             ("simulate", "--model", "bytes", "--input", "x"),
-            "bytes cannot be read (it is no text in",
+            "bytes: cannot be read (it is no text in",
         ),
         (("export", "c", "--step", "10us", "--stack", "demo", "-o", "bytes"), "there is a file of"),
         (("examples", "ci", "-o", "bytes"), "bytes: cannot be created, there is a file of that"),

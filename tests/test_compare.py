@@ -128,7 +128,7 @@ def test_values_that_do_not_belong_are_told_with_their_place(
     (content["errors"] if place.startswith("noise_floor") else content)[place] = value
     path = tmp_path / "x.json"
     path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=rf"{place}.*does not belong there"):
+    with pytest.raises(InputError, match=rf"{place}[^;]*is .*; give "):
         read_findings([path])
 
 

@@ -1,9 +1,6 @@
 """What stands behind a model's values is kept with it, in MODEL.json, and only while it is true."""
 
-import json
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +21,6 @@ from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Interval
 from tests.evidence_models import NOISE, OFFSET, evident_model, noisy_record
-from tests.mutations import sentences
 
 
 def evidence_in(model: Model) -> Evidence:
@@ -144,45 +140,3 @@ def test_a_plant_keeps_it_with_the_covariance_of_its_own_parameters() -> None:
     assert evidence_in(plant).covariance.names == ("k_L",)
     assert evidence_in(plant).covariance.matrix == ((4.0,),)
     assert loads(dumps(plant)).evidence == plant.evidence
-
-
-def _edited(change: Callable[[dict[str, Any]], object]) -> str:
-    content = json.loads(dumps(evident_model()))
-    change(content["evidence"])
-    return json.dumps(content)
-
-
-MISTAKES: dict[str, Callable[[dict[str, Any]], object]] = {
-    "'evidence' has the unknown names ['more']": lambda e: e.update(more=1),
-    "'evidence' lacks seen": lambda e: e.pop("seen"),
-    "'evidence.fitted_m' is 'x'; give a number": lambda e: e.update(fitted_m="x"),
-    "'evidence.fitted_m' is True; give a number": lambda e: e.update(fitted_m=True),
-    "an error, a rate or a duration below 0": lambda e: e.update(fitted_m=-1.0),
-    "'evidence.seen.voltage' is [2, 1]; give [low, high]": lambda e: e["seen"].update(
-        voltage=[2, 1]
-    ),
-    "'evidence.runs[0].samples' is 2.5; give a whole number": lambda e: e["runs"][0].update(
-        samples=2.5
-    ),
-    "must have held-out stretches that follow each other": lambda e: e["runs"][0].update(
-        held_out=[[5, 9], [8, 12]]
-    ),
-    "must have a held-out error and held-out samples": lambda e: e["runs"][0].update(held_out=[]),
-    "must have samples, each of at least one": lambda e: e["runs"][0].update(averaged=0),
-    "must name parameters, none twice; not ['warp']": lambda e: e["covariance"].update(
-        names=["k_L", "A", "warp"]
-    ),
-    "must have a row and a column for each name": lambda e: e["covariance"]["matrix"].pop(),
-    "must be symmetric": lambda e: e["covariance"]["matrix"][0].__setitem__(1, 7.0),
-    "must have two or more increasing times": lambda e: e["reference"].update(time=[0.0]),
-    "and a value of each column for each time": lambda e: e["reference"]["inputs"].clear(),
-    "which is not among the runs": lambda e: e["reference"].update(record="other"),
-    "'evidence.reference.displacement' is 3; give a list": lambda e: e["reference"].update(
-        displacement=3
-    ),
-}
-
-
-@pytest.mark.parametrize("expected", MISTAKES)
-def test_a_mistake_in_a_file_is_named(expected: str) -> None:
-    assert expected in "\n".join(sentences(lambda: loads(_edited(MISTAKES[expected]))))

@@ -92,7 +92,7 @@ def test_the_page_of_json_files_holds_every_member_of_every_schema() -> None:
         schema = json.loads(schema_texts()[f"{name}.schema.json"])
         text = schema_section(name, schema)
         records = [schema, *schema.get("$defs", {}).values()]
-        members = [member for record in records for member in record["properties"]]
+        members = [member for record in records for member in record.get("properties", ())]
         assert [m for m in members if f"| `{m}` |" not in text] == []
         linked = set(re.findall(r"\]\(#([\w-]+)\)", text))
         assert linked == set(re.findall(r"\{ #([\w-]+) \}", text))

@@ -1,6 +1,5 @@
 """Composition, values, and MODEL.json."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -175,55 +174,6 @@ def test_named_stacks_round_trip(name: str) -> None:
     model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()}, name=name)
     assert loads(dumps(model)).values == model.values
     assert set(model.values) == set(STACKS[name].values)
-
-
-def changed(change: Callable[[dict[str, Any]], object]) -> str:
-    content = json.loads(dumps(identified()))
-    change(content)
-    return message(lambda: loads(json.dumps(content), "m.json"))
-
-
-def test_each_mistake_in_a_file_is_named() -> None:
-    parameters = "parameters"
-    cases: dict[str, Callable[[dict[str, Any]], object]] = {
-        "its format is 'x/2', expected 'psa_casadi.model/1'": lambda c: c.update(format="x/2"),
-        "'components' is missing": lambda c: c.pop("components"),
-        "unknown name 'engine' in components": lambda c: c["components"].append("engine"),
-        "unknown name [1] in effects": lambda c: c["effects"].append([1]),
-        "unknown name 'slow_creep' in components": lambda c: c["components"].append("slow_creep"),
-        "Two components declare 'k_L'": lambda c: c["components"].append("linear_force"),
-        "'parameters' is missing": lambda c: c.pop(parameters),
-        "parameter 'k_L' [N/V] has no value": lambda c: c[parameters].pop("k_L"),
-        "'tau' is 'fast'": lambda c: c[parameters]["tau"].update(value="fast"),
-        "'m_P' is True": lambda c: c[parameters]["m_P"].update(value=True),
-        "'tau' is given in 'ms'; convert it to 's'": lambda c: c[parameters]["tau"].update(
-            unit="ms"
-        ),
-        "'n' is 17 1, outside its bounds": lambda c: c[parameters]["n"].update(value=17),
-        "NaN is no number": lambda c: c[parameters]["n"].update(value=float("nan")),
-        "unknown parameters ['warp']": lambda c: c[parameters].update(warp={"value": 1}),
-        "interval of 'n' is [1]": lambda c: c[parameters]["n"].update(interval=[1]),
-        "'identified_from' must list": lambda c: c.update(identified_from=[{"record": "a"}]),
-        "'notes' is 'one'": lambda c: c.update(notes="one"),
-        "'name' is 3": lambda c: c.update(name=3),
-        "'u'": lambda c: c["components"].remove("drive") or [
-            c[parameters].pop(n) for n in ("G", "R_s", "C_p", "u_rated")
-        ],
-    }  # fmt: skip
-    for expected, change in cases.items():
-        text = changed(change)
-        assert expected in text, text
-        assert all(line.startswith("m.json") for line in text.splitlines())
-
-
-def test_several_mistakes_come_together() -> None:
-    def spoil(content: dict[str, Any]) -> None:
-        content["effects"].append("magic")
-        content["parameters"]["tau"]["value"] = None
-        del content["parameters"]["A"]
-
-    text = changed(spoil)
-    assert all(word in text for word in ("'magic'", "'tau' is None", "'A' [N/V] has no value"))
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"x"', "null"])

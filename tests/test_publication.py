@@ -48,9 +48,13 @@ def test_what_a_model_states_is_in_its_file_and_comes_back() -> None:
     model = replace(model_named("flexure"), publication=SAID)
     assert loads(dumps(model)).publication == SAID
     assert "publication" not in dumps(model_named("flexure"))
-    for wrong in ({"author": 1}, {"auther": "A."}, "A."):
+    for wrong, said in (
+        ({"author": 1}, "'publication.author' is 1; give a text"),
+        ({"auther": "A."}, "'publication.auther' is unknown; give author, version, copyright"),
+        ("A.", "'publication' is 'A.'"),
+    ):
         text = json.dumps({**json.loads(dumps(model)), "publication": wrong})
-        with pytest.raises(InputError, match="author, version, copyright, license"):
+        with pytest.raises(InputError, match=said):
             loads(text)
 
 

@@ -1,7 +1,7 @@
 """The JSON schemas that the package ships, against their records and against what is written."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from psa_casadi.model.model_file import dumps
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.documents.check_file import check_file
 from psa_casadi.report.documents.identification_file import identification_file
-from psa_casadi.report.documents.schema import json_schema
 from psa_casadi.report.documents.schemas import FILES, schema_texts
 from psa_casadi.strict_json import json_text
 from psa_casadi.variables import Publication
@@ -108,15 +107,3 @@ def test_what_is_otherwise_is_refused(spoil: dict[str, Any]) -> None:
     content = {**check_file(CheckReport(Path("a.fmu"), (), compared=True)), **spoil}
     with pytest.raises(jsonschema.ValidationError):
         valid("check", json_text(content))
-
-
-@dataclass(frozen=True)
-class _Odd:
-    """A record with what JSON has not."""
-
-    what: complex
-
-
-def test_a_type_that_json_has_not_is_no_field() -> None:
-    with pytest.raises(TypeError, match="has no form in JSON"):
-        json_schema(_Odd)

@@ -27,8 +27,7 @@ from psa_casadi.report.documents.device_file import (
     hash_of,
 )
 from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding
-from psa_casadi.report.documents.read_document import read_document
-from psa_casadi.strict_json import json_text, parse_json, read_json_text
+from psa_casadi.strict_json import decode, json_text, read_json
 from psa_casadi.version import __version__
 
 
@@ -55,9 +54,9 @@ class Results:
         """Return how a device ended, None where that is not known."""
         path = self.folder / device / DEVICE_FILE
         try:
-            content = parse_json(read_json_text(path), str(path), "the device is done again.")
-            return read_document(DeviceFile, content, str(path))
-        except (OSError, ValueError):  # never done, or damaged
+            content = read_json(path, "the device is done again.")
+            return decode(DeviceFile, content, str(path))
+        except InputError:  # never done, or damaged
             return None
 
     def write(self, job: Job, options: Options, key: str, outcome: DeviceOutcome) -> DeviceFile:

@@ -1,8 +1,11 @@
 """What a model is good for: records, errors, ranges and covariance, kept with the model."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
+from psa_casadi.strict_json import shown
 from psa_casadi.variables import Interval
 
 
@@ -136,3 +139,56 @@ class Evidence:
     def run_of(self, record: str) -> RecordRun | None:
         """Return how the record of that name is played again."""
         return next((r for r in self.runs if r.record == record), None)
+
+
+def contradictions(e: Evidence, parameters: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what cannot be in the evidence of a file, although each part alone could."""
+    intervals = {"seen.voltage": e.seen.voltage, "seen.temperature": e.seen.temperature}
+    sizes = [e.fitted_m, e.seen.rate, e.seen.duration]
+    if e.held_out is not None:
+        held = e.held_out
+        intervals["held_out.interval_m"] = held.interval_m
+        sizes += [held.rms_m, held.interval_m.low, held.max_m, held.nrmse_percent, held.records]
+    for run in e.runs:
+        sizes += [run.fitted_m, run.held_out_m or 0.0]
+    if min(sizes) < 0.0:
+        yield "'evidence' has an error, a rate or a duration below 0."
+    for name, interval in intervals.items():
+        if interval is not None and interval.low > interval.high:
+            yield f"'evidence.{name}' is {shown(list(interval))}; give [low, high]."
+    yield from _bad_covariance(e.covariance, parameters)
+    for run in e.runs:
+        yield from _bad_run(run)
+    if e.reference is not None:
+        yield from _bad_reference(e.reference, [r.record for r in e.runs])
+
+
+def _bad_covariance(c: Covariance, parameters: Mapping[str, Any]) -> Iterator[str]:
+    unknown = [n for n in c.names if n not in parameters]
+    if unknown or len(set(c.names)) < len(c.names):
+        yield f"'evidence.covariance.names' must name parameters, none twice; not {shown(unknown)}."
+    rows = c.matrix
+    if [len(c.names)] * len(c.names) != [len(row) for row in rows]:
+        yield "'evidence.covariance.matrix' must have a row and a column for each name."
+    elif any(row[i] < 0.0 for i, row in enumerate(rows)) or rows != tuple(zip(*rows, strict=True)):
+        yield "'evidence.covariance.matrix' must be symmetric, with no variance below 0."
+
+
+def _bad_run(run: RecordRun) -> Iterator[str]:
+    of, ends = f"'evidence.runs' of {shown(run.record)}", [k for s in run.held_out for k in s]
+    if run.averaged < 1 or run.samples < 2:
+        yield f"{of} must have samples, each of at least one."
+    if any(a >= b for a, b in pairwise([-1, *ends, run.samples + 1])):
+        yield f"{of} must have held-out stretches that follow each other within its samples."
+    if (run.held_out_m is None) != (not run.held_out):
+        yield f"{of} must have a held-out error and held-out samples, or neither."
+
+
+def _bad_reference(r: ReferenceRun, known: Sequence[str]) -> Iterator[str]:
+    if r.record not in known:
+        yield f"'evidence.reference' is of {shown(r.record)}, which is not among the runs."
+    if len(r.time) < 2 or any(a >= b for a, b in pairwise(r.time)):
+        yield "'evidence.reference.time' must have two or more increasing times."
+    columns = [r.displacement, *r.inputs.values()]
+    if "voltage" not in r.inputs or any(len(c) != len(r.time) for c in columns):
+        yield "'evidence.reference' must have a voltage, and a value of each column for each time."

@@ -1,25 +1,85 @@
 """MODEL.json: a model by the names of its components, with every value, interval and origin."""
 
 import os
-from collections.abc import Iterable
-from typing import Any
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
 from psa_casadi.component import Component
 from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.effects.patches import PATCHES
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write, why_not_read
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.evidence_file import evidence_content, read_evidence
-from psa_casadi.model.model_file_checks import FORMAT, check_content, first_ones, name_of
+from psa_casadi.model.evidence import Evidence, contradictions
 from psa_casadi.model.own_effects import declaration_hash, known_effects
-from psa_casadi.strict_json import json_text, parse_json, read_json_text, shown
+from psa_casadi.strict_json import (
+    decode,
+    json_text,
+    mistakes,
+    parse_json,
+    part,
+    plain,
+    read_json,
+    shown,
+)
 from psa_casadi.variables import Interval, Provenance, Publication
 
+FORMAT = "psa_casadi.model/1"
 #: What a diagnosis may add beside the effects of the table.
 _BESIDE = {c.name: c for c in (*MODAL_SERIES.values(), *PATCHES.values())}
+_STATED = tuple(f.name for f in fields(Publication))
+_ADVICE = "give a file that `psa identify` or `psa diagnose` wrote."
+
+
+@dataclass(frozen=True)
+class ModelParameter:
+    """A parameter's value in its unit, its 95 % interval, and whether a fit found it."""
+
+    value: float
+    unit: str = ""
+    interval: Interval | None = None
+    free: bool = False
+
+
+@dataclass(frozen=True)
+class OwnEffect:
+    """An effect that is not of this package: its module and the hash of what it declares."""
+
+    name: str
+    module: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class IdentifiedFrom:
+    """A record that the model was fitted to, with the SHA-256 of its file."""
+
+    record: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """A model by the names of its components, with every value, interval and origin."""
+
+    format: Literal["psa_casadi.model/1"]
+    components: tuple[str, ...]
+    effects: tuple[str | OwnEffect, ...]
+    parameters: Mapping[str, ModelParameter]
+    name: str = "psa"
+    description: str = ""
+    publication: Publication = field(default_factory=Publication)
+    starts: Mapping[str, float] = field(default_factory=dict)
+    interrupted: bool = False
+    force_scale: str = "assumed"
+    notes: tuple[str, ...] = ()
+    identified_from: tuple[IdentifiedFrom, ...] = ()
+    package_version: str = ""
+    evidence: Evidence | None = None
 
 
 def dumps(model: Model) -> str:
@@ -44,7 +104,7 @@ def dumps(model: Model) -> str:
         parameters[p.name] = {
             "value": model.values[p.name],
             "unit": p.unit,
-            "interval": [interval.low, interval.high] if interval else None,
+            "interval": list(interval) if interval else None,
             "free": p.name in origin.free,
         }
     starts, stated = model.own_starts(), model.publication.stated
@@ -62,7 +122,7 @@ def dumps(model: Model) -> str:
         "notes": list(origin.notes),
         "identified_from": [{"record": n, "sha256": h} for n, h in origin.identified_from],
         "package_version": origin.package_version,
-        **({"evidence": evidence_content(model.evidence)} if model.evidence else {}),
+        **({"evidence": plain(model.evidence)} if model.evidence else {}),
     }
     try:
         return json_text(content)
@@ -90,28 +150,47 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
 
     Raises InputError that names every unknown name, missing or bad value.
     """
-    content = parse_json(text, source, "give a file that `psa identify` or `psa diagnose` wrote.")
+    return model_of(parse_json(text, source, _ADVICE), source, effects)
+
+
+def model_of(content: Any, source: str, effects: Iterable[Component] = ()) -> Model:
+    """Return the model that the content of a file holds; raises InputError as `loads`."""
+    found = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if not isinstance(content, dict) or found != FORMAT:
+        raise InputError(
+            f"{source} is not a model file: its format is {shown(found)}, expected '{FORMAT}';"
+            f" {_ADVICE}"
+        )
     table = {**known_effects(effects), **_BESIDE}
-    check_content(content, source, table)
-    components = [COMPONENTS[name_of(n)] for n in content["components"]]
-    components += [table[name_of(n)] for n in content["effects"]]
-    given = content["parameters"]
+    _refuse(_problems(content, table), source)
+    file = decode(ModelFile, content, source)
+    components = [COMPONENTS[name] for name in file.components]
+    components += [table[_name_of(effect)] for effect in file.effects]
+    given = file.parameters
     try:
         model = compose(
             components,
-            {n: e["value"] for n, e in given.items()},
-            name=content.get("name", "psa"),
-            description=content.get("description", ""),
-        ).with_starts({n: float(v) for n, v in content.get("starts", {}).items()})
+            {name: p.value for name, p in given.items()},
+            name=file.name,
+            description=file.description,
+        ).with_starts(file.starts)
     except InputError as error:
-        said = first_ones(f"{source}: {problem}" for problem in error.problems)
-        raise InputError(said) from error
+        _refuse(error.problems, source)
+        raise
+    if file.evidence is not None:
+        _refuse(contradictions(file.evidence, model.values), source)
     ordered = {p.name: given[p.name] for p in model.structure.parameters}
-    published = Publication(**content.get("publication", {}))
-    told = content.get("evidence")
-    evidence = None if told is None else read_evidence(told, model.values, source)
+    provenance = Provenance(
+        identified_from=tuple((r.record, r.sha256) for r in file.identified_from),
+        package_version=file.package_version,
+        free=tuple(name for name, p in ordered.items() if p.free),
+        intervals={name: p.interval for name, p in ordered.items() if p.interval},
+        force_scale=file.force_scale,
+        notes=file.notes,
+        interrupted=file.interrupted,
+    )
     return model.with_values(
-        {}, provenance=_provenance(content, ordered), publication=published, evidence=evidence
+        {}, provenance=provenance, publication=file.publication, evidence=file.evidence
     )
 
 
@@ -122,27 +201,83 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
 
 def load_model(path: str | os.PathLike[str], effects: Iterable[Component] = ()) -> Model:
     """Read MODEL.json; `effects` are own ones that it may have. Raises InputError."""
-    try:
-        text = read_json_text(path)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"The model file {path} cannot be read ({why_not_read(error)}); give a file that"
-            " `psa identify` wrote."
-        ) from error
-    return loads(text, str(path), effects)
+    return model_of(read_json(path, _ADVICE), str(path), effects)
 
 
-def _provenance(content: dict[str, Any], given: dict[str, Any]) -> Provenance:
-    return Provenance(
-        identified_from=tuple(
-            (r["record"], r["sha256"]) for r in content.get("identified_from", [])
-        ),
-        package_version=content.get("package_version", ""),
-        free=tuple(n for n, e in given.items() if e.get("free")),
-        intervals={
-            n: Interval(*map(float, e["interval"])) for n, e in given.items() if e.get("interval")
-        },
-        force_scale=content.get("force_scale", "assumed"),
-        notes=tuple(content.get("notes", ())),
-        interrupted=content.get("interrupted", False),
+def _refuse(sentences: Iterable[str], source: str) -> None:
+    """Raise InputError with the first 20 sentences and a count of the others, if there are any."""
+    problems = Problems()
+    for sentence in sentences:
+        problems.add(f"{source}: {sentence}")
+    problems.raise_if_any()
+
+
+def _name_of(effect: str | OwnEffect) -> str:
+    return effect if isinstance(effect, str) else effect.name
+
+
+def _problems(content: dict[str, Any], effects: Mapping[str, Component]) -> list[str]:
+    """Return all mistakes in the content of a file; `effects` are those that it may name."""
+    problems = list(mistakes(ModelFile, content))
+    names = [n for n in _listed(content, "components") if isinstance(n, str)]
+    references = [r for e in _listed(content, "effects") if (r := part(str | OwnEffect, e))]
+    problems += [_unknown(n, "components", COMPONENTS) for n in names if n not in COMPONENTS]
+    known = [COMPONENTS[n] for n in names if n in COMPONENTS]
+    for reference in references:
+        effect = effects.get(_name_of(reference))
+        if effect is None:
+            problems.append(_unknown(reference, "effects", effects))
+            continue
+        known.append(effect)
+        if isinstance(reference, OwnEffect) and reference.sha256 != declaration_hash(effect):
+            problems.append(
+                f"the effect '{effect.name}' of {effect.home or 'this package'} is declared in"
+                " another way than when the file was written; restore that, or identify again."
+            )
+    for name, count in Counter(map(_name_of, (*names, *references))).items():
+        if count > 1:
+            problems.append(f"{shown(name)} is listed {count} times; list it once.")
+    if isinstance(stated := content.get("publication"), dict):
+        extra = [n for n in stated if n not in _STATED]
+        problems += [f"'publication.{n}' is unknown; give {', '.join(_STATED)}." for n in extra]
+    if isinstance(given := content.get("parameters"), dict):
+        problems += _parameter_problems(given, known)
+        declared = {p.name for c in known for p in c.parameters}
+        unknown = [n for n in given if n not in declared]
+        if unknown and not problems:
+            problems.append(
+                f"unknown parameters {shown(unknown)}; remove them or add their component."
+            )
+    return problems
+
+
+def _listed(content: dict[str, Any], key: str) -> list[Any]:
+    return found if isinstance(found := content.get(key), list) else []
+
+
+def _unknown(reference: str | OwnEffect, key: str, table: Mapping[str, Component]) -> str:
+    if isinstance(reference, str):
+        return f"unknown name {shown(reference)} in {key}; the known ones are {sorted(table)}."
+    module = reference.module[:80]
+    return (
+        f"has the effect {shown(reference.name)} of the module {module}, which was not named; give"
+        f" --effects {module} (in Python: effects=psa.own_effects({module!r}).values())."
     )
+
+
+def _parameter_problems(given: dict[str, Any], known: Iterable[Component]) -> Iterator[str]:
+    for parameter in {p.name: p for c in known for p in c.parameters}.values():
+        if parameter.name not in given:
+            yield f"parameter '{parameter.name}' [{parameter.unit}] has no value; add it."
+            continue
+        entry = part(ModelParameter, given[parameter.name])
+        if entry and entry.unit not in ("", parameter.unit):
+            yield (
+                f"'{parameter.name}' is given in {shown(entry.unit)}; convert it to"
+                f" '{parameter.unit}'."
+            )
+        if entry and entry.interval and not entry.interval.low <= entry.interval.high:
+            yield (
+                f"the interval of '{parameter.name}' is {shown(list(entry.interval))}; give [low,"
+                " high] or null."
+            )

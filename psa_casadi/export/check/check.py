@@ -39,10 +39,10 @@ from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive, archive_problems
 from psa_casadi.files import why_not_read
 from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import loads
+from psa_casadi.model.model_file import model_of
 from psa_casadi.records.record import Record
 from psa_casadi.scratch import requests_to_end_answered
-from psa_casadi.strict_json import read_json_text
+from psa_casadi.strict_json import read_json
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
 
@@ -202,9 +202,9 @@ def _read_model(
 ) -> Iterator[str]:
     """Append the model that the FMU carries; what prevents that is the problem."""
     try:
-        text = read_json_text(archive.directory / MODEL_ENTRY)
-        found.append(loads(text, MODEL_ENTRY, effects))
-    except (PsaError, OSError, ValueError) as error:
+        content = read_json(archive.directory / MODEL_ENTRY, "export it again.", MODEL_ENTRY)
+        found.append(model_of(content, MODEL_ENTRY, effects))
+    except PsaError as error:
         yield str(error)
 
 

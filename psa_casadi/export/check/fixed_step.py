@@ -16,7 +16,7 @@ from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, played_inputs, s
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
-from psa_casadi.strict_json import parse_json, read_json_text
+from psa_casadi.strict_json import read_json
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -45,8 +45,7 @@ def stated_step(directory: Path) -> StatedStep | None:
     if step is None:
         return None
     try:
-        text = read_json_text(directory / FIXED_ENTRY)
-        found = parse_json(text, FIXED_ENTRY, "export the FMU again.")["errors"]
+        found = read_json(directory / FIXED_ENTRY, "export the FMU again.", FIXED_ENTRY)["errors"]
         errors = {name: float(found[name]) for name in VOLTAGES}
     except (KeyError, OSError, TypeError, ValueError) as error:
         raise InputError(

@@ -9,10 +9,9 @@ from typing import Any
 
 from psa_casadi.component import Component
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.files import why_not_read
 from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import loads
-from psa_casadi.model.model_file_checks import FORMAT as MODEL
+from psa_casadi.model.model_file import FORMAT as MODEL
+from psa_casadi.model.model_file import model_of
 from psa_casadi.population.finding import (
     BudgetShare,
     Finding,
@@ -26,8 +25,7 @@ from psa_casadi.report.documents.device_file import DeviceFile, damage
 from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
 from psa_casadi.report.documents.identification_file import FORMAT as IDENTIFICATION
 from psa_casadi.report.documents.identification_file import IdentificationFile
-from psa_casadi.report.documents.read_document import read_document
-from psa_casadi.strict_json import parse_json, read_json_text
+from psa_casadi.strict_json import decode, read_json
 
 #: The file in a device's folder that says how its work ended.
 DEVICE_FILE = "device.json"
@@ -87,21 +85,16 @@ def device_finding(
 def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]:
     path = path / DEVICE_FILE if path.is_dir() else path
     source = str(path)
-    try:
-        content = parse_json(text := read_json_text(path), source, _ADVICE)
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be read ({why_not_read(error)}); {_ADVICE}") from error
+    content = read_json(path, _ADVICE)
     kind = content.get("format") if isinstance(content, dict) else None
     if kind == DEVICE:
-        return _of_device(path, read_document(DeviceFile, content, source), effects, traces)
+        return _of_device(path, decode(DeviceFile, content, source), effects, traces)
     if kind == _DIAGNOSIS:
-        return [_Read(path, _diagnosis(read_document(DiagnosisFile, content, source)))]
+        return [_Read(path, _diagnosis(decode(DiagnosisFile, content, source)))]
     if kind == IDENTIFICATION:
-        return [_Read(path, _identification(read_document(IdentificationFile, content, source)))]
+        return [_Read(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
-        return [_Read(path, _model(loads(text, source, effects), traces))]
+        return [_Read(path, _model(model_of(content, source, effects), traces))]
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
 
 

@@ -5,8 +5,7 @@ import os
 from psa_casadi.errors import InputError
 from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
 from psa_casadi.report.documents.own_model_file import OwnModelFile
-from psa_casadi.report.documents.read_document import read_document
-from psa_casadi.strict_json import parse_json, read_json_text, shown
+from psa_casadi.strict_json import decode, read_json, shown
 
 _ADVICE = "give a file that `psa diagnose --json` or `Diagnosis.to_json` wrote"
 _KINDS: dict[str, type[DiagnosisFile | OwnModelFile]] = {
@@ -24,13 +23,8 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
     Raises InputError for a file that cannot be read, is none of a diagnosis, or lacks something.
     """
     source = os.fspath(path)
-    try:
-        content = parse_json(read_json_text(source), source, f"{_ADVICE}.")
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{source}: cannot be read ({error}); {_ADVICE}.") from error
+    content = read_json(source, f"{_ADVICE}.")
     found = content.get("format") if isinstance(content, dict) else None
     if found not in _KINDS:
         raise InputError(f"{source}: its format is {shown(found)}, no diagnosis; {_ADVICE}.")
-    return read_document(_KINDS[found], content, source)
+    return decode(_KINDS[found], content, source)
