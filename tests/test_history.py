@@ -105,7 +105,7 @@ def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> 
     with pytest.raises(InputError, match="finite"):
         STACK.with_starts({"u": np.inf})
     broken = dumps(extended).replace('"voltage": 60.0', '"voltage": "high"')
-    with pytest.raises(InputError, match="'starts' is"):
+    with pytest.raises(InputError, match=r"'starts\.voltage' is 'high'; give a number"):
         loads(broken)
 
 

@@ -18,8 +18,11 @@ from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model, Structure
 
 FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
 
-NEWTON_STEPS = 30
+_NEWTON_STEPS = 30
+#: Sets that one call of a function takes.
+_CHUNK = 1024
 
 
 @dataclass(frozen=True)
@@ -84,24 +87,114 @@ def start_state(
             "An imported FMU has no second derivatives, which a settled start needs; it can only"
             " begin at its start values."
         )
-    settle, rest, moving = start_functions(structure)
     names = memory_names(structure)
-    deviation = np.array([(memory or {}).get(n, 0.0) for n in names])
-    u, w = np.array(inputs, dtype=float), np.array(rates or [0.0] * len(inputs), dtype=float)
-    p = model.parameter_vector()
+    deviation = [(memory or {}).get(n, 0.0) for n in names]
+    begin = [time], inputs, rates or [0.0] * len(inputs), deviation
+    final, by_p, by_memory = _begin(
+        model,
+        _start_functions(structure),
+        model.parameter_vector()[:, None],
+        model.state_nominals()[:, None],
+        [np.array(q, dtype=float)[:, None] for q in begin],
+    )
+    return Start(final[:, 0], by_p, by_memory)
+
+
+def starts_on(
+    model: Model, p: FloatArray, nominal: FloatArray, t: FloatArray, u: FloatArray
+) -> FloatArray:
+    """Return initial states (nx, m) for parameters p (np, m) and inputs u (n, nu) at times t (n,).
+
+    `nominal` (nx, m) are the states' usual sizes. A column has the bits of `start_on` for a model
+    with these parameters, in a fraction of its time. Raises PsaError where a set has no
+    equilibrium.
+    """
+    structure = model.structure
+    if structure.foreign:
+        return np.tile([[s.start] for s in structure.states], p.shape[1])
+    rates = np.array([initial_slope(t, column) for column in u.T])
+    begin = t[:1], u[0], rates, np.zeros(len(memory_names(structure)))
+    x = np.empty((len(structure.states), p.shape[1]))
+    for first in range(0, p.shape[1], _CHUNK):
+        part = slice(first, first + _CHUNK)
+        sets = p[:, part].shape[1]
+        columns = [np.repeat(a[:, None], sets, axis=1) for a in begin]
+        functions = _functions_of_many(structure, sets)
+        x[:, part] = _begin(model, functions, p[:, part], nominal[:, part], columns)[0]
+    return x
+
+
+def _begin(
+    model: Model,
+    functions: tuple[ca.Function, ca.Function, ca.Function],
+    p: FloatArray,
+    nominal: FloatArray,
+    begin: Sequence[FloatArray],
+) -> list[FloatArray]:
+    """Return what the last of `_start_functions` gives, a column for each of p (np, m).
+
+    `begin` holds time, inputs, rates and memory deviations, in columns.
+    """
+    settle, rest, moving = functions
+    time, u, rates, deviation = begin
     gains = [model.parameter_names.index(c.gain) for c in model.effects if c.gain]
     without = p.copy()
     without[gains] = 0.0  # a saturating effect would lead Newton's method astray from far away
-    nominal = model.state_nominals()
-    now = np.array([time])
-    settled = np.zeros(len(structure.states))
-    for values in (without, p) if np.any(p[gains]) else (p,):
-        settled = _at_rest(settle, settled, (now, u, values, deviation), nominal)
-    x = settled
-    if any(s.memory and s.settles for s in structure.states):
-        x = _at_rest(rest, settled, (now, u, p, deviation, settled), nominal)
-    final, by_p, by_memory = Call(moving, (now, x, u, p, deviation, settled, w))()
-    return Start(final[:, 0], by_p, by_memory)
+    every = np.ones(p.shape[1], dtype=bool)
+    x = np.zeros(nominal.shape, order="F")
+    if np.any(p[gains]):
+        strong = np.any(p[gains] != 0.0, axis=0)
+        _to_rest(_Call(settle, time, x, u, without, deviation), x, nominal, strong)
+    _to_rest(_Call(settle, time, x, u, p, deviation), x, nominal, every)
+    settled = x.copy(order="F")
+    if any(s.memory and s.settles for s in model.structure.states):
+        _to_rest(_Call(rest, time, x, u, p, deviation, settled), x, nominal, every)
+    return _Call(moving, time, x, u, p, deviation, settled, rates)()
+
+
+class _Call:
+    """One function with dense results, evaluated in place for what its arguments hold now.
+
+    An ordinary call takes five times as long, most of it for its arguments. A call belongs to one
+    thread. Arguments are taken column by column, as CasADi has its numbers.
+    """
+
+    def __init__(self, function: ca.Function, *arguments: FloatArray) -> None:
+        self._buffer: Any
+        self._buffer, self._run = function.buffer()
+        self._arguments = [np.asfortranarray(a) for a in arguments]
+        shapes = [function.size_out(i) for i in range(function.n_out())]
+        self._results = [np.zeros(shape, order="F") for shape in shapes]
+        for i, argument in enumerate(self._arguments):
+            self._buffer.set_arg(i, argument.reshape(-1, order="F").data)
+        for i, result in enumerate(self._results):
+            self._buffer.set_res(i, result.reshape(-1, order="F").data)
+
+    def __call__(self) -> list[FloatArray]:
+        self._run()
+        return self._results
+
+
+def _to_rest(
+    newton: _Call, x: FloatArray, nominal: FloatArray, moves: npt.NDArray[np.bool_]
+) -> None:
+    """Follow Newton's method from each column of x that moves, in place, to where it ends."""
+    moves = moves.copy()
+    change = np.where(moves, np.inf, 0.0)
+    for _ in range(_NEWTON_STEPS):
+        new = newton()[0]
+        with np.errstate(invalid="ignore"):  # overflow ends in nan, which is no equilibrium
+            step = np.max(np.abs(new - x) / (np.abs(new) + nominal), axis=0, initial=0.0)
+        change[moves] = step[moves]
+        x[:, moves] = new[:, moves]
+        moves &= change > 1e-13
+        if not moves.any():
+            break
+    if not (change < 1e-9).all():
+        raise PsaError(
+            "The state at the start of the record has no equilibrium; the parameter values are the"
+            " likely cause: check them."
+        )
 
 
 def settling_time(model: Model) -> float:
@@ -126,63 +219,8 @@ def _fast_jacobian(structure: Structure) -> ca.Function:
     return ca.Function("fast", [s.time, s.x, s.u, s.p, deviation], [jacobian])
 
 
-def _at_rest(
-    newton: ca.Function, x: FloatArray, where: tuple[FloatArray, ...], nominal: FloatArray
-) -> FloatArray:
-    """Return where Newton's method leads from x; `where` is time and what comes behind x."""
-    x = x.copy()
-    step = Call(newton, (where[0], x, *where[1:]))
-    for _ in range(NEWTON_STEPS):
-        new = step()[0][:, 0]
-        with np.errstate(invalid="ignore"):  # overflow ends in nan, which is no equilibrium
-            change = np.max(np.abs(new - x) / (np.abs(new) + nominal), initial=0.0)
-        x[:] = new
-        if not change > 1e-13:
-            break
-    if not change < 1e-9:
-        raise no_equilibrium()
-    return x
-
-
-def no_equilibrium() -> PsaError:
-    """Return what is raised where Newton's method finds no rest."""
-    return PsaError(
-        "The state at the start of the record has no equilibrium; the parameter values are the"
-        " likely cause: check them."
-    )
-
-
-class Call:
-    """One function with dense results, evaluated in place: `results` follow from the `arguments`.
-
-    An ordinary call takes five times as long, most of it for its arguments. A call belongs to one
-    thread.
-    """
-
-    def __init__(self, function: ca.Function, arguments: Sequence[FloatArray]) -> None:
-        self._arguments = arguments
-        self._buffer: Any
-        self._buffer, self._run = function.buffer()
-        shapes = [function.size_out(i) for i in range(function.n_out())]
-        self.results = [np.zeros(shape, order="F") for shape in shapes]
-        for i, argument in enumerate(arguments):
-            self._buffer.set_arg(i, _memory(argument))
-        for i, result in enumerate(self.results):
-            self._buffer.set_res(i, _memory(result))
-
-    def __call__(self) -> list[FloatArray]:
-        """Evaluate for what the arguments hold now; return `results`."""
-        self._run()
-        return self.results
-
-
-def _memory(array: FloatArray) -> Any:
-    """Return the numbers of an array as CasADi takes them, column by column."""
-    return array.reshape(-1, order="F").data
-
-
 @cache
-def start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
+def _start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return a Newton step for all that settles, one for the states without memory, the motion."""
     s = structure
     memory = [i for i, state in enumerate(s.states) if state.memory]
@@ -216,6 +254,22 @@ def start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.
             [ca.densify(e) for e in (moving, *derivatives)],
         ),
     )
+
+
+@lru_cache(maxsize=64)
+def _functions_of_many(
+    structure: Structure, sets: int
+) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return the functions of `start_state` for so many columns, the last without derivatives."""
+    settle, rest, moving = (f.map(sets) for f in _without_derivatives(structure))
+    return settle, rest, moving
+
+
+@cache
+def _without_derivatives(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
+    settle, rest, moving = _start_functions(structure)
+    given = moving.sx_in()
+    return settle, rest, ca.Function("start", given, [moving.call(given)[0]])
 
 
 def _slopes(s: Structure) -> Expression:
@@ -288,99 +342,6 @@ def _in_motion(
     for k, i in enumerate(fast):
         parts[i] = parts[i] + lag[k]
     return ca.vertcat(*parts)
-
-
-#: Sets that one call of a function takes.
-_CHUNK = 1024
-
-
-def starts_on(
-    model: Model, p: FloatArray, nominal: FloatArray, t: FloatArray, u: FloatArray
-) -> FloatArray:
-    """Return initial states (nx, m) for parameters p (np, m) and inputs u (n, nu) at times t (n,).
-
-    `nominal` (nx, m) are the states' usual sizes. A column has the bits of `start_on` for a model
-    with these parameters, in a fraction of its time. Raises PsaError where a set has no
-    equilibrium.
-    """
-    structure = model.structure
-    if structure.foreign:
-        return np.tile([[s.start] for s in structure.states], p.shape[1])
-    rates = np.array([initial_slope(t, column) for column in u.T])
-    gains = [model.parameter_names.index(c.gain) for c in model.effects if c.gain]
-    x = np.empty((len(structure.states), p.shape[1]))
-    for first in range(0, p.shape[1], _CHUNK):
-        part = slice(first, first + _CHUNK)
-        begin = t[:1], u[0], rates
-        x[:, part] = _starts(structure, p[:, part], nominal[:, part], begin, gains)
-    return x
-
-
-def _starts(
-    structure: Structure,
-    p: FloatArray,
-    nominal: FloatArray,
-    begin: tuple[FloatArray, FloatArray, FloatArray],
-    gains: list[int],
-) -> FloatArray:
-    """Return what `start_state` does for every column: begin with time, inputs and their rates."""
-    sets = p.shape[1]
-    settle, rest, moving = _functions(structure, sets)
-    time, u, rates = (np.repeat(a[:, None], sets, axis=1) for a in begin)
-    deviation = np.zeros((len(memory_names(structure)), sets))
-    without = p.copy()
-    without[gains] = 0.0  # as there
-    every = np.ones(sets, dtype=bool)
-    x = np.zeros((len(structure.states), sets), order="F")
-    if np.any(p[gains]):
-        strong = np.any(p[gains] != 0.0, axis=0)
-        _to_rest(_call(settle, time, x, u, without, deviation), x, nominal, strong)
-    _to_rest(_call(settle, time, x, u, p, deviation), x, nominal, every)
-    settled = x.copy(order="F")
-    if any(s.memory and s.settles for s in structure.states):
-        _to_rest(_call(rest, time, x, u, p, deviation, settled), x, nominal, every)
-    return _call(moving, time, x, u, p, deviation, settled, rates)()[0]
-
-
-@lru_cache(maxsize=64)
-def _functions(structure: Structure, sets: int) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Return the functions of `start_state` for so many columns, the last without derivatives."""
-    settle, rest, moving = (f.map(sets) for f in _single(structure))
-    return settle, rest, moving
-
-
-@cache
-def _single(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
-    settle, rest, moving = start_functions(structure)
-    given = moving.sx_in()
-    return settle, rest, ca.Function("start", given, [moving.call(given)[0]])
-
-
-def _call(function: ca.Function, *given: FloatArray) -> Call:
-    """Return a call in place: column by column, as CasADi has its numbers."""
-    return Call(function, [np.asfortranarray(a) for a in given])
-
-
-def _to_rest(
-    newton: Call, x: FloatArray, nominal: FloatArray, moves: npt.NDArray[np.bool_]
-) -> None:
-    """Follow Newton's method from each column of x that moves, in place, to where it ends."""
-    moves = moves.copy()
-    change = np.where(moves, np.inf, 0.0)
-    for _ in range(NEWTON_STEPS):
-        new = newton()[0]
-        with np.errstate(invalid="ignore"):  # as in start.py
-            step = np.max(np.abs(new - x) / (np.abs(new) + nominal), axis=0, initial=0.0)
-        change[moves] = step[moves]
-        x[:, moves] = new[:, moves]
-        moves &= change > 1e-13
-        if not moves.any():
-            break
-    if not (change < 1e-9).all():
-        raise no_equilibrium()
-
-
-ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,7 +128,7 @@ def run(
     times that do not increase, or numbers that are not finite.
     """
     arrays = _arrays(model, values or model.values, (t, u, x0), unknowns, s0)
-    arrays["z0"] = _doubles(_sampled_starts(model) if z0 is None else z0)
+    arrays["z0"] = doubles(_sampled_starts(model) if z0 is None else z0)
     _check(model, arrays, hold)
     _check_instants(model, arrays)
     nx = len(model.state_names)
@@ -179,24 +179,25 @@ def _arrays(
     """Return the arrays that `_Run` points to, by the names of its fields."""
     n, nx, count = len(given[0]), len(model.state_names), len(unknowns)
     return {
-        **{name: _doubles(array) for name, array in zip(("t", "u", "x0"), given, strict=True)},
+        **{name: doubles(array) for name, array in zip(("t", "u", "x0"), given, strict=True)},
         "p": np.array([values[name] for name in model.parameter_names]),
         "nominal": model.state_nominals() if nx else np.ones(1),
         "x": np.empty((n, max(1, nx))),
         "z": np.empty((n, len(model.sampled_names))),
         "y": np.empty((n, len(model.output_names))),
-        "which": _which(model, unknowns),
-        "s0": _initial_sensitivities(nx, unknowns) if s0 is None else _doubles(s0),
+        "which": which_of(model, unknowns),
+        "s0": _initial_sensitivities(nx, unknowns) if s0 is None else doubles(s0),
         "dy": np.empty((n, count)),
         "work": np.empty((_STAGES + 3) * nx * max(count, 1)),
     }
 
 
-def _doubles(values: npt.ArrayLike) -> FloatArray:
+def doubles(values: npt.ArrayLike) -> FloatArray:
+    """Return numbers as C takes them."""
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def _which(model: Model, unknowns: Sequence[str | int]) -> npt.NDArray[np.int32]:
+def which_of(model: Model, unknowns: Sequence[str | int]) -> npt.NDArray[np.int32]:
     """Return the index of each unknown parameter, -1 for an initial value, shape (k,)."""
     names = model.parameter_names
     return np.array([names.index(q) if isinstance(q, str) else -1 for q in unknowns], np.int32)

@@ -20,6 +20,7 @@ from psa_casadi.simulation.compiler import fingerprint, generated_library, vecto
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
+from psa_casadi.simulation.stepper import doubles, which_of
 from psa_casadi.simulation.timings import count_run
 
 FloatArray = npt.NDArray[np.float64]
@@ -166,7 +167,6 @@ def run_exact(
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
     output: str = "measured_displacement",
-    values: Mapping[str, float] | None = None,
     everything: bool = False,
 ) -> ExactSteps:
     """Integrate a model over times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
@@ -180,14 +180,11 @@ def run_exact(
     if reason:
         raise NotExact(reason)
     n, nx, count = len(t), len(model.state_names), len(unknowns)
-    given = values or model.values
-    names = model.parameter_names
-    which = np.array([names.index(q) if isinstance(q, str) else -1 for q in unknowns], np.int32)
     start = np.zeros((nx, count)) if s0 is None else s0
     arrays: dict[str, npt.NDArray[Any]] = {
-        "p": np.array([given[name] for name in names]), "x0": _doubles(x0),
-        "nominal": model.error_sizes(), "shown": np.empty(n), "which": which,
-        "s0": _doubles(start), "dy": np.empty((n, count)),
+        "p": model.parameter_vector(), "x0": doubles(x0),
+        "nominal": model.error_sizes(), "shown": np.empty(n), "which": which_of(model, unknowns),
+        "s0": doubles(start), "dy": np.empty((n, count)),
     }  # fmt: skip
     if everything:
         arrays |= {"x": np.empty((n, nx)), "y": np.empty((n, len(model.output_names)))}
@@ -222,7 +219,7 @@ def run_sets(
         raise NotExact(reason)
     sets = p.shape[1]
     arrays: dict[str, npt.NDArray[Any]] = {
-        "p": _doubles(p), "x0": _doubles(x0), "nominal": _doubles(nominal),
+        "p": doubles(p), "x0": doubles(x0), "nominal": doubles(nominal),
         "shown": np.empty((len(t), sets)),
     }  # fmt: skip
     limit = MOST_IN_LANES * len(t)
@@ -242,7 +239,7 @@ def _run(
     count_run(differentiated=how["count"] > 0)
     lengths, which_step = time_steps(t)
     given: dict[str, npt.NDArray[Any]] = {
-        "t": _doubles(t), "v": _doubles(u), "length": lengths, "which_step": which_step,
+        "t": doubles(t), "v": doubles(u), "length": lengths, "which_step": which_step,
     }  # fmt: skip
     request = _Request(
         samples=len(t),
@@ -259,7 +256,3 @@ def _run(
     if status:
         raise NotExact(f"exact steps ended at t = {request.t_failed:.6g} s")
     return request.steps, request.rejected, request.forced
-
-
-def _doubles(values: npt.ArrayLike) -> FloatArray:
-    return np.ascontiguousarray(values, dtype=np.float64)
