@@ -8,7 +8,7 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.simulation.device import run as device
+from psa_casadi.simulation import device
 from tests.benchmarks import ensembles
 from tests.benchmarks.ensembles import (
     Case,

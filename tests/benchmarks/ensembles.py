@@ -27,7 +27,7 @@ from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.reference import from_samples, simulate
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from psa_casadi.simulation.device import run as device
+from psa_casadi.simulation import device
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.start import start_on
