@@ -102,33 +102,17 @@ def other_library(path: Path) -> None:
 
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "empty": lambda p: rewrite(p, b""),
-    "one byte": cut(1),
     "the header only": cut(64),
-    "half": cut(0.5),
-    "without the last byte": cut(-1),
-    "zeros": lambda p: rewrite(p, bytes(p.stat().st_size)),
-    "first page zeros": lambda p: rewrite(p, bytes(4096) + p.read_bytes()[4096:]),
-    "a bit of the header": flip(0.001),
     "a bit in the middle": flip(0.5),
-    "the last bit": flip(1.0),
-    "longer": lambda p: rewrite(p, p.read_bytes() + b"\0"),
     "text": lambda p: rewrite(p, b"not a library\n"),
     "another library": other_library,
     "gone": lambda p: p.unlink(),
-    "a folder": replaced_by(lambda p: p.mkdir()),
     "a folder with a file": replaced_by(full_folder),
     "a link to another library": replaced_by(lambda p: p.symlink_to(library(7))),
-    "a dangling link": replaced_by(lambda p: p.symlink_to("nowhere")),
-    "a link to itself": replaced_by(lambda p: p.symlink_to(p)),
     "a pipe": replaced_by(os.mkfifo),
-    "unreadable": lambda p: p.chmod(0),
     "others may write": lambda p: p.chmod(0o666),
     "no checksum": lambda p: checksum(p).unlink(),
-    "wrong checksum": lambda p: rewrite(checksum(p), b"0" * 64),
-    "empty checksum": lambda p: rewrite(checksum(p), b""),
     "binary checksum": lambda p: rewrite(checksum(p), b"\xff\0" * 32),
-    "a folder as checksum": lambda p: replaced_by(full_folder)(checksum(p)),
-    "a dangling link as checksum": lambda p: replaced_by(lambda c: c.symlink_to("x"))(checksum(p)),
 }
 
 
@@ -139,8 +123,7 @@ def test_a_damaged_library_is_made_again(damage: str, calls: list[Path]) -> None
     DAMAGES[damage](path)
     calls.clear()
     assert library() == path
-    reads_all = damage == "unreadable" and os.geteuid() == 0
-    assert len(calls) == (0 if reads_all else 1)
+    assert len(calls) == 1
     assert value(path) == 42
     library()
     assert len(calls) <= 1
@@ -162,7 +145,7 @@ def test_a_damaged_binary_is_not_exported(
     linux = PLATFORMS["x86_64-linux"]
     whole = compile_library({"model.c": ""}, "psa", linux)
     kept = next((cache.cache_directory() / "binaries").glob("*.so"))
-    for damage in ("half", "empty", "zeros", "a bit in the middle", "text"):
+    for damage in ("the header only", "empty", "a bit in the middle", "text"):
         DAMAGES[damage](kept)
         assert compile_library({"model.c": ""}, "psa", linux) == whole, damage
     assert not calls

@@ -12,10 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.scratch import PREFIX, temporary_folder
-from psa_casadi.simulation import compiler
+from psa_casadi.scratch import PREFIX
 from tests.record_files import HEADER, write
-from tests.tiers import slow
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells and signals of POSIX")
 PSA = [sys.executable, "-m", "psa_casadi.cli"]
@@ -81,19 +79,3 @@ def test_a_command_that_is_told_to_end_leaves_nothing(name: str, tmp_path: Path)
                 break
             time.sleep(0.01)
         assert not runs(child)
-
-
-@slow
-@posix
-def test_what_a_killed_command_left_goes_with_the_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with compiling(tmp_path) as (command, child):
-        command.kill()
-        command.wait(10)
-        assert left_over(tmp_path)
-        os.kill(child, signal.SIGKILL)
-    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
-    with temporary_folder(tmp_path / "tmp"):  # as every command makes one
-        compiler.shared_library({"a.c": "int a;"}, ())
-    assert not left_over(tmp_path)

@@ -167,6 +167,7 @@ COMPILERS = {
     "nothing-of-this-name": r"The C compiler nothing-of-this-name cannot be started .*unset",
     "/": r"The C compiler / cannot be started \(Permission denied\)",
     "cc '": r"CC is \"cc '\", which is no command",
+    "false": r"(?s)C compiler failed \(false .*Set CC",
     "true": r"The C compiler true wrote no library; set CC",
     "sh -c 'kill -9 $$'": r"failed .*killed by signal 9; too little memory",
 }

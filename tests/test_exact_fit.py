@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from psa_casadi.identification.certainty.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
-from psa_casadi.identification.fitting.prediction import measured, simulated
+from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.search.multistart import free_parameters
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record, multisine, time_grid
@@ -87,34 +87,11 @@ def test_a_quiet_record_is_simulated_as_finely_as_it_needs(sigma: float) -> None
     assert np.sqrt(np.mean(gap**2)) <= 3.0 * limit
 
 
-def test_a_coarse_way_is_refused() -> None:
-    """Where a run at 1e-5 misses by more than 3 % of the noise, the fit has gone on finer."""
-    experiments = [whole(regular(1e-9))]
-    coarse = fitted(experiments, 1e-9, rtol=1e-5)
-    limit = allowed(experiments[0], 1e-9)
-    told = simulated(coarse.model, experiments, coarse.unknowns, coarse.theta, way=Way(1e-5, 1e-5))[
-        0
-    ]
-    if told.error > limit:
-        assert coarse.way.stepped or coarse.way.rtol < 1e-5
-    assert coarse.simulated[0].way == STEPPER or coarse.simulated[0].error <= limit
-
-
 def jittered(sigma: float, seed: int = 1) -> Record:
     """Return the record at instants that are off by a thousandth of a sample."""
     shift = 1e-3 * STEP * np.random.default_rng(5).standard_normal(SAMPLES)
     shift[0] = 0.0
     return record_at(time_grid(STEP * SAMPLES, STEP) + shift, sigma, seed)
-
-
-def test_a_stepped_record_is_as_accurate() -> None:
-    """Noise of 1e-9 m is 5e-5 of the range."""
-    experiments = [whole(jittered(1e-9, 2))]
-    found = fitted(experiments, 1e-9)
-    assert found.simulated[0].way == STEPPER
-    fine = simulated_by(found, experiments, Way(1e-11, 1e-11, stepped=True))
-    gap = found.predicted(experiments)[0] - fine
-    assert np.sqrt(np.mean(gap**2)) <= 3.0 * allowed(experiments[0], 1e-9)
 
 
 def test_both_ways_find_the_same_values() -> None:
@@ -124,19 +101,3 @@ def test_both_ways_find_the_same_values() -> None:
     assert [f.converged for f in found] == [True, True]
     spread = standard_errors(found[0], [whole(even)])
     assert np.all(np.abs(found[0].theta - found[1].theta) <= 0.5 * spread)
-
-
-def test_one_record_fits_the_same_on_both_ways(monkeypatch: pytest.MonkeyPatch) -> None:
-    experiments = [whole(regular())]
-    exact = fitted(experiments, SIGMA)
-
-    def refuse(*_: object) -> str:
-        return "not wanted"
-
-    monkeypatch.setattr("psa_casadi.simulation.exact.run.why_not", refuse)
-    by_stepper = fitted(experiments, SIGMA)
-    assert exact.simulated[0].way == EXACT
-    assert by_stepper.simulated[0].way == STEPPER
-    spread = standard_errors(exact, experiments)
-    assert np.all(np.abs(exact.theta - by_stepper.theta) <= 0.5 * spread)
-    assert by_stepper.cost == pytest.approx(exact.cost, abs=1.0)

@@ -24,8 +24,6 @@ NAMES = ("base", *EFFECTS)
 SAMPLES, STEP = 240, 2e-4
 #: What a run at 1e-8 may be off, over the largest value of a column; delta's own jumps.
 ALLOWED, OF_DELTA = 2e-3, 1e-2
-#: What a difference over a step of 3e-4 may be off itself (ageing_time: 2.9e-3).
-OF_DIFFERENCES = 5e-3
 
 
 def unknowns_of(name: str, model: Model) -> list[str | int]:
@@ -76,58 +74,6 @@ def test_derivatives_are_the_stepper_s(name: str) -> None:
     gaps = {q: off(found[:, k], own[:, k]) for k, q in enumerate(unknowns)}
     for unknown, gap in gaps.items():
         assert gap < (OF_DELTA if unknown == "delta" else ALLOWED), unknown
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES[::4])
-def test_derivatives_are_differences_of_the_stepper(name: str) -> None:
-    """Central differences of two runs at 1e-11, for parameters and initial values.
-
-    Every fourth effect: all are compared with the stepper's own above, which are differences of
-    runs in `tests/test_claims.py`.
-    """
-    model = with_effect(name)
-    t, u, x0 = record(model)
-    unknowns, found, _ = columns(name, 1e-8)
-    shown = model.output_names.index(OUTPUT)
-    for column, unknown in enumerate(unknowns):
-        ends = []
-        if isinstance(unknown, int):
-            step = 1e-4 * float(model.state_nominals()[unknown])
-            for sign in (1.0, -1.0):
-                moved = x0.copy()
-                moved[unknown] += sign * step
-                ends.append(run(model, t, u, moved, rtol=1e-11).y[:, shown])
-        else:
-            share = 1e-6 if name != "base" and unknown == EFFECTS[name].tone else 3e-4
-            step = share * model.parameter(unknown).typical(model.values)
-            for sign in (1.0, -1.0):
-                values = {**model.values, unknown: model.values[unknown] + sign * step}
-                ends.append(run(model, t, u, x0, rtol=1e-11, values=values).y[:, shown])
-        if np.abs(ends[0] - ends[1]).max() < 1e-9 * np.ptp(ends[0]):
-            assert np.abs(found[:, column] * step).max() < 1e-9 * np.ptp(ends[0]), unknown
-            continue  # it does nothing here, or only to the noise of two runs
-        gap = off(found[:, column], (ends[0] - ends[1]) / (2 * step))
-        assert gap < (OF_DELTA if unknown == "delta" else OF_DIFFERENCES), unknown
-
-
-@pytest.mark.parametrize("name", ["base", "backlash", "load_stiffness", "voltage_saturation"])
-def test_derivatives_at_the_tolerance_of_fits(name: str) -> None:
-    unknowns, found, own = columns(name, 1e-6)
-    gaps = {q: off(found[:, k], own[:, k]) for k, q in enumerate(unknowns)}
-    assert all(gap < 2e-2 for gap in gaps.values()), gaps
-
-
-def test_the_run_itself_does_not_depend_on_its_derivatives() -> None:
-    model = with_effect("backlash")
-    t, u, x0 = record(model)
-    unknowns: list[str | int] = ["k_L", 1]
-    plain = run_exact(model, t, u, x0, tolerance=1e-6)
-    with_them = run_exact(
-        model, t, u, x0, tolerance=1e-6, unknowns=unknowns, s0=initial(model, unknowns)
-    )
-    np.testing.assert_array_equal(plain.shown, with_them.shown)
-    assert plain.sensitivity is None
 
 
 def test_a_column_does_not_depend_on_the_others() -> None:

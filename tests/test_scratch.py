@@ -12,7 +12,7 @@ import pytest
 from psa_casadi import scratch
 from psa_casadi.children import run_child
 from psa_casadi.files import atomic_write
-from psa_casadi.scratch import abandon, sweep, temporary_file, temporary_folder
+from psa_casadi.scratch import sweep, temporary_file, temporary_folder
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and locks of POSIX")
 
@@ -70,12 +70,6 @@ def test_a_process_never_sweeps_its_own(tmp_path: Path) -> None:
         assert file.suffix == ".fmu"
         assert swept_again(tmp_path) == sorted([folder.name, file.name])
     assert not os.listdir(tmp_path)
-
-
-def test_a_link_that_looks_like_a_leftover_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "precious").mkdir()
-    (tmp_path / f"{scratch.PREFIX}12345678").symlink_to(tmp_path / "precious")
-    assert len(swept_again(tmp_path)) == 2
 
 
 def test_without_locks_only_what_is_old_goes(
@@ -220,18 +214,6 @@ def ended(pid: int) -> bool:
             return True
         time.sleep(0.01)
     return False
-
-
-def test_to_abandon_removes_everything_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(scratch, "_MADE", set())
-    with temporary_folder(tmp_path) as folder, temporary_file(tmp_path, "a.csv") as file:
-        (folder / "deep" / "deeper").mkdir(parents=True)
-        file.write_text("half")
-        abandon()
-        assert not os.listdir(tmp_path)
-    assert not scratch._MADE
 
 
 @posix

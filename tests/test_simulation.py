@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from psa_casadi.components import BASE
 from psa_casadi.components.stack import DRIVE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError, MachineError
+from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.model.structure import structure_of
@@ -218,19 +218,6 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return made
 
 
-def test_a_library_is_compiled_once(tmp_path: Path, calls: list[list[str]]) -> None:
-    first, second = (
-        compiler.shared_library(generate_c(compose(p).structure, sensitivities=True), SOURCES)
-        for p in (BASE, BASE)
-    )
-    assert first == second
-    assert len(calls) == 1
-    other = generate_c(compose(BASE[:2]).structure, sensitivities=True)
-    assert compiler.shared_library(other, SOURCES) != first
-    assert len(calls) == 2
-    assert len(list((tmp_path / "models").glob("*.so"))) == 2
-
-
 def test_threads_that_want_one_model_compile_it_once(calls: list[list[str]]) -> None:
     both, text = threading.Barrier(2), generate_c(compose(BASE).structure, sensitivities=True)
 
@@ -242,16 +229,6 @@ def test_threads_that_want_one_model_compile_it_once(calls: list[list[str]]) -> 
         first, second = (job.result() for job in [pool.submit(wanted) for _ in range(2)])
     assert first == second
     assert len(calls) == 1
-
-
-def test_a_broken_compiler_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
-    monkeypatch.setenv("CC", "false")
-    with pytest.raises(MachineError, match=r"(?s)C compiler failed \(false .*Set CC"):
-        compiler.shared_library(
-            generate_c(compose((DRIVE,)).structure, sensitivities=True), SOURCES
-        )
-    assert not list(tmp_path.rglob("*.so"))
 
 
 def test_a_fingerprint_differs_where_the_generated_text_does() -> None:
