@@ -17,8 +17,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from psa_casadi.files import replace_durably
-from psa_casadi.scratch import sweep, temporary_folder
+from psa_casadi.files import replace_durably, sweep, temporary_folder
 
 #: Environment variable that names another folder.
 VARIABLE = "PSA_CASADI_CACHE"

@@ -9,7 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
     os.environ.setdefault("PSA_CASADI_THREADS", "1")
 # a model runs for a few hundredths of a second here, and compiles in half the time with this; the
-# bits are the same (`test_exact_bits`). zig's -Og means other checks in the code.
+# bits are the same (`test_exact`). zig's -Og means other checks in the code.
 if shutil.which("cc") and "CC" not in os.environ:
     os.environ.setdefault("PSA_CASADI_CFLAGS", "-Og")
 # hundreds of Python processes are started, and each would compile the package again

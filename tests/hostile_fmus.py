@@ -7,7 +7,7 @@ from pathlib import Path
 import fmpy
 
 from psa_casadi.export.check.binaries import FUNCTIONS
-from psa_casadi.scratch import temporary_folder
+from psa_casadi.files import temporary_folder
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
 
 #: What the library does, and when: "MOMENT:DEED" in this variable; MOMENT is load, make or step.

@@ -22,7 +22,7 @@ from psa_casadi.export.importer.archive import unpack
 from psa_casadi.export.importer.fmu import CO_SIMULATION, FloatArray, Fmu, FmuError, Instance
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.drawing import OUTSIDE, Port, Wire
-from psa_casadi.scratch import temporary_folder
+from psa_casadi.files import temporary_folder
 
 #: Multiple of a port's nominal size beyond which a co-simulation counts as blown up.
 _BEYOND = 1e3

@@ -1,15 +1,21 @@
 """Which C compiler is used, and what is said where there is none."""
 
+import ctypes
+import errno
+import logging
+import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
+from psa_casadi import cache, files
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
 from psa_casadi.export.fmu.platforms import host_platform as host
+from psa_casadi.files import replace_durably
 from psa_casadi.simulation import compiler
 
 ZIG = [sys.executable, "-m", "ziglang", "cc"]
@@ -110,3 +116,278 @@ def test_without_zig_the_host_is_compiled_by_its_own_compiler(
     assert compile_library({"model.c": "int a;"}, "psa", host()) == b"binary"
     assert commands[0][0] == "own-cc"
     assert "-target" not in commands[0]
+
+
+SEEN = '__attribute__((visibility("default")))'
+posix = pytest.mark.skipif(sys.platform == "win32", reason="owners and permissions of POSIX")
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Folders that the compiler was run in; the caches, kept and private, are new."""
+    made: list[Path] = []
+    run_it = compiler.run_compiler
+
+    def counted(command: list[str], directory: Path) -> None:
+        made.append(directory)
+        run_it(command, directory)
+
+    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiler, "run_compiler", counted)
+    monkeypatch.setattr(cache, "_REFUSED", set())
+    monkeypatch.setattr(cache, "_private", lambda: tmp_path / "private")
+    (tmp_path / "private").mkdir(mode=0o700)
+    return made
+
+
+def library(number: int = 42) -> Path:
+    """Return a library with a function f() that returns the number."""
+    text = f"{SEEN} double f(void) {{ return {number}; }}"
+    return compiler.shared_library({"a.c": text}, ())
+
+
+def value(path: Path) -> float:
+    loaded = ctypes.CDLL(str(path))
+    loaded.f.restype = ctypes.c_double
+    return float(loaded.f())
+
+
+def checksum(path: Path) -> Path:
+    return path.with_name(path.name + ".sha256")
+
+
+def rewrite(path: Path, content: bytes) -> None:
+    """Write another file of the name; the one that is loaded in this process stays."""
+    path.unlink()
+    path.write_bytes(content)
+    path.chmod(0o700)
+
+
+def cut(length: float) -> Callable[[Path], None]:
+    """Return what keeps so many bytes of a file, or this part of it, or all but so many."""
+
+    def damage(path: Path) -> None:
+        content = path.read_bytes()
+        rewrite(path, content[: int(length if abs(length) >= 1 else length * len(content))])
+
+    return damage
+
+
+def flip(place: float) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        content = bytearray(path.read_bytes())
+        content[int(place * (len(content) - 1))] ^= 1
+        rewrite(path, bytes(content))
+
+    return damage
+
+
+def replaced_by(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        path.unlink()
+        make(path)
+
+    return damage
+
+
+def full_folder(path: Path) -> None:
+    path.mkdir()
+    (path / "inside").write_text("text")
+
+
+def other_library(path: Path) -> None:
+    """With its own checksum, as if the files had been renamed."""
+    other = library(7)
+    rewrite(path, other.read_bytes())
+    rewrite(checksum(path), checksum(other).read_bytes())
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "empty": lambda p: rewrite(p, b""),
+    "the header only": cut(64),
+    "a bit in the middle": flip(0.5),
+    "text": lambda p: rewrite(p, b"not a library\n"),
+    "another library": other_library,
+    "gone": lambda p: p.unlink(),
+    "a folder with a file": replaced_by(full_folder),
+    "a link to another library": replaced_by(lambda p: p.symlink_to(library(7))),
+    "a pipe": replaced_by(os.mkfifo),
+    "others may write": lambda p: p.chmod(0o666),
+    "no checksum": lambda p: checksum(p).unlink(),
+    "binary checksum": lambda p: rewrite(checksum(p), b"\xff\0" * 32),
+}
+
+
+@posix
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_library_is_made_again(damage: str, calls: list[Path]) -> None:
+    path = library()
+    DAMAGES[damage](path)
+    calls.clear()
+    assert library() == path
+    assert len(calls) == 1
+    assert value(path) == 42
+    library()
+    assert len(calls) <= 1
+    assert sorted(p.name for p in path.parent.iterdir() if p.name.startswith(path.name)) == [
+        path.name,
+        checksum(path).name,
+    ]
+    assert path.parent.stat().st_mode & 0o777 == 0o700
+
+
+@posix
+def test_a_damaged_binary_is_not_exported(
+    calls: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compiled(command: list[str], directory: Path) -> None:
+        (directory / command[-1]).write_bytes(b"binary" * 2000)
+
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", compiled)
+    linux = PLATFORMS["x86_64-linux"]
+    whole = compile_library({"model.c": ""}, "psa", linux)
+    kept = next((cache.cache_directory() / "binaries").glob("*.so"))
+    for damage in ("the header only", "empty", "a bit in the middle", "text"):
+        DAMAGES[damage](kept)
+        assert compile_library({"model.c": ""}, "psa", linux) == whole, damage
+    assert not calls
+
+
+@posix
+def test_what_killed_runs_left_in_the_cache_goes(calls: list[Path]) -> None:
+    room = cache.cache_directory() / "models"
+    (room / f"{files.PREFIX}0123abcd").mkdir(parents=True)
+    (room / f"{files.PREFIX}0123abcd" / "model.c").write_text("half")
+    (room / f"{files.PREFIX}89abcdef-x.so").write_text("half")
+    room.chmod(0o700)
+    path = library()
+    assert sorted(room.iterdir()) == sorted([path, checksum(path)])
+    assert len(calls) == 1
+
+
+def _file(place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text("")
+
+
+def _shared(place: Path) -> None:
+    place.mkdir(parents=True)
+    place.chmod(0o777)
+
+
+def _stranger(place: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can give a file away")
+    place.mkdir(parents=True)
+    os.chown(place, 12345, -1)
+
+
+def _dangling(place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.symlink_to("nowhere/at/all")
+
+
+UNUSABLE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "a file": (_file, "File exists|Not a directory"),
+    "others may write": (_shared, "others may write"),
+    "of another user": (_stranger, "another user"),
+    "a dangling link": (_dangling, "No such file|File exists"),
+}
+
+
+@posix
+@pytest.mark.parametrize("level", ["cache", "models"])
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_a_cache_that_cannot_be_trusted_is_left_alone(
+    case: str, level: str, tmp_path: Path, calls: list[Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    if (case, level) == ("a dangling link", "cache"):
+        pytest.skip("the folder that the link names is made")
+    wanted = tmp_path / "cache"
+    make, said = UNUSABLE[case]
+    make(wanted if level == "cache" else wanted / "models")
+    with caplog.at_level(logging.WARNING, "psa_casadi"):
+        first, second = library(), library(7)
+        assert library() == first
+    assert [value(first), value(second)] == [42, 7]
+    assert len(calls) == 2
+    assert first.is_relative_to(tmp_path / "private")
+    assert len(caplog.records) == 1, caplog.text
+    assert caplog.records[0].getMessage().startswith("The cache folder ")
+    assert any(word in caplog.text for word in said.split("|")), caplog.text
+
+
+@posix
+def test_a_library_of_another_user_is_not_loaded(calls: list[Path]) -> None:
+    path = library()
+    _ = os.geteuid() == 0 or pytest.skip("only root can give a file away")
+    for file in (path, checksum(path)):
+        os.chown(file, 12345, -1)
+        calls.clear()
+        assert library() == path
+        assert len(calls) == 1
+        assert {path.stat().st_uid, checksum(path).stat().st_uid} == {0}
+
+
+@posix
+def test_a_shared_place_where_all_keep_their_own_is_used(tmp_path: Path, calls: list[Path]) -> None:
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache").chmod(0o1777)  # as /tmp is
+    assert library().is_relative_to(tmp_path / "cache")
+    assert len(calls) == 1
+
+
+@posix
+def test_a_full_disk_is_tried_once(
+    tmp_path: Path, calls: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(source: Path, target: Path) -> None:
+        if target.is_relative_to(tmp_path / "cache"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace_durably(source, target)
+
+    monkeypatch.setattr("psa_casadi.cache.replace_durably", full)
+    assert [value(library(n)) for n in (1, 2, 3)] == [1, 2, 3]
+    assert len(calls) == 4
+    assert not list((tmp_path / "cache" / "models").iterdir())
+
+
+def test_a_folder_that_lets_no_program_run_is_told(
+    tmp_path: Path, calls: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load, noexec = ctypes.CDLL, [tmp_path / "cache"]
+
+    def refused(name: str) -> ctypes.CDLL:
+        if any(Path(name).is_relative_to(folder) for folder in noexec):
+            raise OSError(f"{name}: failed to map segment from shared object")
+        return load(name)
+
+    monkeypatch.setattr("ctypes.CDLL", refused)
+    assert library().is_relative_to(tmp_path / "private")
+    assert len(calls) == 2
+    noexec.append(tmp_path)
+    with pytest.raises(MachineError, match=r"cannot be loaded .*noexec.*set PSA_CASADI_CACHE"):
+        library()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the rules of the desktop's specification")
+@pytest.mark.parametrize("given", ["", "relative/path", "."])
+def test_an_empty_or_relative_cache_variable_counts_as_unset(
+    given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PSA_CASADI_CACHE", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", given)
+    assert cache.cache_directory() == tmp_path / ".cache" / "psa_casadi"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache.cache_directory() == tmp_path / "xdg" / "psa_casadi"
+
+
+def test_a_user_without_a_home_has_a_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("PSA_CASADI_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert cache.writable_room("zig").is_dir()

@@ -16,10 +16,9 @@ from psa_casadi.cli.app import app
 from psa_casadi.cli.failures import guarded
 from psa_casadi.components import BASE
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.files import PREFIX, atomic_path, atomic_write
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps
-from psa_casadi.scratch import PREFIX
 from psa_casadi.simulation import compiler
 from tests.record_files import HEADER, ROWS, write
 from tests.tiers import slow

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.certainty.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
@@ -13,7 +14,11 @@ from psa_casadi.identification.search.multistart import free_parameters
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
+from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.simulate import EXACT, STEPPER, Way, simulate
+from psa_casadi.simulation.start import start_on
+from psa_casadi.simulation.stepper import run
+from tests.exact_cases import OUTPUT, composite, inputs, times, with_effect
 from tests.test_fit import model_with
 
 FloatArray = NDArray[np.float64]
@@ -101,3 +106,77 @@ def test_both_ways_find_the_same_values() -> None:
     assert [f.converged for f in found] == [True, True]
     spread = standard_errors(found[0], [whole(even)])
     assert np.all(np.abs(found[0].theta - found[1].theta) <= 0.5 * spread)
+
+
+BASE_UNKNOWNS = ("R_s", "C_p", "k_L", "A", "beta", "gamma", "delta", "n", "tau", "k_P", "c_B")
+NAMES = ("base", *EFFECTS)
+DERIVED_SAMPLES, DERIVED_STEP = 240, 2e-4
+#: What a run at 1e-8 may be off, over the largest value of a column; delta's own jumps.
+ALLOWED, OF_DELTA = 2e-3, 1e-2
+
+
+def unknowns_of(name: str, model: Model) -> list[str | int]:
+    """Return the effect's own parameters, some of the base, and initial states."""
+    own = [] if name == "base" else [p.name for p in EFFECTS[name].parameters]
+    memories = [s.name for s in model.structure.states if s.memory]
+    starts = [model.state_names.index(n) for n in (*memories, "f_out")]
+    return [*own, *BASE_UNKNOWNS, *starts]
+
+
+def derived_record(model: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
+    t = times(DERIVED_SAMPLES, DERIVED_STEP)
+    u = inputs(model, t, composite(DERIVED_SAMPLES))
+    return t, u, start_on(model, t, u).x
+
+
+def initial(model: Model, unknowns: list[str | int]) -> FloatArray:
+    s0 = np.zeros((len(model.state_names), len(unknowns)))
+    for column, unknown in enumerate(unknowns):
+        if isinstance(unknown, int):
+            s0[unknown, column] = 1.0
+    return s0
+
+
+def columns(name: str, tolerance: float) -> tuple[list[str | int], FloatArray, FloatArray]:
+    """Return the unknowns, the derivatives of exact steps, and those of the stepper at 1e-12."""
+    model = with_effect(name)
+    t, u, x0 = derived_record(model)
+    unknowns = unknowns_of(name, model)
+    s0 = initial(model, unknowns)
+    found = run_exact(model, t, u, x0, tolerance=tolerance, unknowns=unknowns, s0=s0)
+    own = run(model, t, u, x0, rtol=1e-12, unknowns=unknowns, s0=s0, output=OUTPUT)
+    assert found.sensitivity is not None
+    assert own.sensitivity is not None
+    return unknowns, found.sensitivity, own.sensitivity
+
+
+def off(found: FloatArray, true: FloatArray) -> float:
+    """Return the largest difference over the column's largest value; 0 for columns of zeros."""
+    size = float(np.abs(true).max())
+    gap = float(np.abs(found - true).max())
+    return gap / size if size > 0.0 else gap
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_derivatives_are_the_stepper_s(name: str) -> None:
+    unknowns, found, own = columns(name, 1e-8)
+    gaps = {q: off(found[:, k], own[:, k]) for k, q in enumerate(unknowns)}
+    for unknown, gap in gaps.items():
+        assert gap < (OF_DELTA if unknown == "delta" else ALLOWED), unknown
+
+
+def test_a_column_does_not_depend_on_the_others() -> None:
+    """Columns stand side by side in vectors of four."""
+    model = with_effect("load_stiffness")
+    t, u, x0 = derived_record(model)
+    many: list[str | int] = ["k_L", "A", "tau", "k_P", "load_gain", "c_B", 6]
+
+    def derivatives(unknowns: list[str | int]) -> FloatArray:
+        s0 = initial(model, unknowns)
+        found = run_exact(model, t, u, x0, tolerance=1e-6, unknowns=unknowns, s0=s0).sensitivity
+        assert found is not None
+        return found
+
+    together = derivatives(many)
+    for column, unknown in enumerate(many):
+        np.testing.assert_array_equal(derivatives([unknown])[:, 0], together[:, column])

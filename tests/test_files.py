@@ -1,11 +1,30 @@
+"""Files are written whole, and what a process makes for itself goes with it, however it ends."""
+
 import os
+import signal
 import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from psa_casadi import files
+from psa_casadi.children import run_child
 from psa_casadi.errors import InputError, Problems, PsaError
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.files import (
+    PREFIX,
+    atomic_path,
+    atomic_write,
+    sweep,
+    temporary_file,
+    temporary_folder,
+)
+from tests.record_files import HEADER, write
 
 
 def test_text_and_bytes_are_written_as_given(tmp_path: Path) -> None:
@@ -90,3 +109,287 @@ def test_problems_beyond_the_limit_are_counted() -> None:
     with pytest.raises(InputError) as caught:
         problems.raise_if_any()
     assert caught.value.problems == ("mistake 0.", "mistake 1.", "... and 13 more")
+
+
+posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and locks of POSIX")
+
+#: Makes a folder and a half-written file in a place, tells so, and waits to be killed.
+HOLDS = """
+import pathlib, sys, time
+from psa_casadi.files import temporary_file, temporary_folder
+place = pathlib.Path(sys.argv[1])
+with temporary_folder(place) as folder, temporary_file(place, "model.json") as file:
+    (folder / "inner").mkdir()
+    (folder / "inner" / "a.o").write_text("half")
+    file.write_text("half")
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+def holder(place: Path) -> "subprocess.Popen[str]":
+    child = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(place)], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "ready\n"
+    return child
+
+
+def swept_again(place: Path) -> list[str]:
+    files._SWEPT.discard(place)
+    sweep(place)
+    return sorted(os.listdir(place))
+
+
+@posix
+def test_what_a_killed_process_left_goes_and_what_a_live_one_holds_stays(tmp_path: Path) -> None:
+    dead, alive = holder(tmp_path), holder(tmp_path)
+    (tmp_path / "model.json").write_text("old")
+    dead.kill()
+    dead.communicate()
+    assert len(os.listdir(tmp_path)) == 5
+    kept = swept_again(tmp_path)
+    assert len(kept) == 3
+    assert swept_again(tmp_path) == kept
+    alive.kill()
+    alive.communicate()
+    files._SWEPT.discard(tmp_path)
+    atomic_write(tmp_path / "other.json", "new")
+    assert sorted(os.listdir(tmp_path)) == ["model.json", "other.json"]
+    assert (tmp_path / "model.json").read_text() == "old"
+
+
+@posix
+def test_a_process_never_sweeps_its_own(tmp_path: Path) -> None:
+    with temporary_folder(tmp_path) as folder, temporary_file(tmp_path, "x.fmu") as file:
+        assert folder.stat().st_mode & 0o777 == 0o700
+        assert file.suffix == ".fmu"
+        assert swept_again(tmp_path) == sorted([folder.name, file.name])
+    assert not os.listdir(tmp_path)
+
+
+def test_without_locks_only_what_is_old_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_lock", lambda path: None)
+    old, new = (tmp_path / f"{files.PREFIX}{name}" for name in ("old", "new"))
+    old.mkdir()
+    new.mkdir()
+    week = time.time() - 8 * 86400
+    os.utime(old, (week, week))
+    assert swept_again(tmp_path) == [new.name]
+
+
+@posix
+def test_a_folder_that_a_sweeper_took_before_it_was_locked_is_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = files._lock
+    taken: list[Path] = []
+
+    def slow(path: Path) -> int | None:
+        if not taken:
+            taken.append(path)
+            path.rmdir()
+        return lock(path)
+
+    monkeypatch.setattr(files, "_lock", slow)
+    with temporary_folder(tmp_path) as folder:
+        assert folder.is_dir()
+        assert folder != taken[0]
+
+
+@posix
+def test_a_child_that_is_not_waited_for_dies_with_its_children(tmp_path: Path) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupted)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        with pytest.raises(KeyboardInterrupt):
+            run_child(
+                ["sh", "-c", "sleep 60 & echo $! > pid; wait"],
+                directory=tmp_path,
+                environment=os.environ,
+            )
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert ended(int((tmp_path / "pid").read_text()))
+
+
+#: Reads an HDF5 file by an interpreter that notes its number and never ends.
+READS = """
+import sys
+from psa_casadi.cli.surroundings import prepare
+from psa_casadi.records import read_record
+prepare()
+sys.executable = sys.argv[1]
+read_record(sys.argv[2])
+"""
+
+
+@posix
+def test_a_request_to_end_ends_the_python_that_reads_a_file_too(tmp_path: Path) -> None:
+    interpreter, note = tmp_path / "python", tmp_path / "pid"
+    interpreter.write_text(
+        f"#!/bin/sh\nsleep 60 & echo $! > {note}.new; mv {note}.new {note}; wait\n"
+    )
+    interpreter.chmod(0o755)
+    (tmp_path / "f.mat").write_bytes(b"nothing")
+    reading = subprocess.Popen(
+        [sys.executable, "-c", READS, str(interpreter), str(tmp_path / "f.mat")],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )
+    while reading.poll() is None and not note.exists():
+        time.sleep(0.01)
+    reading.terminate()
+    assert reading.wait(10) == 128 + signal.SIGTERM
+    assert ended(int(note.read_text()))
+    assert sorted(os.listdir(tmp_path)) == ["f.mat", "pid", "python"]
+
+
+#: Is told to end when its child runs, and `Popen` has not come back with it yet.
+STARTS = """
+import os, subprocess, sys
+from psa_casadi.children import started
+from psa_casadi.files import answer_requests_to_end
+popen = subprocess.Popen
+def told(*given, **options):
+    child = popen(*given, **options)
+    print(child.pid, flush=True)
+    os.kill(os.getpid(), 15)
+    return child
+subprocess.Popen = told
+answer_requests_to_end()
+with started(["sleep", "60"]):
+    print("goes on")
+"""
+
+
+@posix
+def test_a_child_that_is_just_being_started_is_ended_too() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STARTS], stdout=subprocess.PIPE, text=True, check=False
+    )
+    assert done.returncode == 128 + signal.SIGTERM
+    assert ended(int(done.stdout))
+
+
+#: Is told to end in a block that answers, or after it.
+TOLD = """
+import os, pathlib, sys
+from psa_casadi.files import requests_to_end_answered, temporary_folder
+with requests_to_end_answered(), temporary_folder(pathlib.Path(sys.argv[1])):
+    if sys.argv[2] == "inside":
+        os.kill(os.getpid(), 15)
+with temporary_folder(pathlib.Path(sys.argv[1])):
+    os.kill(os.getpid(), 15)
+"""
+
+
+@posix
+@pytest.mark.parametrize(("where", "code", "left"), [("inside", 143, 0), ("after", -15, 1)])
+def test_requests_to_end_are_answered_in_the_block_alone(
+    where: str, code: int, left: int, tmp_path: Path
+) -> None:
+    done = subprocess.run([sys.executable, "-c", TOLD, str(tmp_path), where], check=False)
+    assert done.returncode == code
+    assert len(os.listdir(tmp_path)) == left
+
+
+def ended(pid: int) -> bool:
+    """Whether a process ends within two seconds."""
+    for _ in range(200):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        state = Path(f"/proc/{pid}/stat")
+        if state.exists() and state.read_text().rsplit(")", 1)[1].split()[0] == "Z":
+            return True
+        time.sleep(0.01)
+    return False
+
+
+@posix
+def test_any_command_sweeps_what_a_killed_one_left_in_the_cache(tmp_path: Path) -> None:
+    room = tmp_path / "cache" / "models"
+    room.mkdir(parents=True)
+    dead = holder(room)
+    dead.kill()
+    dead.communicate()
+    assert os.listdir(room)
+    subprocess.run(
+        [sys.executable, "-m", "psa_casadi.cli", "--version"],
+        env={**os.environ, "PSA_CASADI_CACHE": str(tmp_path / "cache")},
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    assert os.listdir(room) == []
+
+
+PSA = [sys.executable, "-m", "psa_casadi.cli"]
+
+#: A compiler that has a child of its own and never ends.
+NEVER_ENDS = ["#!/bin/sh", "sleep 100 &", 'echo $! > "$COMPILING"', "wait"]
+
+
+@contextmanager
+def compiling(folder: Path) -> Iterator["tuple[subprocess.Popen[str], int]"]:
+    """Yield a command that waits for its compiler, and the process of the compiler's child."""
+    t = np.linspace(0.0, 1.0, 200)
+    rows = [f"{a:.4f},{50 * np.sin(6 * a):.6f},{np.sin(6 * a - 0.1):.6f}" for a in t]
+    record = write(folder / "record.csv", HEADER, *rows)
+    slow = write(folder / "never_ends", *NEVER_ENDS)
+    slow.chmod(0o700)
+    told = folder / "pid"
+    (folder / "tmp").mkdir()
+    changes = {"CC": str(slow), "COMPILING": str(told), "TMPDIR": str(folder / "tmp"),
+               "PSA_CASADI_CACHE": str(folder / "cache")}  # fmt: skip
+    command = subprocess.Popen(
+        [*PSA, "identify", str(record), "-o", str(folder / "m.json"), "-q"],
+        env={**os.environ, **changes}, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        for _ in range(3000):
+            if told.exists() and told.read_text().endswith("\n"):
+                break
+            time.sleep(0.01)
+        yield command, int(told.read_text())
+    finally:
+        command.kill()
+        command.communicate()
+
+
+def runs(pid: int) -> bool:
+    state = Path(f"/proc/{pid}/stat")
+    try:
+        os.kill(pid, 0)
+        return not (state.exists() and state.read_text().rsplit(")", 1)[1].split()[0] == "Z")
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
+def left_over(folder: Path) -> list[Path]:
+    return [*folder.rglob(f"{PREFIX}*"), *(folder / "tmp").iterdir(), *folder.glob("m.json")]
+
+
+@posix
+@pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.slow)])
+def test_a_command_that_is_told_to_end_leaves_nothing(name: str, tmp_path: Path) -> None:
+    number = getattr(signal, name)
+    # nohup leaves SIGHUP ignored, and a command started so keeps running: not what is tested here.
+    inherited = signal.signal(number, signal.SIG_DFL)
+    with compiling(tmp_path) as (command, child):
+        signal.signal(number, inherited)
+        assert left_over(tmp_path)
+        command.send_signal(number)
+        assert command.wait(10) == 128 + number
+        assert not left_over(tmp_path)
+        for _ in range(100):
+            if not runs(child):
+                break
+            time.sleep(0.01)
+        assert not runs(child)

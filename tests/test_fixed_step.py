@@ -17,9 +17,9 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
 from psa_casadi.export.fixed_step.probe import VOLTAGES, Probe, played_inputs
+from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import compiler_command, has_zig, run_compiler, zig_command
 from psa_casadi.simulation.simulate import simulate
 from tests.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect

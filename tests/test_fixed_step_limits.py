@@ -11,7 +11,7 @@ from psa_casadi.export.fixed_step.export import GOOD, FixedStep, fixed_step
 from psa_casadi.export.fixed_step.probe import Probe, played_inputs
 from psa_casadi.export.fmu.sources import FIXED_ENTRY
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
-from psa_casadi.scratch import temporary_folder
+from psa_casadi.files import temporary_folder
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.stepper import run
 from tests.exact_cases import FloatArray, error

@@ -15,9 +15,9 @@ from psa_casadi.design.online.drifting_stack import DriftingStack
 from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
 from psa_casadi.export.fixed_step.probe import Probe
+from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.model.parts import PARTS, part_model
-from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.test_fixed_step import STRICT
 from tests.tiers import slow_but

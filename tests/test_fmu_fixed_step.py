@@ -21,9 +21,9 @@ from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, STRICT
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate
+from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import compose
 from psa_casadi.report.words.text import check_sentence
-from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.c_host.build import HEADERS
 from tests.exact_cases import JUMP, FloatArray, error

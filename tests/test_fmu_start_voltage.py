@@ -17,9 +17,9 @@ from psa_casadi.export.common.variable_table import START_VOLTAGE, variable_tabl
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
+from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import simulate as reference
-from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.simulate import settled_at, simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.variables import Parameter, State

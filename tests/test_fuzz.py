@@ -52,8 +52,8 @@ FULL = {
     "records-dat": 200, "column-maps": 800, "units": 1000, "models": 400, "paths": 500,
     "checks": 10, "states": 250,
 }  # fmt: skip
-#: A command in odd surroundings. Kills and damaged caches are in `test_ended_commands` and
-#: `test_compiler_cache`.
+#: A command in odd surroundings. Kills and damaged caches are in `test_files` and
+#: `test_compiler`.
 SURROUNDED = {"surroundings": "HOME a file", "run": "simulate"}
 
 

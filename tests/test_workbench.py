@@ -20,7 +20,7 @@ from psa_casadi.workbench.desk import Desk
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
 from psa_casadi.workbench.uploads import Limits, stored_name
-from tests.test_ended_commands import runs
+from tests.test_files import runs
 from tests.test_own_effects import RIPPLE, install
 
 SMALL = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k % 50) for k in range(100))

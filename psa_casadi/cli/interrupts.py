@@ -12,8 +12,8 @@ from types import FrameType
 from typing import NoReturn
 
 from psa_casadi.cli import INTERRUPTED
+from psa_casadi.files import abandon
 from psa_casadi.interruption import Work, interruptible_work
-from psa_casadi.scratch import abandon
 
 _SHOW_CURSOR = "\x1b[?25h"
 

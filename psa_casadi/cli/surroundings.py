@@ -9,7 +9,7 @@ import sys
 import tempfile
 
 from psa_casadi.cache import sweep_rooms
-from psa_casadi.scratch import answer_requests_to_end, temporary_folder
+from psa_casadi.files import answer_requests_to_end, temporary_folder
 
 #: What the operating system refuses: what happened, and what to do.
 _REFUSALS = {

@@ -91,8 +91,8 @@ def web(
 def _serve(port: int, no_browser: bool, modules: list[str]) -> None:
     """Serve the page until Ctrl-C; its files are removed then."""
     from psa_casadi.cli.inputs import Given
+    from psa_casadi.files import temporary_folder
     from psa_casadi.model.own_effects import known_effects
-    from psa_casadi.scratch import temporary_folder
     from psa_casadi.workbench.desk import Desk
     from psa_casadi.workbench.server import served
 

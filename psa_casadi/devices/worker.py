@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from psa_casadi.children import end_with_parent
 from psa_casadi.devices.device import work_on
-from psa_casadi.scratch import abandon, answer_requests_to_end
+from psa_casadi.files import abandon, answer_requests_to_end
 
 LENGTH = struct.Struct("<Q")
 

@@ -27,8 +27,8 @@ from psa_casadi.cache import VARIABLE, cached, writable_room
 from psa_casadi.children import run_child
 from psa_casadi.component import Expression
 from psa_casadi.errors import MachineError
+from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Structure
-from psa_casadi.scratch import temporary_folder
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")

@@ -23,7 +23,7 @@ from psa_casadi.children import end_with_parent, heard, kill_group, started_pyth
 from psa_casadi.errors import PsaError
 from psa_casadi.export.check.measured import Task, checks_of
 from psa_casadi.export.check.rows import CheckRow, stopped
-from psa_casadi.scratch import temporary_folder
+from psa_casadi.files import temporary_folder
 
 #: The row that is there only if the process ends badly outside of any check.
 OUTSIDE = "process ends"

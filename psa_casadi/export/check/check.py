@@ -37,11 +37,10 @@ from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.export.fmu.evidence import with_validity
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive, archive_problems
-from psa_casadi.files import why_not_read
+from psa_casadi.files import requests_to_end_answered, why_not_read
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import model_of
 from psa_casadi.records.record import Record
-from psa_casadi.scratch import requests_to_end_answered
 from psa_casadi.strict_json import read_json
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]

@@ -11,7 +11,7 @@ from pathlib import Path
 from psa_casadi.cache import cached
 from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.sources import compiled_files
-from psa_casadi.scratch import temporary_folder
+from psa_casadi.files import temporary_folder
 from psa_casadi.simulation.compiler import (
     INSTALL_ZIG,
     OPTIMISE,

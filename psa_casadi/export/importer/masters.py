@@ -17,8 +17,8 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
+from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
-from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.start import start_state
 
 FloatArray = npt.NDArray[np.float64]

@@ -20,9 +20,8 @@ from psa_casadi.export.ssp.drawing import (
 )
 from psa_casadi.export.ssp.steps import master_step
 from psa_casadi.export.ssp.structure import WiredParts, parameter_files, structure_description
-from psa_casadi.files import atomic_path
+from psa_casadi.files import atomic_path, temporary_folder
 from psa_casadi.model.system import System
-from psa_casadi.scratch import temporary_folder
 from psa_casadi.variables import Publication
 
 __all__ = ["export_ssp", "layout_of", "save_wiring", "wiring_of"]

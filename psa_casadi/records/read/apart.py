@@ -18,6 +18,7 @@ import numpy as np
 
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.files import temporary_folder
 from psa_casadi.records.read.choose import choose
 from psa_casadi.records.read.columns import Field, Source, stated_unit
 from psa_casadi.records.read.file_bytes import check_there, read_text, reason_of
@@ -25,7 +26,6 @@ from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
 from psa_casadi.records.read.samples import Outcome, Request, Samples, samples_of
 from psa_casadi.records.read.table import Cells, Table, parts_of_file
 from psa_casadi.records.read.text import decoded, text_tables
-from psa_casadi.scratch import temporary_folder
 
 #: The columns that a diagnosis needs; a cell that may be one of them is a guess worth showing.
 NEEDED = ("time", "voltage", "displacement")
