@@ -140,8 +140,8 @@ def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
         d,
         runs=(replace(run, signals=replace(run.signals, name=_HOSTILE)),),
         causes=(replace(cause, description=_HOSTILE),),
-        missed=replace(d.missed, where=_HOSTILE),
-        notes=(_HOSTILE,),
+        missed=replace(d.missed, seen=_HOSTILE),
+        remarks=(_HOSTILE,),
     )
     hostile.report(path)
     text = path.read_text("utf-8")

@@ -111,7 +111,7 @@ def test_what_held_out_samples_confirm(
     experiments = held(triangle, count)
     gain = Gain(40.0, interval)
     said = unconfirmed(experiments, gain, whole=97.5, lost=lost, partly=partly, hidden=hidden)
-    assert told in said
-    assert bool(said) == bool(told)
-    few = [n for n in coverage_notes(experiments) if n.startswith("Only")]
+    assert told in str(said)
+    assert (said is not None) == bool(told)
+    few = [n for n in coverage_notes(experiments) if n.code == "held_out_says_little"]
     assert len(few) == (count < 16)

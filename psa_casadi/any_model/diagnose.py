@@ -54,7 +54,7 @@ def diagnose_ode(
     held = signals_given(holdout, hold, len(given) + 1) if _any(holdout) else []
     runs = runs_of(model, given, held)
     shifted = known_zeros(model, zeros)
-    progress("fitting the model from several starts")
+    progress("fitting from several starts")
     base, runs, _ = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts, zeros=shifted,
         known_start=known_start,
@@ -69,11 +69,11 @@ def diagnose_ode(
     known = search(base, runs, table, progress)
     runs = with_noise(known.best().fit, runs)
     if unlike(runs, known.runs):
-        progress("searching again with the noise that the best model leaves in every record")
+        progress("searching again, noise by record")
         known = search(reweighted(base, runs), runs, table, progress)
     progress("judging")
     found = judged(known)
-    return replace(found, notes=(*found.notes, *told_of_columns(model, runs)))
+    return replace(found, remarks=(*found.remarks, *told_of_columns(model, runs)))
 
 
 def _any(given: Any) -> bool:

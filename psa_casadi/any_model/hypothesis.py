@@ -155,17 +155,11 @@ def tested(of: OdeHypothesis, runs: Sequence[Run], colour: Colour) -> Omnibus:
                 output.residuals, along, time, own, noise_rms(output.residuals, own),
                 knowable=output.straight, even=bool(of.causes),
             )  # fmt: skip
-            several = len(of.fit.outputs) > 1
-            where = f"Of {output.column}: {_lower(found.where)}" if several else found.where
-            rows.append(replace(found, where=where))
+            rows.append(replace(found, output=output.column if len(of.fit.outputs) > 1 else ""))
     p = min(1.0, len(rows) * min(r.p_value for r in rows))
     worst = min(rows, key=lambda r: (not r.alarm, r.p_value))
     told = worst.p_value * len(rows)
     return replace(worst, p_value=min(1.0, told if worst.alarm else p))
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]
 
 
 def _along(runs: Sequence[Run], output: FittedOutput) -> list[FloatArray]:

@@ -14,6 +14,7 @@ from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
 from psa_casadi.any_model.sizes import sized
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.quality.noise import first_order_noise
 from psa_casadi.records.signals import Hold, signals_given
 from psa_casadi.shown import StillReported, frame
@@ -38,7 +39,7 @@ _ALL = 0.8
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OdeIdentification(StillReported):
-    """A model with fitted values, how sure they are, and warnings.
+    """A model with fitted values, how sure they are, and remarks, which `warnings` tells.
 
     `errors` are the parameters' standard errors, `intervals` their 95 % intervals in
     `model.provenance`; `rms` is what is left of every measured output and `noise` the fast part of
@@ -55,17 +56,16 @@ class OdeIdentification(StillReported):
     noise: Mapping[str, float]
     costs: tuple[float, ...]
     agreed: int
-    warnings: tuple[str, ...]
+    remarks: tuple[Note, ...]
 
     def __repr__(self) -> str:
         """Return the parameters with their standard errors, and what is left of the outputs."""
-        rows = [
-            f"  {n} = {self.model.values[n]:.6g} +- {e:.2g} {self.model.parameter(n).unit}"
-            for n, e in self.errors.items()
-        ]
-        left = [f"  {n}: {v:.3g} rms left, noise {self.noise[n]:.3g}" for n, v in self.rms.items()]
-        said = [f"  {w}" for w in self.warnings]
-        return "\n".join([f"identified '{self.model.name}':", *rows, *left, *said])
+        return str(note("own_identification", found=self))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The remarks in sentences."""
+        return texts(self.remarks)
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas DataFrame: value, standard error, interval, unit."""
@@ -254,29 +254,19 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
     good = [c for c in costs if np.isfinite(c)]
     agreed = sum(c <= (1.0 + _SAME) * min(good) for c in good)
     said = []
-    if fit.interrupted:
-        said.append("The search was interrupted; these are the best values so far.")
-    elif not fit.converged:
-        said.append("The fit was cut off before it converged; its values are not final.")
+    if fit.interrupted or not fit.converged:
+        said.append(note("own_interrupted" if fit.interrupted else "cut_off"))
     if len(costs) > 1 and agreed == 1:
-        said.append(
-            f"Of {len(costs)} starts only one led to this minimum; it is the best found, and may"
-            " not be the best there is."
-        )
-    said += [f"'{n}' is not determined by these records." for n in sure.undetermined]
+        said.append(note("one_start", starts=len(costs)))
+    said += [note("own_undetermined", name=n) for n in sure.undetermined]
+    said += [note("on_bound", name=n) for n in sure.on_bound]
     said += [
-        f"'{n}' sits on a bound of its range; its interval means nothing." for n in sure.on_bound
-    ]
-    said += [
-        f"'{n}' is missed by {rms[n] / noise[n]:.2g} times its noise: the model lacks something, so"
-        " that the values bend to it, and their errors are too small; psa.diagnose looks for the"
-        " cause."
+        note("output_missed", output=n, ratio=rms[n] / noise[n])
         for n in rms
         if noise[n] > 0 and rms[n] > MISSED * noise[n]
     ]
     said += [
-        f"'{o.column}' is left with {100 * share:.0f} % of its own movement: see that its column,"
-        " and those of the inputs, are in the model's units."
+        note("output_not_followed", output=o.column, share=share)
         for o in fit.outputs
         if (share := rms[o.column] / _movement(runs, o.index)) > _ALL
     ]
@@ -291,7 +281,7 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         noise=noise,
         costs=costs,
         agreed=agreed,
-        warnings=tuple(said),
+        remarks=tuple(said),
     )
 
 

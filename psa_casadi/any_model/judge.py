@@ -22,21 +22,13 @@ from psa_casadi.any_model.weighing import (
 )
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out.shares import Removed, Share
-from psa_casadi.diagnosis.judgement import SMALL_NOTE, least_share, rivals, verdict_by
+from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.diagnosis.screening.evidence import probabilities, temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
+from psa_casadi.notes import Note, note
 from psa_casadi.records.checks import FEWEST_SAMPLES
-
-_FEW = (
-    "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
-)
-_HELD = (
-    "The fitted samples leave no more than noise, but the held-out ones of {} {:.1f} times their"
-    " noise: these records do not say the same, or their inputs are not read alike (see `hold`)."
-)
-_UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
 
 
 def judged(known: Known) -> OdeDiagnosis:
@@ -60,10 +52,9 @@ def judged(known: Known) -> OdeDiagnosis:
         more=more,
     )
     named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
-    notes = [_FEW.format(held, FEWEST_SAMPLES)] if few else []
-    names = " and ".join(c.name for c in best.causes)
+    notes = [note("own_few_held_out", count=held, least=FEWEST_SAMPLES)] if few else []
     if verdict == "unexplained" and best.causes and not few:
-        notes.append(why_not_named(names, own, beaten))
+        notes.append(why_not_named(tuple(c.name for c in best.causes), own, beaten))
     if not few:
         notes += left_out(known, best)
     return _diagnosis(known, verdict, named, removed, told, left, notes, free)
@@ -103,7 +94,7 @@ def _diagnosis(
     removed: Removed,
     told: Mapping[str, Mapping[str, float]],
     left: Mapping[Names, Remaining],
-    notes: list[str],
+    notes: list[Note],
     free: Sequence[Free],
 ) -> OdeDiagnosis:
     root = known.found[frozenset()]
@@ -152,7 +143,7 @@ def _diagnosis(
             for o, level in zip(named.fit.outputs, noise, strict=True)
         ),
         remaining=left[named.names],
-        notes=(*notes, *(SMALL_NOTE.format(n, 100 * shares[n].shown[0]) for n in small)),
+        remarks=(*notes, *(note("small", effect=n, share=shares[n].shown[0]) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
         extended_fit=named.fit,
@@ -165,9 +156,8 @@ def _diagnosis(
             tuple(shares[c.effect] for c in causes),
             best_free.removes if best_free else None,
         ),
-        unnamed=_UNNAMED.format(best_free.of, best_free.port.words, best_free.share)
-        if best_free
-        else "",
+        free_function=note("free_function", of=best_free.of, port=best_free.port.words,
+                           share=best_free.share) if best_free else None,
         correction=_correction(known, best_free) if best_free else None,
     )  # fmt: skip
 
@@ -224,16 +214,15 @@ def _noise(known: Known, h: OdeHypothesis) -> tuple[tuple[Run, ...], tuple[float
 
 
 def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
-    """Say what a model leaves: of fitted samples by its test, of held-out ones by their size."""
+    """Return what a model leaves: of fitted samples by its test, of held-out ones by their size."""
     test = known.view(h).test
-    where = "What remains cannot be distinguished from noise."
     if test.alarm:
-        where = f"{test.where} {100 * test.excess:.0f} % of its power is above the noise."
-        return Remaining(False, test.p_value, where)
+        return Remaining(False, test.p_value, test.finding)
     for o, noise in zip(h.fit.outputs, _noise(known, h)[1], strict=True):
         held = any(r.judged(o.index).any() for r in known.runs)
         rms = missed_rms(known.runs, h.predicted, o.index)
         least = thresholds().unseen_ratio_of_records * float(np.hypot(noise, o.straight))
         if held and rms > least:
-            return Remaining(False, test.p_value, _HELD.format(o.column, rms / noise))
-    return Remaining(True, test.p_value, where)
+            unlike = note("held_out_unlike", output=o.column, ratio=rms / noise)
+            return Remaining(False, test.p_value, unlike)
+    return Remaining(True, test.p_value)

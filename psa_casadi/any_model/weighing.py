@@ -9,19 +9,7 @@ from psa_casadi.any_model.identify import MISSED
 from psa_casadi.any_model.search import Known
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.thresholds import thresholds
-
-_BEATEN = (
-    "{} would remove {:.0%} of the held-out error above the noise{}; not named, because a free"
-    " function of {} in {} explains more ({:.0%})."
-)
-_LITTLE = (
-    "{} would remove {:.0%} of the held-out error above the noise{}; not named, because that is"
-    " less than {:.0%} and much remains."
-)
-_SLIGHT = (
-    "{} together fit better (ln of the Bayes factor higher by {:.0f}). Not named, because {} would"
-    " remove less than {:.0%} of what the rest does, and so little may only correct its form."
-)
+from psa_casadi.notes import Note, note
 
 
 @dataclass(frozen=True)
@@ -106,19 +94,19 @@ def beaten_by(
     return None
 
 
-def why_not_named(names: str, own: Weighed, beaten: Beaten | None) -> str:
-    """Say why causes that were found are not told."""
+def why_not_named(names: tuple[str, ...], own: Weighed, beaten: Beaten | None) -> Note:
+    """Return why causes that were found are not told."""
     if beaten:
         f = beaten.by
-        return _BEATEN.format(
-            names, beaten.names, _of(beaten.output), f.of, f.port.words, beaten.function
-        )
+        why = note("free_beats", of=f.of, port=f.port.words, share=beaten.function)
+        return note("own_withdrawn", names=names, share=beaten.names, output=beaten.output, why=why)
     output, share = own.least
-    return _LITTLE.format(names, share, _of(output), thresholds().enough)
+    why = note("own_little", least=thresholds().enough)
+    return note("own_withdrawn", names=names, share=share, output=output, why=why)
 
 
-def left_out(known: Known, best: OdeHypothesis) -> tuple[str, ...]:
-    """Say which causes are clearly likelier than the best ones, and add too little to be told.
+def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
+    """Return which causes are clearly likelier than the best ones, and add too little to be told.
 
     Only where structure remains beside the best.
     """
@@ -130,11 +118,6 @@ def left_out(known: Known, best: OdeHypothesis) -> tuple[str, ...]:
     top = max(better, key=known.score, default=None)
     if top is None:
         return ()
-    slight = known.slight(top)
+    names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
     more = known.evidence(top) - known.evidence(best)
-    names, small = (" and ".join(sorted(n)) for n in (top.names, slight))
-    return (_SLIGHT.format(names, more, small, thresholds().further),)
-
-
-def _of(output: str) -> str:
-    return f" of {output}" if output else ""
+    return (note("slight", names=names, more=more, small=small, least=thresholds().further),)

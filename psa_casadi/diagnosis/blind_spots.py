@@ -9,6 +9,7 @@ from psa_casadi.diagnosis.judgement import told_from
 from psa_casadi.diagnosis.result import BlindSpot
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.notes import note
 
 
 def shown(steps: Sequence[Step]) -> set[str]:
@@ -35,15 +36,10 @@ def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...
         factor = np.sqrt(final.screening.threshold)
         smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
         if smallest > practical:
-            unit = "" if gain.unit == "1" else f" {gain.unit}"
-            seen = f"only from {smallest:.3g}{unit} on" if np.isfinite(smallest) else "at no size"
-            spots.append(
-                BlindSpot(
-                    effect.name,
-                    float(min(smallest, 1e300)),
-                    gain.unit,
-                    f"These records show {effect.name} {seen} ({gain.name}), while"
-                    f" {practical:.3g}{unit} is an ordinary size.",
-                )
-            )
+            why = note(
+                "blind_spot" if np.isfinite(smallest) else "blind",
+                effect=effect.name, gain=gain.name,
+                smallest=(smallest, gain.unit), ordinary=(practical, gain.unit),
+            )  # fmt: skip
+            spots.append(BlindSpot(effect.name, float(min(smallest, 1e300)), gain.unit, why))
     return tuple(spots)

@@ -12,14 +12,10 @@ from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.verdict import NAMING
 from psa_casadi.identification.fitting.further import COLUMNS
 from psa_casadi.identification.search.measured_load import LOAD, is_measured, without_column
+from psa_casadi.notes import Note, note
 
-#: What the places are called that effects belong to.
-PLACES = {
-    "drive": "the amplifier",
-    "sensor": "the sensor",
-    "plant": "the stack with its load",
-    "environment": "the surroundings",
-}
+#: The places that effects belong to, in the order in which they are told.
+_PLACES = ("drive", "sensor", "plant", "environment")
 #: Probability below which an effect is no rival.
 _RIVAL = 0.01
 
@@ -66,7 +62,7 @@ def _decision(
 ) -> Decision:
     first, last = steps[0].view.of, steps[-1].view.of
     now, then = _named(steps) if verdict in NAMING else {}, _named(before)
-    words = {e.name: e for e in table}
+    effects = {e.name: e for e in table}
     k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
     gained = further_gains(first.fit, last.fit, steps[-1].screening.colour).get(column, 0.0)
     ruled_out = tuple(n for n in then if n not in now)
@@ -81,7 +77,7 @@ def _decision(
         named_without=then,
         ruled_out=ruled_out,
         evidence=gained,
-        sentence=decision_sentence(column, now, then, gained, words, clear=verdict == "adequate"),
+        outcome=decided(column, now, then, gained, effects, clear=verdict == "adequate"),
     )
 
 
@@ -97,7 +93,7 @@ def _named(steps: Sequence[Step]) -> dict[str, float]:
     return found
 
 
-def decision_sentence(
+def decided(
     column: str,
     now: Mapping[str, float],
     then: Mapping[str, float],
@@ -105,41 +101,28 @@ def decision_sentence(
     table: Mapping[str, Component],
     *,
     clear: bool,
-) -> str:
-    """Say in words what a column decided, from what is named with it and without it.
+) -> Note:
+    """Return what a column decided, from what is named with it and without it.
 
     `clear` says that nothing is left to name with the column.
     """
-    before = ", ".join(f"{n} {100 * p:.0f} %" for n, p in then.items())
-    gone, new = [n for n in then if n not in now], [n for n in now if n not in then]
+    before = tuple(then.items())
+    gone, new = [n for n in then if n not in now], tuple(n for n in now if n not in then)
     if not now and not then:
-        agrees = "agrees with the model" if clear else "decides nothing"
-        return f"{column} {agrees}: with it as without it nothing is named."
+        return note("column_agrees" if clear else "column_decides_nothing", column=column)
     if not gone and not new:
-        return f"{column} changes no name; it adds {gained:.0f} to the ln of the Bayes factor."
+        return note("column_adds", column=column, gained=gained)
     held = [n for n in gone if n in table and table[n].measured_by == column]
     if held and not now and clear:
-        return (
-            f"{column} explains by itself what without it is named ({before}): {held[0]} is in the"
-            " column."
-        )
+        return note("column_holds", column=column, effect=held[0], before=before)
     if not gone:
-        return f"Only with {column} is there {_joined(new)}; without it {_joined(then)}."
+        return note("column_names", column=column, new=new, then=tuple(then))
     if not now:
-        return f"With {column} nothing is named; without it {before}."
+        return note("column_clears", column=column, before=before)
     kept = {table[n].belongs_to for n in now if n in table}
-    places = [p for p in PLACES if p not in kept and any(_of(table, n) == p for n in gone)]
-    ruled = [PLACES[p] for p in places] or gone
-    verb = "is" if len(ruled) == 1 else "are"
-    return (
-        f"With {column} {' and '.join(ruled)} {verb} ruled out: what is left is {_joined(now)}"
-        f" (without it: {before})."
-    )
-
-
-def _of(table: Mapping[str, Component], name: str) -> str:
-    return table[name].belongs_to if name in table else ""
-
-
-def _joined(names: Sequence[str] | Mapping[str, float]) -> str:
-    return " or ".join(names) or "nothing is named"
+    lost = {table[n].belongs_to for n in gone if n in table} - kept
+    places = tuple(p for p in _PLACES if p in lost)
+    return note(
+        "column_rules_out",
+        column=column, places=places, effects=tuple(gone), now=tuple(now), before=before,
+    )  # fmt: skip

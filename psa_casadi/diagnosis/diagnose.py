@@ -31,6 +31,7 @@ from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
+from psa_casadi.notes import Note, note
 from psa_casadi.records.excerpts import excerpts
 from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.suspects import cleaned, masked, suspects
@@ -43,14 +44,8 @@ from psa_casadi.simulation.timings import stage
 
 #: So many further stuck readings are worth a second search.
 MORE = 3
-#: Steps of a sensor over a record's range below which it is coarse, and what is said then.
+#: Steps of a sensor over a record's range below which it is coarse.
 COARSE = 32
-COARSE_NOTE = (
-    "{}: the sensor resolves {:.0f} steps over the whole range. They make up the model's error:"
-    " nothing smaller can be distinguished from them."
-)
-#: What is said of readings that a stuck sensor repeats.
-STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
 
 @interruptible_work()
@@ -115,7 +110,7 @@ def diagnose(
             # from the end: the screening begins at the front
             with compiled_ahead(start.with_effect(e) for e in reversed(table)):
                 found = _diagnose(start, task, scale_given)
-            return replace(found, notes=(*found.notes, *said))
+            return replace(found, remarks=(*found.remarks, *said))
         except KeyboardInterrupt:
             if not so_far:
                 raise
@@ -136,7 +131,7 @@ def _in_form(
     return next(m for m in forms if m.components == found.best.model.components), (why,)
 
 
-def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]:
+def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
     """Return the records without suspect samples, and where a sensor was saturated or coarse.
 
     And the share of the readings that a saturated sensor has made.
@@ -148,16 +143,17 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]
     refuse_other_time(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
-    said = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
-    refuse_few(records, clean, said)
+    saturation = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
+    refuse_few(records, clean, saturation)
+    said: list[Note | str] = [*saturation]
     for r, own in zip(records, found, strict=True):
         if own.quantum is not None and r.range_m < COARSE * own.quantum:
-            said.append(COARSE_NOTE.format(r.name, r.range_m / own.quantum))
+            said.append(note("coarse", record=r.name, steps=r.range_m / own.quantum))
     saturated = sum(own.counts["saturated"] for own in found)
     return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 
 
-def _on_one_clock(records: Sequence[Record], said: list[str]) -> list[Record]:
+def _on_one_clock(records: Sequence[Record], said: list[Note | str]) -> list[Record]:
     """Return the records with their readings on one clock; what is done to them goes to `said`."""
     done = [on_one_clock(r) for r in records]
     said += [s for _, own in done for s in own]
@@ -184,7 +180,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         found = conclude(
             steps, experiments, table, scale_given, driven=seen.filtered, hidden=task.hidden
         )
-        return replace(found, notes=(*found.notes, *seen.notes))
+        return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = _search(base, task)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
@@ -198,13 +194,13 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
     turned = [f.turned for f in steps[0].fit.further if f.turned]
-    notes = (*seen.notes, *between, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
-    return replace(found, notes=(*found.notes, *notes))
+    remarks = (*seen.notes, *between, *([note("stuck", count=stuck)] if stuck else []), *turned)
+    return replace(found, remarks=(*found.remarks, *remarks))
 
 
 def _with_smooth_voltage(
     start: Model, steps: list[Step], task: Task
-) -> tuple[list[Step], Task, tuple[str, ...]]:
+) -> tuple[list[Step], Task, tuple[Note, ...]]:
     """Search again where the voltage is smooth between its samples; return what holds, and notes.
 
     As it is where the base's error shows none of it, or is no less with it.

@@ -22,6 +22,7 @@ from psa_casadi.identification.start.doubts import (
 from psa_casadi.identification.start.other_quantities import doubtful_quantity
 from psa_casadi.identification.start.time_unit import doubtful_time
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -32,22 +33,15 @@ _TREND = 0.05
 _TAPS, _EACH = 128, 8
 
 
-_FILTERED = (
-    "A linear filter of the voltage explains {:.0f} % of the displacement's variance, the base"
-    " model {:.0f} %: the two belong together, but with dynamics that the base model does not have"
-    " (several resonances, a delay, perhaps the other sign). No causes were sought."
-)
-
-
 @dataclass(frozen=True)
 class Driven:
-    """Whether a displacement follows the voltage, and what of sign and unit is wrong, in words.
+    """Whether a displacement follows the voltage, and what of sign and unit is wrong.
 
     `filtered` says that it does not follow by the base model, but by another linear one.
     """
 
     follows: bool
-    notes: tuple[str, ...]
+    notes: tuple[Note | str, ...]
     filtered: bool = False
 
 
@@ -66,30 +60,18 @@ def driven(
     notes = tuple(s for doubt in doubts if (s := doubt(records)))
     if share >= thresholds().follows and correlation(records) > thresholds().falling:
         return Driven(follows=True, notes=notes)
-    progress("the displacement with its sign flipped")
+    progress("with the sign flipped")
     other = _flipped(model, experiments)
+    shown = max(share, 0.0)
     if other > max(share, thresholds().follows):
-        said = (
-            f"With the sign of the displacement flipped the base model explains"
-            f" {100 * other:.2f} % of its variance, as given {100 * max(share, 0.0):.2f} %: the"
-            " sensor or the voltage is probably connected the other way round.",
-        )
-        return Driven(follows=False, notes=(*said, *notes))
+        return Driven(False, (note("flipped", flipped=other, share=shown), *notes))
     if share < thresholds().follows:
         linear = filtered(experiments)
         if linear > thresholds().follows:
-            return Driven(
-                follows=False,
-                notes=(_FILTERED.format(100 * linear, 100 * max(share, 0.0)), *notes),
-                filtered=True,
-            )
-        said = (
-            f"The voltage explains {100 * max(share, 0.0):.0f} % of the displacement's variance,"
-            " and no more with the other sign: check that both columns are of the same device and"
-            " the same time.",
-        )
+            return Driven(False, (note("filtered", linear=linear, share=shown), *notes), True)
         quantity = doubtful_quantity(records)
-        return Driven(follows=False, notes=(*said, quantity) if quantity else said)
+        said = note("not_driven", share=shown)
+        return Driven(False, (said, quantity) if quantity else (said,))
     return Driven(follows=True, notes=notes)
 
 

@@ -23,7 +23,6 @@ from psa_casadi.diagnosis.held_out.errors import (
 )
 from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
 from psa_casadi.diagnosis.judgement import (
-    SMALL_NOTE,
     told_from,
     too_small,
     vague_note,
@@ -52,6 +51,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
 from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import note
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.timings import stage
 
@@ -59,10 +59,6 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Verdicts that name causes.
 NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
-_HELD_OUT = (
-    "The held-out samples' error is {:.2f} times what the fitted ones let expect: something matters"
-    " there that these do not show."
-)
 
 
 @stage("judging")
@@ -99,20 +95,21 @@ def conclude(
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
     lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
     doubt = unconfirmed(experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden)
-    vague = {} if beaten is not None or doubt else balance.vague(steps)
+    stands = beaten is None and doubt is None
+    vague = balance.vague(steps) if stands else {}
     verdict: Verdict = (
         "not_driven"
         if not driven
         else verdict_of(
             steps,
             missing=missing,
-            withdrawn=bool(beaten or doubt),
+            withdrawn=not stands,
             share=weighed.share,
             unseen=bool(unseen),
             unnamed=vague,
         )
     )
-    weak = verdict == "unexplained" and not (beaten or doubt or vague) and weighed.adds
+    weak = verdict == "unexplained" and stands and not vague and weighed.adds
     kept = [s for s in steps if s.chosen] if verdict in NAMING or weak else []
     final = last if kept else first
     patch = patch_of(
@@ -159,17 +156,17 @@ def conclude(
             verdict,
             same_curves(experiments, table, first.fit),
             [e.record for e in experiments],
-            doubted=bool(doubt),
+            doubted=doubt is not None,
         ),
-        doubt=doubt if verdict in ("adequate", "unexplained") else "",
-        notes=(
+        doubted=doubt if verdict in ("adequate", "unexplained") else None,
+        remarks=(
             *model.provenance.notes,
             *(
                 withdrawn_names(steps, weighed, beaten, vague, doubt)
                 if verdict == "unexplained"
                 else vague_note(vague)
             ),
-            *(SMALL_NOTE.format(c.what, 100 * max(c.share, 0.0)) for c in small),
+            *(note("small", effect=c.what, share=max(c.share, 0.0)) for c in small),
             *coverage_notes(experiments),
         ),
         experiments=tuple(experiments),
@@ -274,11 +271,10 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
 
 
 def _remaining(r: Step, beyond: Excess) -> Remaining:
-    """Describe what is left; `beyond` the fit where that leaves nothing to be seen."""
-    where = "What remains cannot be distinguished from noise."
-    if r.test.alarm:
-        where = f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
-    elif beyond:
-        where = _HELD_OUT.format(beyond.factor)
+    """Return what is left; `beyond` the fit where that leaves nothing to be seen."""
     p_value = min(r.test.p_value, beyond.p_value)
-    return Remaining(not (r.test.alarm or beyond), p_value, where)
+    if r.test.alarm:
+        return Remaining(False, p_value, r.test.finding)
+    if beyond:
+        return Remaining(False, p_value, note("held_out_error", factor=beyond.factor))
+    return Remaining(True, p_value)

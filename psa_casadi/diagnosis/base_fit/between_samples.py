@@ -15,6 +15,7 @@ import numpy.typing as npt
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import trace_record
+from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 
@@ -24,16 +25,11 @@ FloatArray = npt.NDArray[np.float64]
 #: and how far it may be from the whole of it. Smooth plants have 0.85 to 0.98 (the base has bent
 #: itself to the rest), others 0.0 +- 0.1, and residuals that hold something else -6000 to 11.
 _SURE, _NEAR = 6.0, 0.25
-NOTE = (
-    "Between its samples the voltage follows a smooth curve, not straight lines, of whose"
-    " difference the base model's error held {:.2f} ({:.2f} to {:.2f}): the model is driven by the"
-    " curve, and a simulation of such a record needs more samples for each period."
-)
 
 
 def smooth_between(
     fit: Fit, experiments: Sequence[Experiment]
-) -> tuple[tuple[Experiment, ...], str] | None:
+) -> tuple[tuple[Experiment, ...], Note] | None:
     """Return the experiments with the voltage moved to a smooth curve's mean, and a note; or None.
 
     The difference of the two displacements is fitted to what the `fit` leaves, beside all fitted
@@ -54,7 +50,8 @@ def smooth_between(
     if not (share > _SURE * error and abs(share - 1.0) < _NEAR):
         return None
     moved = tuple(replace(e, record=_moved(e.record)) for e in experiments)
-    return moved, NOTE.format(share, share - 1.96 * error, share + 1.96 * error)
+    interval = (share - 1.96 * error, share + 1.96 * error)
+    return moved, note("smooth_voltage", share=share, low=interval[0], high=interval[1])
 
 
 def _difference(fit: Fit, number: int, experiment: Experiment) -> FloatArray:

@@ -69,7 +69,6 @@ class Kind:
 
     name: str
     port: str
-    sentence: str
     columns: Callable[[Signals, int], FloatArray]
     shape: Callable[[int], FloatArray]
     fast: bool = False
@@ -179,13 +178,13 @@ def _smooth(count: int) -> FloatArray:
 
 
 KINDS = (
-    Kind("curve", "drive voltage", "a bent curve of the drive voltage", _voltage_curve, _smooth),
-    Kind("curve", "reading", "a bent curve of the displacement", _reading_curve, _smooth),
-    Kind("curve", "force", "a bent curve of the force", _force_curve, _smooth, fast=True),
-    Kind("direction", "force", "a difference between the branches", _direction, _smooth),
-    Kind("memory", "force", "a memory of past reversals", _memory, _flat),
-    Kind("relaxation", "force", "a lag or creep over decades of time", _relaxation, _flat),
-    Kind("modes", "force", "further resonances", _modes, _flat),
-    Kind("time", "reading", "a change with time that does not follow the voltage", _time, _smooth),
-    Kind("gain in time", "force", "a sensitivity that changes with time", _gain_in_time, _smooth),
+    Kind("curve", "drive voltage", _voltage_curve, _smooth),
+    Kind("curve", "reading", _reading_curve, _smooth),
+    Kind("curve", "force", _force_curve, _smooth, fast=True),
+    Kind("direction", "force", _direction, _smooth),
+    Kind("memory", "force", _memory, _flat),
+    Kind("relaxation", "force", _relaxation, _flat),
+    Kind("modes", "force", _modes, _flat),
+    Kind("time", "reading", _time, _smooth),
+    Kind("gain in time", "force", _gain_in_time, _smooth),
 )

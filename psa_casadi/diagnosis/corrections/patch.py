@@ -11,6 +11,7 @@ from psa_casadi.diagnosis.corrections.correct import Correction
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.notes import note
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -20,14 +21,13 @@ FloatArray = npt.NDArray[np.float64]
 class Patch:
     """An unnamed correction: its kind and port, what else it may be, evidence and predictions.
 
-    `sentence` says what it is in words; `open_to` are other kinds and ports that explain the data
+    `open_to` are other kinds and ports that explain the data
     as well; `predicted` [m] are whole records with it, `added` [m] its own part of them,
     `weights` [m] those of its terms, `moved` how far the model's own theta follows.
     """
 
     kind: str
     port: str
-    sentence: str
     evidence: float
     open_to: tuple[str, ...]
     predicted: tuple[FloatArray, ...]
@@ -39,6 +39,11 @@ class Patch:
     def name(self) -> str:
         """Kind and port."""
         return f"{self.kind} at the {self.port}"
+
+    @property
+    def sentence(self) -> str:
+        """What it is in words."""
+        return str(note("correction", kind=self.kind, port=self.port))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for DIAGNOSIS.json."""
@@ -77,7 +82,6 @@ def patch_of(
     return Patch(
         kind=best.kind.name,
         port=best.kind.port,
-        sentence=best.kind.sentence,
         evidence=best.evidence,
         open_to=tuple(f"{c.kind.name} at the {c.kind.port}" for c in others),
         predicted=best.predicted,

@@ -6,6 +6,7 @@ from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.start.doubts import doubtful_voltage
 from psa_casadi.identification.start.other_quantities import doubtful_quantity
+from psa_casadi.notes import Note, note
 from psa_casadi.records.checks import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment
 
@@ -15,15 +16,12 @@ _DOUBLED = -100.0
 _HIDDEN = 0.5
 
 
-def too_few_held_out(experiments: Sequence[Experiment]) -> str:
-    """Say that too few readings are held out to judge a model by; "" where there are enough."""
+def too_few_held_out(experiments: Sequence[Experiment]) -> Note | None:
+    """Return that too few readings are held out to judge a model by; None where enough are."""
     count = sum(int(e.held_out.sum()) for e in experiments)
     if count >= FEWEST_SAMPLES:
-        return ""
-    return (
-        f"only {count} of the readings that count are held out, and no model can be judged by fewer"
-        f" than {FEWEST_SAMPLES}"
-    )
+        return None
+    return note("few_held_out", count=count, least=FEWEST_SAMPLES)
 
 
 def unconfirmed(
@@ -34,8 +32,8 @@ def unconfirmed(
     lost: float,
     partly: bool,
     hidden: float,
-) -> str:
-    """Say why the records do not confirm the causes of an extended model; "" where they do.
+) -> Note | None:
+    """Return why the records do not confirm the causes of an extended model; None where they do.
 
     `hidden` is the share of the readings that a saturated sensor has made. The interval of the
     held-out `gain` tells nothing where it reaches from an error that doubles to the `whole` gain
@@ -45,26 +43,16 @@ def unconfirmed(
     much remains, the displacement no other quantity.
     """
     few = too_few_held_out(experiments)
-    if few:
+    if few is not None:
         return few
     if hidden > _HIDDEN:
-        return (
-            f"the sensor is saturated in {100 * hidden:.0f} % of the readings, so that more of the"
-            " motion is hidden than shown"
-        )
+        return note("saturated", share=hidden)
     low, high = gain.interval
     if low <= _DOUBLED and high >= whole and lost > thresholds().held_out:
-        return (
-            f"the 95 % interval of the held-out gain, {low:.0f} to {high:.0f} %, reaches from an"
-            " error that doubles to noise alone, and most held-out samples lose by it"
-        )
-    return _columns(experiments, partly=partly)
-
-
-def _columns(experiments: Sequence[Experiment], *, partly: bool) -> str:
+        return note("gain_unknown", low=low, high=high)
     records = [e.record for e in experiments]
     if doubtful_voltage(records):
-        return "no stack bears such a voltage, and what depends on its level cannot be told"
+        return note("no_such_voltage")
     if partly and doubtful_quantity(records):
-        return "much would remain, and the displacement may be another quantity"
-    return ""
+        return note("other_quantity")
+    return None

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, rms
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.notes import Note, note
 from psa_casadi.records.quality.noise import first_order_noise
 from psa_casadi.records.quality.quantum import last_place_of, quantum_of
 from psa_casadi.records.quality.repeats import MeasuredNoise, holds, repeats
@@ -36,7 +37,7 @@ class NoiseFloor:
 
     `autocovariance` (lags,) [m^2] begins at lag 0 and is that of `level`; `autoregression` (p,) is
     empty for white noise; `samples` is what the level rests on. `quantum` is the step between the
-    sensor's levels, None where it shows none; `sentence` says all this in words.
+    sensor's levels, None where it shows none; `finding` says all this.
     """
 
     record: str
@@ -46,7 +47,12 @@ class NoiseFloor:
     autocovariance: FloatArray
     autoregression: FloatArray
     quantum: float | None
-    sentence: str
+    finding: Note
+
+    @property
+    def sentence(self) -> str:
+        """All this in words."""
+        return str(self.finding)
 
 
 def noise_floor(
@@ -132,20 +138,17 @@ def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
     if level < rounding:
         covariance[0] += rounding**2 - level**2
         level = rounding
-    coloured = np.any(np.abs(covariance[1:]) > VISIBLE * covariance[0])
-    colour = "correlated from sample to sample" if coloured else "white"
-    said = (
-        f"The noise of {record.name} is {quantity(level, record.displacement_unit)} rms, {how}"
-        f" ({found.samples} samples)"
-    )
-    said += f", and {colour}."
-    if quantum is not None:
-        step = quantity(quantum, record.displacement_unit)
-        least = quantity(rounding, record.displacement_unit)
-        said += f" The sensor counts in steps of {step}, which alone give {least} rms."
+    coloured = bool(np.any(np.abs(covariance[1:]) > VISIBLE * covariance[0]))
+    unit = record.displacement_unit
+    finding = note(
+        "noise", record=record.name, level=(level, unit), how=how, samples=found.samples,
+        coloured=coloured, quantum=None if quantum is None else (quantum, unit),
+        rounding=(rounding, unit),
+    )  # fmt: skip
     return NoiseFloor(
-        record.name, level, source, found.samples, covariance, found.autoregression, quantum, said
-    )
+        record.name, level, source, found.samples, covariance, found.autoregression, quantum,
+        finding,
+    )  # fmt: skip
 
 
 def _rounding(quantum: float | None) -> float:
@@ -153,11 +156,7 @@ def _rounding(quantum: float | None) -> float:
     return (quantum or 0.0) / float(np.sqrt(12.0))
 
 
-_FAST_PART: tuple[Source, None, str] = (
-    "fast part",
-    None,
-    "from the fast part of what the model leaves",
-)
+_FAST_PART: tuple[Source, None, Note] = ("fast part", None, note("noise_fast"))
 
 
 @lru_cache(maxsize=64)
@@ -171,34 +170,12 @@ def _resolution(record: Record) -> tuple[float | None, float, float]:
 
 
 @lru_cache(maxsize=64)
-def _source(record: Record) -> tuple[Source, MeasuredNoise | None, str]:
-    """Return the best source that needs no model, what it says, and how it does so in words."""
+def _source(record: Record) -> tuple[Source, MeasuredNoise | None, Note]:
+    """Return the best source that needs no model, what it says, and how it does so."""
     again = repeats(record)
     if again is not None and again.samples >= ENOUGH:
-        apart = quantity(again.distances[0], "s")
-        return "repeats", again, f"from what differs when the same voltage returns after {apart}"
+        return "repeats", again, note("noise_repeats", apart=(again.distances[0], "s"))
     still = holds(record)
     if still is not None and still.samples >= ENOUGH:
-        spans = "a held voltage" if still.count == 1 else f"{still.count} held voltages"
-        return "holds", still, f"from {spans} after smooth creep is taken off"
+        return "holds", still, note("noise_holds", count=still.count)
     return _FAST_PART
-
-
-def figure(value: float) -> str:
-    """Return a number with two significant digits, "0" if it is none."""
-    return f"{float(f'{value:.1e}'):g}" if np.isfinite(value) else "no number"
-
-
-_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
-    "m": (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9)),
-    "s": (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)),
-}
-
-
-def quantity(value: float, unit: str) -> str:
-    """Return a value in SI units with two digits in a handy unit, such as "0.12 um"."""
-    sizes = _UNITS.get(unit, ((unit, 1.0),))
-    name, size = next((u for u in sizes if abs(value) >= 0.1 * u[1]), sizes[-1])
-    if value == 0:
-        return f"0 {'um' if unit == 'm' else unit}"
-    return f"{figure(value / size)} {name}"

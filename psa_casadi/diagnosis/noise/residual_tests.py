@@ -1,6 +1,7 @@
 """Is anything missing at all? Tests of a residual that need no named effect."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -8,8 +9,11 @@ import scipy
 
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.notes import Note, note
 
 FloatArray = npt.NDArray[np.float64]
+#: Neighbours correlate, the spectrum has a line, the residual or its size follows the drive.
+Seen = Literal["correlation", "line", "drive", "size"]
 
 _LAGS = 25
 #: Squares of the residual over their mean that count at most.
@@ -18,22 +22,29 @@ _MOST = 9.0
 
 @dataclass(frozen=True)
 class Omnibus:
-    """Probability of the residual under noise alone, the test that says so, and where it shows.
+    """Probability of the residual under noise alone, and the test that says so.
 
-    `excess` is the share of the residual's power above the noise; `size` [m] the rms of what the
-    test sees, `knowable` [m] that below which nothing can be told of a stack.
+    `seen` is what that test sees, `output` the one of several whose residual it is. `excess` is the
+    share of the residual's power above the noise; `size` [m] the rms of what the test sees,
+    `knowable` [m] that below which nothing can be told of a stack.
     """
 
     p_value: float
     excess: float
-    where: str
+    seen: Seen
     size: float
     knowable: float
+    output: str = ""
 
     @property
     def alarm(self) -> bool:
         """Whether something besides noise is in the residual, large enough to be told."""
         return self.p_value < thresholds().alarm and self.size > self.knowable
+
+    @property
+    def finding(self) -> Note:
+        """What is in the residual besides noise, where the test alarms."""
+        return note("structure", seen=self.seen, output=self.output, excess=self.excess)
 
 
 def omnibus(
@@ -55,19 +66,19 @@ def omnibus(
     `floor` [m]; what is seen must be larger than what is `knowable` [m].
     """
     white = colour.whiten(residual)
-    tests = {
-        "neighbouring samples are correlated": _neighbours(white),
-        "its spectrum has a line": _fisher_line(white),
-        "it depends on voltage, rate or time": _features(white, voltage, time, colour),
+    tests: dict[Seen, tuple[float, float]] = {
+        "correlation": _neighbours(white),
+        "line": _fisher_line(white),
+        "drive": _features(white, voltage, time, colour),
     }
     if even:
-        tests["the size depends on voltage, rate or time"] = _sizes(white, voltage, time, colour)
-    where, (p, share) = min(tests.items(), key=lambda item: item[1][0])
+        tests["size"] = _sizes(white, voltage, time, colour)
+    seen, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))
     size = float(np.sqrt(share * power))
     excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
     p = min(1.0, len(tests) * p)
-    return Omnibus(p, excess, f"In the residual {where}.", size, knowable)
+    return Omnibus(p, excess, seen, size, knowable)
 
 
 def whiteness(white: FloatArray) -> float:

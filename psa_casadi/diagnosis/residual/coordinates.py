@@ -39,44 +39,32 @@ def axes(record: Record, predicted: FloatArray, drive: Drive) -> tuple[Axis, ...
     """
     t, v = record.time - record.time[0], record.voltage
     h = _history(t, v, drive.turns)
-    along = "the residual counted along the motion"
-    above = "the residual counted along the voltage's deviation"
-    amplitude, frequency = "local peak-to-peak voltage", "local frequency"
-    since = "time since the last reversal"
+    length = record.displacement_unit
     rows = (
-        ("voltage", "Voltage", "voltage", "V", "the voltage", v, None),
-        ("displacement", "Displacement", "predicted displacement", record.displacement_unit,
-         "the displacement", predicted, None),
-        ("rate", "Voltage rate", "voltage rate", "V/s", "the voltage rate", drive.rate, None),
-        ("since_reversal", "Time since a reversal", since, "s", f"the {since}", h.since, None),
-        ("since_reversal_lag", "Time since a reversal, along the motion", since, "s",
-         f"the {since}, {along}", h.since, h.motion),
-        ("from_reversal", "Voltage since a reversal", "voltage since the last reversal",
-         "V", "the voltage's distance from the last reversal", h.distance, None),
-        ("amplitude", "Amplitude of the drive", amplitude, "V", "the amplitude of the drive",
-         h.swing, None),
-        ("amplitude_gain", "Gain against amplitude", amplitude, "V",
-         f"the amplitude of the drive, {above}", h.swing, h.side),
-        ("amplitude_lag", "Lag against amplitude", amplitude, "V",
-         f"the amplitude of the drive, {along}", h.swing, h.motion),
-        ("frequency", "Frequency of the drive", frequency, "Hz", "the frequency of the drive",
-         h.frequency, None),
-        ("frequency_gain", "Gain against frequency", frequency, "Hz",
-         f"the frequency of the drive, {above}", h.frequency, h.side),
-        ("frequency_lag", "Lag against frequency", frequency, "Hz",
-         f"the frequency of the drive, {along}", h.frequency, h.motion),
-    )  # fmt: skip
+        ("voltage", "V", v, None),
+        ("displacement", length, predicted, None),
+        ("rate", "V/s", drive.rate, None),
+        ("since_reversal", "s", h.since, None),
+        ("since_reversal_lag", "s", h.since, h.motion),
+        ("from_reversal", "V", h.distance, None),
+        ("amplitude", "V", h.swing, None),
+        ("amplitude_gain", "V", h.swing, h.side),
+        ("amplitude_lag", "V", h.swing, h.motion),
+        ("frequency", "Hz", h.frequency, None),
+        ("frequency_gain", "Hz", h.frequency, h.side),
+        ("frequency_lag", "Hz", h.frequency, h.motion),
+    )
     return tuple(
-        Axis(name, title, label, unit, noun, x, log=x is h.since,
+        Axis(name, unit, x, log=x is h.since,
              blocks=FINE if name.startswith(("ampl", "freq")) else COARSE, sign=sign)
-        for name, title, label, unit, noun, x, sign in rows
+        for name, unit, x, sign in rows
     )  # fmt: skip
 
 
 def time_axis(record: Record) -> Axis:
     """Return the time since the record began."""
     t = record.time - record.time[0]
-    return Axis("time", "Time", "time", "s", "time", t, blocks=FINE)
+    return Axis("time", "s", t, blocks=FINE)
 
 
 def hold_axis(record: Record) -> tuple[Axis, int]:
@@ -95,11 +83,7 @@ def hold_axis(record: Record) -> tuple[Axis, int]:
     count = len({a for a, _ in spans if sign[a] != 0})
     if not count:
         sign, count = np.isfinite(since).astype(np.float64), len(spans)
-    axis = Axis(
-        "holds", "Holds", "time since the hold began", "s", "the time since a hold began", since,
-        log=True, blocks=FINE, sign=sign,
-    )  # fmt: skip
-    return axis, count
+    return Axis("holds", "s", since, log=True, blocks=FINE, sign=sign), count
 
 
 def drive_of(record: Record) -> Drive:

@@ -1,12 +1,11 @@
 """A residual under a periodic voltage, split into linear, even and odd parts and noise."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.diagnosis.noise.floor import quantity
 from psa_casadi.records.quality.repetitions import Repetition, repetitions
 from psa_casadi.records.record import Record
 
@@ -37,7 +36,11 @@ class HarmonicSplit:
     even: float
     odd: float
     noise: float
-    sentence: str
+
+    @property
+    def repeats(self) -> float:
+        """Power of all that repeats."""
+        return self.linear + self.even + self.odd
 
 
 def harmonic_split(record: Record, residual: FloatArray) -> HarmonicSplit | None:
@@ -74,10 +77,7 @@ def harmonic_split(record: Record, residual: FloatArray) -> HarmonicSplit | None
     total = float(np.sum(line[1:])) + float(np.sum(between[1:])) * (periods - 1)
     noise = max(total - sum(found.values()), 0.0)
     first = float(record.time[run.start + run.lag] - record.time[run.start])
-    split = HarmonicSplit(
-        base / first, periods, int(excited.sum()), **found, noise=noise, sentence=""
-    )
-    return replace(split, sentence=_sentence(split, record.displacement_unit))
+    return HarmonicSplit(base / first, periods, int(excited.sum()), **found, noise=noise)
 
 
 def _period(record: Record) -> Repetition | None:
@@ -134,24 +134,3 @@ def _significant(line: FloatArray, between: FloatArray, periods: int) -> float:
         p = float(scipy.special.fdtrc(2 * line.size, freedom, float(np.sum(line)) / noise))
         above = above if p < _SIGNIFICANT else 0.0
     return max(above, 0.0)
-
-
-def _sentence(s: HarmonicSplit, unit: str) -> str:
-    place = "the excited lines" if s.excited > 1 else "harmonic 1"
-    parts = {
-        f"linear misfit at {place}": s.linear,
-        "even nonlinearity": s.even,
-        "odd nonlinearity": s.odd,
-    }
-    total = s.linear + s.even + s.odd + s.noise
-    if not total > s.noise:
-        return f"Nothing in the residual repeats over {s.periods} periods of the drive."
-    said = ", ".join(
-        f"{100.0 * p / total:.0f} % {name} ({quantity(float(np.sqrt(p)), unit)} rms)"
-        for name, p in sorted(parts.items(), key=lambda item: -item[1])
-        if p > 0
-    )
-    return (
-        f"Over {s.periods} periods of the drive the residual's power is {said}, and"
-        f" {100.0 * s.noise / total:.0f} % does not repeat."
-    )

@@ -1,11 +1,11 @@
-"""What a simulation gets wrong: one record's residual from every side, in pictures and words."""
+"""What a simulation gets wrong: one record's residual from every side."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.floor import NoiseFloor, figure, quantity
+from psa_casadi.diagnosis.noise.floor import NoiseFloor
 from psa_casadi.diagnosis.residual.coordinates import (
     Drive,
     axes,
@@ -15,8 +15,9 @@ from psa_casadi.diagnosis.residual.coordinates import (
 )
 from psa_casadi.diagnosis.residual.harmonics import HarmonicSplit, harmonic_split
 from psa_casadi.diagnosis.residual.spectrum import Spectrum, spectrum_of
-from psa_casadi.diagnosis.residual.views import Ground, View, explains, ground_of, signed, view
+from psa_casadi.diagnosis.residual.views import Ground, View, ground_of, view
 from psa_casadi.errors import InputError
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.drive import drive_frequency
 from psa_casadi.records.record import Record
 
@@ -40,11 +41,11 @@ class Slope:
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """One record's residual: its size, the views of it, and what is seen in sentences.
+    """One record's residual: its size, the views of it, and what is seen.
 
     `rms` [m, or counts] is without the mean `mean`; `floor` is the noise, `excess` the share of the
     power above it. The view named "holds" is None in a record without holds, as is `slope`;
-    `split` is None unless the voltage is periodic. `sentences` begin with the size; the rest is
+    `split` is None unless the voltage is periodic. `findings` begin with the size; the rest is
     what explains more than 5 % of the excess, in falling order, and the split; noise has none.
     """
 
@@ -58,7 +59,12 @@ class Misfit:
     slope: Slope | None
     spectrum: Spectrum
     split: HarmonicSplit | None
-    sentences: tuple[str, ...]
+    findings: tuple[Note, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return texts(self.findings)
 
 
 def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
@@ -75,7 +81,7 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
             f" valid samples of {residual.size} for {record.n} instants; give one value for each"
             f" instant, {FEWEST} of them valid at least."
         )
-    ground = ground_of(residual, floor.level, record.displacement_unit)
+    ground = ground_of(residual, floor.level)
     drive = drive_of(record)
     over_time = view(ground, time_axis(record))
     steady = _steady(ground, record, over_time, drive)
@@ -83,33 +89,25 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     # what varies as slowly as time itself would vanish with the drift
     slow = ("amplitude", "frequency")
     views = [over_time, *(view(ground if a.name in slow else steady, a) for a in rows)]
-    held, slope = _holds(record, ground)
+    held, slope, count = _holds(record, ground)
     split = harmonic_split(record, residual)
     line = split.fundamental if split is not None else drive_frequency(record)
     spectrum = spectrum_of(record, residual, floor, ground.excess, line)
     power = float(np.mean(ground.residual**2))
     excess = max(0.0, 1.0 - floor.level**2 / power) if power > 0 else 0.0
-    mean = float(np.nanmean(residual))
-    said = _said([*views, *([held] if held else [])], spectrum, split, ground.excess)
-    rms = float(np.sqrt(power))
-    size = _size(record, rms, mean, floor, excess)
+    rms, mean, unit = float(np.sqrt(power)), float(np.nanmean(residual)), record.displacement_unit
+    said = [(v.share, _followed(v, unit)) for v in views if v.significant]
+    if held is not None and held.significant:
+        said.append((held.share, _held(held, slope, count, unit)))
+    said.append((spectrum.share, _lines(spectrum)))
+    worth = sorted((row for row in said if row[0] > WORTH_SAYING), key=lambda row: -row[0])
+    findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in worth)]
+    if split is not None and split.repeats > WORTH_SAYING * ground.excess:
+        findings.append(_split(split, unit))
     return Misfit(
         record.name, rms, mean, floor, excess, tuple(views), held, slope, spectrum, split,
-        (size, *said),
+        tuple(findings),
     )  # fmt: skip
-
-
-def _said(
-    views: list[View], spectrum: Spectrum, split: HarmonicSplit | None, excess: float
-) -> list[str]:
-    """Return what is worth saying: views and lines in falling order of share, then the split."""
-    said = [(v.share, v.sentence) for v in views if v.significant]
-    said.append((spectrum.share, spectrum.sentence))
-    worth = sorted((row for row in said if row[0] > WORTH_SAYING), key=lambda row: -row[0])
-    sentences = [sentence for _, sentence in worth]
-    if split is not None and split.linear + split.even + split.odd > WORTH_SAYING * excess:
-        sentences.append(split.sentence)
-    return sentences
 
 
 def _steady(ground: Ground, record: Record, over_time: View, drive: Drive) -> Ground:
@@ -132,45 +130,60 @@ def _predicted(record: Record, residual: FloatArray) -> FloatArray:
     return predicted
 
 
-def _holds(record: Record, ground: Ground) -> tuple[View | None, Slope | None]:
-    """Return the residual against lg of the time since a hold began, and its slope."""
+def _holds(record: Record, ground: Ground) -> tuple[View | None, Slope | None, int]:
+    """Return the residual against lg of the time since a hold began, its slope, and the holds."""
     axis, count = hold_axis(record)
     if not count:
-        return None, None
+        return None, None, 0
     found = view(ground, axis)
     good = found.spread > 0
     if np.count_nonzero(good) < 3:
-        return found, None
+        return found, None, count
     x, weight = np.log10(found.x[good]), found.spread[good] ** -2.0
     x = x - np.average(x, weights=weight)
     spread = float(np.sum(weight * x**2))
     value = float(np.sum(weight * x * found.mean[good])) / spread
-    slope = Slope(value, 1.0 / float(np.sqrt(spread)))
-    if not found.significant:
-        return found, slope
-    after = "a hold" if count == 1 else f"{count} holds"
-    per_decade = (
-        f"by {signed(value, ground.unit)} per decade of time, counted in the direction of the"
-        f" voltage's last change"
-        if abs(value) > 3.0 * slope.error
-        else "without a trend in the logarithm of time"
-    )
-    said = f"In {after} the residual moves {per_decade}; {explains(found.share)}."
-    return replace(found, sentence=said), slope
+    return found, Slope(value, 1.0 / float(np.sqrt(spread))), count
 
 
-def _size(record: Record, rms: float, mean: float, floor: NoiseFloor, excess: float) -> str:
-    """Say how large the residual is, against its noise."""
+def _size(record: Record, rms: float, mean: float, floor: NoiseFloor, excess: float) -> Note:
+    """Return how large the residual is, against its noise."""
     unit = record.displacement_unit
-    ratio = rms / floor.level if floor.level > 0 else float("inf")
-    times = "as large as" if 0.95 < ratio < 1.05 else f"{figure(ratio)} times"
-    said = (
-        f"The residual of {record.name} is {quantity(rms, unit)} rms, {times} the noise of"
-        f" {quantity(floor.level, unit)} (from {floor.source})"
+    return note(
+        "residual", record=record.name, rms=(rms, unit), noise=(floor.level, unit),
+        ratio=rms / floor.level if floor.level > 0 else None, source=floor.source,
+        excess=excess, mean=(mean, unit) if abs(mean) > rms else None,
+    )  # fmt: skip
+
+
+def _followed(v: View, unit: str) -> Note:
+    """Return what the residual follows, with the extremes that stand clear of their errors."""
+    ends = tuple(((float(v.mean[k]), unit), (float(v.x[k]), v.x_unit)) for k in v.extremes)
+    return note("follows", axis=v.name, ends=ends, share=v.share)
+
+
+def _held(v: View, slope: Slope | None, count: int, unit: str) -> Note:
+    """Return how the residual moves in holds; without a slope it only differs."""
+    if slope is None:
+        return _followed(v, unit)
+    clear = abs(slope.value) > 3.0 * slope.error
+    moves = (slope.value, unit) if clear else None
+    return note("holds", count=count, moves=moves, share=v.share)
+
+
+def _lines(s: Spectrum) -> Note:
+    lines = tuple((line.frequency, line.name, (line.amplitude, s.unit)) for line in s.others[:3])
+    return note("lines", lines=lines, count=len(s.others), share=s.share)
+
+
+def _split(s: HarmonicSplit, unit: str) -> Note:
+    total = s.repeats + s.noise
+    rows = {"linear": s.linear, "even": s.even, "odd": s.odd}
+    parts = tuple(
+        (name, p / total, (float(np.sqrt(p)), unit))
+        for name, p in sorted(rows.items(), key=lambda row: -row[1])
+        if p > 0
     )
-    if not np.isfinite(ratio):
-        said = f"The residual of {record.name} is {quantity(rms, unit)} rms, without any noise"
-    said += f": {100.0 * excess:.0f} % of its power is above the noise." if excess > 0 else "."
-    if abs(mean) > rms:
-        said += f" Its mean, {signed(mean, unit)}, is left out."
-    return said
+    return note(
+        "harmonics", periods=s.periods, excited=s.excited, parts=parts, rest=s.noise / total
+    )

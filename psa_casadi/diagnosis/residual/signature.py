@@ -188,7 +188,7 @@ def _telling(effect: Component, play: _Play) -> tuple[View, FloatArray, FloatArr
     # two amplitudes at two rates make no curve
     rows = [row for row in rows if not row.name.startswith(("amplitude", "frequency"))]
     if play.warming is not None:
-        rows = [Axis("temperature", "Temperature", "warming", "K", "the warming", play.warming)]
+        rows = [Axis("temperature", "K", play.warming)]
     found = [_view(axis, d) for axis in rows]
     if any(s.memory and s.settles for s in effect.states):
         axis, _ = hold_axis(record)
@@ -209,7 +209,7 @@ def _view(axis: Axis, d: FloatArray) -> tuple[View, FloatArray, FloatArray]:
     there = np.isfinite(d)
     noise = _NOISE * float(np.nanstd(d))
     residual = d + noise * np.random.default_rng(0).standard_normal(d.size)
-    seen = view(ground_of(residual, noise, "m"), axis)
+    seen = view(ground_of(residual, noise), axis)
     sign = np.ones(d.size) if axis.sign is None else axis.sign
     on = there & np.isfinite(axis.x) & (sign != 0)
     coordinate, counted = np.where(on, axis.x, np.nan), np.where(on, d * sign, np.nan)
@@ -245,8 +245,6 @@ def _spectrum(time: FloatArray, d: FloatArray) -> View:
     share = float(np.sum(power[band]) / np.sum(power))
     shown = (frequency > 0) & (frequency < 20.0 * peak)
     density: FloatArray = np.sqrt(2.0 * step * power / float(window @ window))
-    said = f"{100.0 * share:.0f} % of the difference's power lies around {peak:.3g} Hz."
     return View(
-        "spectrum", "Spectrum", "frequency", "Hz", frequency[shown], density[shown],
-        np.zeros(int(shown.sum())), share, significant=True, sentence=said,
-    )  # fmt: skip
+        "spectrum", "Hz", frequency[shown], density[shown], np.zeros(int(shown.sum())), share, True
+    )

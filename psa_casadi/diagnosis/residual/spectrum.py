@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.floor import NoiseFloor, figure, quantity
+from psa_casadi.diagnosis.noise.floor import NoiseFloor
 from psa_casadi.records.record import Record
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,7 +39,7 @@ class Spectrum:
     """Amplitude density [m/sqrt(Hz)] of a residual and of the noise at `frequency` [Hz].
 
     `lines` are the strongest first; `share` is what those that are no harmonics of the drive hold
-    of the residual's power above the noise.
+    of the residual's power above the noise. Amplitudes are in `unit`.
     """
 
     frequency: FloatArray
@@ -47,7 +47,12 @@ class Spectrum:
     floor: FloatArray
     lines: tuple[Line, ...]
     share: float
-    sentence: str
+    unit: str
+
+    @property
+    def others(self) -> tuple[Line, ...]:
+        """The lines that are not the drive's."""
+        return tuple(line for line in self.lines if not line.of_drive)
 
 
 def spectrum_of(
@@ -65,13 +70,11 @@ def spectrum_of(
     power = np.abs(np.fft.rfft(even * window)) ** 2 * 2.0 * step / float(window @ window) / there
     frequency = np.arange(power.size) / (n * step)
     lines = _lines(record, frequency, power, drive, window)
-    others = [line for line in lines if not line.of_drive]
-    held = sum(0.5 * line.amplitude**2 for line in others)
+    held = sum(0.5 * line.amplitude**2 for line in lines if not line.of_drive)
     share = min(1.0, held / max(excess, held)) if held > 0 else 0.0
     f, density = _condensed(frequency, power)
-    unit = record.displacement_unit
     noise = _floor_density(floor, f, record.sample_time)
-    return Spectrum(f, density, noise, lines, share, _sentence(others, share, unit))
+    return Spectrum(f, density, noise, lines, share, record.displacement_unit)
 
 
 def _lines(
@@ -96,7 +99,7 @@ def _lines(
         centre = float(power[near] @ frequency[near] / np.sum(power[near]))
         line = _named(centre, amplitude, drive, record.sample_time, width)
         if not line.of_drive and loud[near].any():
-            line = Line(centre, amplitude, "where the drive moves too", True)
+            line = Line(centre, amplitude, "moved by the drive", True)
         rows.append(line)
     return tuple(sorted(rows, key=lambda line: -line.amplitude)[:LINES])
 
@@ -148,7 +151,7 @@ def _named(f: float, amplitude: float, drive: float | None, step: float, width: 
             tone, rate = order * mains, 1.0 / step
             alias = abs(tone - rate * round(tone / rate))
             if abs(f - alias) < max(near, 2e-3 * tone):
-                what = f"{figure(mains)} Hz mains" if order == 1 else f"{tone:g} Hz, from the mains"
+                what = f"{mains:g} Hz mains" if order == 1 else f"{tone:g} Hz, from the mains"
                 return Line(f, amplitude, what if tone < 0.5 * rate else f"alias of {what}", False)
     return Line(f, amplitude, "", False)
 
@@ -168,18 +171,3 @@ def _floor_density(floor: NoiseFloor, frequency: FloatArray, step: float) -> Flo
     faded = floor.autocovariance * (1.0 - lags / lags.size) * np.where(lags > 0, 2.0, 1.0)
     power = np.cos(2.0 * np.pi * np.outer(frequency * step, lags)) @ faded
     return np.sqrt(np.maximum(2.0 * step * power, 0.0))
-
-
-def _sentence(lines: list[Line], share: float, unit: str) -> str:
-    if not lines:
-        return "The spectrum has no lines besides the drive's."
-    said = ", ".join(
-        f"{line.frequency:.4g} Hz{f' ({line.name})' if line.name else ''} with"
-        f" {quantity(line.amplitude, unit)}"
-        for line in lines[:3]
-    )
-    word = "a line" if len(lines) == 1 else "lines"
-    return (
-        f"The residual has {word} whatever the drive does: {said} of amplitude;"
-        f" this explains {100.0 * share:.0f} % of the excess."
-    )

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.floor import figure, quantity
 from psa_casadi.records.quality.noise import correlation_inflation
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,15 +30,21 @@ class View:
     """
 
     name: str
-    title: str
-    x_label: str
     x_unit: str
     x: FloatArray
     mean: FloatArray
     spread: FloatArray
-    share: float
-    significant: bool
-    sentence: str
+    share: float = 0.0
+    significant: bool = False
+
+    @property
+    def extremes(self) -> tuple[int, ...]:
+        """The bins of the largest and least mean that stand clear of errors, the larger first."""
+        clear = np.flatnonzero(np.abs(self.mean) > _CLEAR * self.spread)
+        if not clear.size:
+            return ()
+        ends = {int(clear[f(self.mean[clear])]) for f in (np.argmax, np.argmin)}
+        return tuple(sorted(ends, key=lambda k: -abs(self.mean[k])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,64 +52,64 @@ class Ground:
     """What all views share: `index` (m,) of the samples that count of the record's n, and there.
 
     `residual` (m,) is without its mean, `excess` [m^2] its power above the noise, at least a tenth
-    of all; `unit` is "m" or "counts".
+    of all.
     """
 
     n: int
     index: IndexArray
     residual: FloatArray
     excess: float
-    unit: str
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """A coordinate of the samples `x` (n,), nan where it has no value, and how to show it.
+    """A coordinate of the samples `x` (n,), nan where it has no value, in the unit `x_unit`.
 
-    `sign` (n,) is multiplied to the residual, 0 where it does not count; `noun` names the axis in a
-    sentence.
+    `sign` (n,) is multiplied to the residual, 0 where it does not count.
     """
 
     name: str
-    title: str
-    x_label: str
     x_unit: str
-    noun: str
     x: FloatArray
     log: bool = False
     blocks: int = COARSE
     sign: FloatArray | None = None
 
 
-def ground_of(residual: FloatArray, level: float, unit: str) -> Ground:
+def ground_of(residual: FloatArray, level: float) -> Ground:
     """Return the samples of a residual (n,) that count; `level` [m] is that of the noise."""
     index = np.flatnonzero(np.isfinite(residual))
     values = residual[index] - np.mean(residual[index]) if index.size else residual[index]
     power = float(np.mean(values**2)) if index.size else 0.0
-    return Ground(residual.size, index, values, max(power - level**2, 0.1 * power), unit)
+    return Ground(residual.size, index, values, max(power - level**2, 0.1 * power))
 
 
 def view(ground: Ground, axis: Axis) -> View:
-    """Return the view of a residual along one axis. Work grows with the number of samples."""
+    """Return the view of a residual along one axis, empty where there are too few samples.
+
+    Work grows with the number of samples.
+    """
+    none = np.zeros(0)
+    nothing = View(axis.name, axis.x_unit, none, none, none)
     x, r = axis.x[ground.index], ground.residual
     there = np.isfinite(x)
     if axis.sign is not None:
         r = r * axis.sign[ground.index]
         there &= axis.sign[ground.index] != 0
     if np.count_nonzero(there) < 8 * FEWEST:
-        return _nothing(axis, f"This record is too short for {axis.noun}, or has none.")
+        return nothing
     x, r, where = x[there], r[there], ground.index[there]
     x = np.log10(x) if axis.log else _rounded(x)
     edges = _edges(x, axis.log)
     if not edges.size:
-        return _nothing(axis, f"This record has a single value of {axis.noun}.")
+        return nothing
     bins = np.searchsorted(edges, x, side="right")
     blocks = 2 * max(2, min(axis.blocks, r.size // 24) // 2)
     block = where * blocks // ground.n
     count = _table(bins, block, None, edges.size + 1, blocks)
     kept = count.sum(1) >= FEWEST
     if np.count_nonzero(kept) < 2:
-        return _nothing(axis, f"This record is too short for {axis.noun}.")
+        return nothing
     count, total = count[kept], _table(bins, block, r, edges.size + 1, blocks)[kept]
     place = np.bincount(bins, weights=x, minlength=kept.size)[kept] / count.sum(1)
     square = np.bincount(bins, weights=r**2, minlength=kept.size)[kept]
@@ -114,7 +119,7 @@ def view(ground: Ground, axis: Axis) -> View:
     gain, significant = _explained(count, total, max(inflation, 1.0) * float(np.mean(variance)))
     explained = gain / ground.residual.size
     found = replace(
-        _nothing(axis, f"Against {axis.noun}, nothing is seen beyond the noise."),
+        nothing,
         x=10.0**place if axis.log else place,
         mean=mean,
         spread=np.sqrt(inflation * variance / count.sum(1)),
@@ -122,7 +127,7 @@ def view(ground: Ground, axis: Axis) -> View:
     if not significant:
         return found
     share = float(min(1.0, explained / max(ground.excess, explained)))
-    return _worded(replace(found, share=share, significant=True), axis, ground.unit)
+    return replace(found, share=share, significant=True)
 
 
 def _table(
@@ -192,36 +197,3 @@ def _explained(count: FloatArray, total: FloatArray, noise: float) -> tuple[floa
     # the variance itself is uncertain where blocks are few
     least = (8.0 * float(np.sqrt(count.shape[0])) + 12.0) * (1.0 + 20.0 / blocks) * noise
     return explained, agree and explained > least
-
-
-def _nothing(axis: Axis, sentence: str) -> View:
-    none = np.zeros(0)
-    return View(
-        axis.name, axis.title, axis.x_label, axis.x_unit, none, none, none, 0.0, False, sentence
-    )
-
-
-def _worded(v: View, axis: Axis, unit: str) -> View:
-    """Return the view with its sentence: the extremes that stand clear of their errors."""
-    clear = np.flatnonzero(np.abs(v.mean) > _CLEAR * v.spread)
-    ends = {int(clear[f(v.mean[clear])]) for f in (np.argmax, np.argmin)} if clear.size else set()
-    seen = " and ".join(
-        f"{signed(v.mean[k], unit)} at {_at(v.x[k], v.x_unit)}"
-        for k in sorted(ends, key=lambda k: -abs(v.mean[k]))
-    )
-    said = f"The residual follows {axis.noun}{f': {seen}' if seen else ''}; {explains(v.share)}."
-    return replace(v, sentence=said)
-
-
-def explains(share: float) -> str:
-    """Return the share of a view as the end of a sentence."""
-    return f"this view explains {100.0 * share:.0f} % of the excess"
-
-
-def signed(value: float, unit: str) -> str:
-    """Return a residual with its sign and unit."""
-    return f"{'+' if value > 0 else ''}{quantity(value, unit)}"
-
-
-def _at(value: float, unit: str) -> str:
-    return quantity(value, unit) if unit in ("m", "s") else f"{figure(value)} {unit}"

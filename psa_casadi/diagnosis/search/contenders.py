@@ -18,6 +18,7 @@ from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 
@@ -45,28 +46,17 @@ def contenders(
 
 def one_of_each(
     found: Sequence[Contender], experiments: Sequence[Experiment]
-) -> tuple[tuple[Contender, ...], str]:
+) -> tuple[tuple[Contender, ...], tuple[Note, ...]]:
     """Return contenders of which a voltage may tell one from another, and what none will tell.
 
-    Of effects that bend the same curve the best fit stands for all; the sentence is empty where
-    there are none.
+    Of effects that bend the same curve the best fit stands for all.
     """
     best = sorted(found, key=lambda c: c.fit.cost)
     own = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
     groups = same_curves(experiments, own, best[0].fit) if best else ()
     rest = {name for group in groups for name in group[1:]}
-    said = " ".join(same_curve_note(group) for group in groups)
-    return tuple(c for c in found if c.effect not in rest), said
-
-
-def same_curve_note(names: Sequence[str]) -> str:
-    """Return the sentence on effects that bend the same curve."""
-    return (
-        f"{' and '.join(names)} bend the same curve: no voltage below the resonances tells one from"
-        " another. Measure the displacement with a second sensor (column displacement_2) or the"
-        " load's force (load_force), elsewhere in the range of this sensor, or without the load;"
-        " or sample fast enough to excite and see the resonances."
-    )
+    same = tuple(note("same_curve", effects=group) for group in groups)
+    return tuple(c for c in found if c.effect not in rest), same
 
 
 def fit_contenders(

@@ -132,9 +132,8 @@ def _with_further(
         found = omnibus(f.residuals, voltage, time, own, noise, knowable=f.straight, even=even)
         p = min(1.0, found.p_value * (1 + len(fit.further)))
         if found.alarm and p < thresholds().alarm:
-            where = f"Of {f.column}: {found.where[:1].lower()}{found.where[1:]}"
             size = max(test.size, 2.0 * test.knowable)
-            test = replace(test, p_value=p, excess=found.excess, where=where, size=size)
+            test = replace(found, p_value=p, size=size, knowable=test.knowable, output=f.column)
     return test
 
 

@@ -18,7 +18,6 @@ from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.words.phrases import (
     handy_scale,
-    in_page_unit,
     listing,
     one_unit,
     rest_sentence,
@@ -163,6 +162,6 @@ def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str
         page.paragraph(note, "note")
     if d.noise:
         page.section("Noise")
-        page.bullets(in_page_unit(n.sentence) for n in d.noise)
+        page.bullets(n.sentence for n in d.noise)
     page.section("Records")
     page.table(record_table(d.experiments, origin))

@@ -1,6 +1,5 @@
 """The results as plain text for a terminal."""
 
-import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,6 +15,8 @@ from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.budget_words import budget_sentence
+from psa_casadi.report.words.misfit_words import strongest
+from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
@@ -27,7 +28,6 @@ from psa_casadi.report.words.phrases import (
     probability_text,
     rest_sentence,
     scale_of,
-    strongest_sentence,
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
@@ -44,9 +44,6 @@ if TYPE_CHECKING:  # which take long to load
     from psa_casadi.export.check.check import CheckReport
 
 _LABEL = 10
-#: Where the first sentence of a note ends; how a sentence on a view ends.
-_FIRST = re.compile(r"(?<=\.) ")
-_EXPLAINS = re.compile(r"; this(?: view)? explains (\d+ %) of the excess(?=\.)")
 
 
 def story(
@@ -79,8 +76,8 @@ def story(
 def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
     lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
-    wrong = _EXPLAINS.sub(r" (\1 of the excess)", strongest_sentence(d.misfit))
-    lines += [("wrong", wrong)] if wrong else []
+    wrong = strongest(d.misfit)
+    lines += [("wrong", brief_text(wrong))] if wrong else []
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
     lines += [
         ("records", records_text(d.experiments, origin)),
@@ -100,8 +97,13 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     lines.append(("remains", rest_sentence(d)))
     lines.append(("blind to", _blind(d)))
     lines.append(("next", d.next_experiment.why))
-    lines.extend(("note", _FIRST.split(note, maxsplit=1)[0]) for note in d.notes)
+    lines.extend(("note", _first_sentence(note)) for note in d.notes)
     return lines
+
+
+def _first_sentence(text: str) -> str:
+    head, dot, _ = text.partition(". ")
+    return f"{head}{dot.rstrip()}"
 
 
 def _cause(d: Diagnosis, cause: Cause) -> str:
