@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.screening.probes import Direction, directions
 from psa_casadi.diagnosis.screening.screen import Score, Screening, copies, screen
 from psa_casadi.diagnosis.screening.sets import best_sets

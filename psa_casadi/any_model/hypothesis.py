@@ -14,9 +14,8 @@ from psa_casadi.any_model.fit import FittedOutput, OdeFit
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.trials import Table, trial_directions
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
 from psa_casadi.diagnosis.held_out.errors import output_gain
-from psa_casadi.diagnosis.noise.colour import Colour, noise_rms
-from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
 from psa_casadi.diagnosis.screening.evidence import estimated
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.screening.screen import Score, Screening, screen

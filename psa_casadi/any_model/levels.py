@@ -9,7 +9,7 @@ import numpy.typing as npt
 from psa_casadi.any_model.fit import OdeFit, measured_outputs, refitted
 from psa_casadi.any_model.predict import shown_by
 from psa_casadi.any_model.runs import Run, noise_share
-from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, uncertain
+from psa_casadi.diagnosis.colour import Colour, noise_rms, uncertain
 from psa_casadi.records.quality.noise import first_order_noise
 
 FloatArray = npt.NDArray[np.float64]

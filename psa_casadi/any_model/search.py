@@ -24,7 +24,7 @@ from psa_casadi.any_model.levels import relevelled
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.trials import Table
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.screening.evidence import evidence
 from psa_casadi.diagnosis.screening.screen import Score
 from psa_casadi.diagnosis.screening.sets import Together, best_sets

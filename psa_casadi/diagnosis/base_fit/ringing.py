@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.colour import residual_colour
+from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit

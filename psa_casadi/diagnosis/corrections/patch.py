@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections.correct import Correction
-from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.notes import note

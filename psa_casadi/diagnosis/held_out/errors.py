@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.diagnosis.colour import rms
 from psa_casadi.diagnosis.held_out.parts import FEWEST_RECORDS, jackknife, parts_of
-from psa_casadi.diagnosis.noise.colour import rms
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import predicted_further
 from psa_casadi.identification.fitting.prediction import measured

@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.screening.screen import Score, Screening, whitened_residuals
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fitted import Fitted

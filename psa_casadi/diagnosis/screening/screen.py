@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.colour import Colour, colour_of
+from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.screening.spans import Span, combined, declared, spans
 from psa_casadi.diagnosis.thresholds import thresholds

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.screening.screen import (
     further_columns,

@@ -18,7 +18,7 @@ from psa_casadi.diagnosis.base_fit.variants import (
     instead_of_mode,
     rings,
 )
-from psa_casadi.diagnosis.noise.colour import noise_rms
+from psa_casadi.diagnosis.colour import noise_rms
 from psa_casadi.diagnosis.search.exchange import exchange
 from psa_casadi.diagnosis.search.fits import (
     afresh,

@@ -21,13 +21,13 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.diagnosis.held_out.errors import (
     held_out_further,
     held_out_rms,
     output_gain,
     whole_residuals,
 )
-from psa_casadi.diagnosis.noise.colour import Colour, rms
 from psa_casadi.diagnosis.screening.evidence import evidence
 from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.errors import PsaError

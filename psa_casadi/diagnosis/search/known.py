@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
+from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.search.fits import begun_again, to_end

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.residual_tests import Omnibus
+from psa_casadi.diagnosis.colour import Omnibus
 from psa_casadi.diagnosis.screening.evidence import levelled, probabilities, temperature
 from psa_casadi.diagnosis.screening.screen import Screening
 from psa_casadi.diagnosis.search.fits import with_cause, without

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.colour import Colour, noise_rms, residual_colour
+from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus, residual_colour
 from psa_casadi.diagnosis.noise.floor import knowable_of, known_colour
-from psa_casadi.diagnosis.noise.residual_tests import Omnibus, omnibus
 from psa_casadi.diagnosis.screening.evidence import estimated
 from psa_casadi.diagnosis.screening.probes import Direction, directions
 from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
