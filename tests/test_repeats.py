@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.noise.floor import noise_floor
+from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import Record, excitation, read_record
 from psa_casadi.records.quality.repeats import holds, repeats

@@ -7,7 +7,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit.between_samples import smooth_between
 from psa_casadi.diagnosis.columns import decisions
 from psa_casadi.diagnosis.driven import driven
-from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
+from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched

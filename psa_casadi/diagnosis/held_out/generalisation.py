@@ -9,7 +9,7 @@ import scipy
 
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.diagnosis.held_out.errors import held_out_residuals
-from psa_casadi.diagnosis.noise.floor import NoiseFloor, knowable_of
+from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment

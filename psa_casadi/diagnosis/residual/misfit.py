@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.floor import NoiseFloor
+from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.diagnosis.residual.coordinates import (
     Drive,
     axes,

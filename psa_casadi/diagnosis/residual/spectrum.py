@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.floor import NoiseFloor
+from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.records.record import Record
 
 FloatArray = npt.NDArray[np.float64]
