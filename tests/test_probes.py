@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.screening.peaks import residual_jumps, residual_periods
-from psa_casadi.diagnosis.screening.probes import directions
+from psa_casadi.diagnosis.probes import directions, residual_jumps, residual_periods
 from psa_casadi.diagnosis.search.hypothesis import root_of
 from psa_casadi.diagnosis.search.worth import shows_memory
 from psa_casadi.effects import EFFECTS

@@ -14,7 +14,7 @@ from psa_casadi.any_model.predict import traced
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.start import start_of
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.screening.probes import Direction
+from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.side_by_side import side_by_side

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour, colour_of
-from psa_casadi.diagnosis.screening.probes import Direction
-from psa_casadi.diagnosis.screening.spans import Span, combined, declared, spans
+from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fitted import Fitted
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.screening.probes import Direction
+from psa_casadi.diagnosis.probes import Direction, Span, combined, spans
 from psa_casadi.diagnosis.screening.screen import (
     further_columns,
     independent,
@@ -21,7 +21,6 @@ from psa_casadi.diagnosis.screening.screen import (
     whitened_residuals,
     without,
 )
-from psa_casadi.diagnosis.screening.spans import Span, combined, spans
 from psa_casadi.identification.fitting.fitted import Fitted
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 
