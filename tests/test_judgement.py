@@ -16,7 +16,7 @@ from psa_casadi.diagnosis.judgement import (
     verdict_of,
     withdrawn_names,
 )
-from psa_casadi.diagnosis.screening.evidence import probabilities
+from psa_casadi.diagnosis.screening import probabilities
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.search.view import View
 

@@ -17,8 +17,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
 from psa_casadi.diagnosis.held_out.errors import output_gain
 from psa_casadi.diagnosis.probes import Direction
-from psa_casadi.diagnosis.screening.evidence import estimated
-from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
+from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
 from psa_casadi.diagnosis.search.worth import confirmed
 from psa_casadi.errors import PsaError
 

@@ -24,7 +24,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out.shares import Removed, Share
 from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
-from psa_casadi.diagnosis.screening.evidence import probabilities, temperature
+from psa_casadi.diagnosis.screening import probabilities, temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.notes import Note, note

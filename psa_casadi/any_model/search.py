@@ -25,9 +25,7 @@ from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.trials import Table
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.screening.evidence import evidence
-from psa_casadi.diagnosis.screening.screen import Score
-from psa_casadi.diagnosis.screening.sets import Together, best_sets
+from psa_casadi.diagnosis.screening import Score, Together, best_sets, evidence
 from psa_casadi.diagnosis.search.worth import another_minimum, inside_ranges
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError

@@ -6,7 +6,7 @@ from dataclasses import replace
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.judgement import told_from
 from psa_casadi.diagnosis.result import Decision, Verdict
-from psa_casadi.diagnosis.screening.evidence import further_gains
+from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.verdict import NAMING

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from psa_casadi.diagnosis.corrections.correct import Correction
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.diagnosis.screening.evidence import credible_set, temperature
+from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.notes import Note, note

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import residual_colour
-from psa_casadi.diagnosis.screening.screen import independent, without
+from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.search.force_start import force_of

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections.correct import Correction
-from psa_casadi.diagnosis.screening.evidence import temperature
+from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.notes import note
 from psa_casadi.records.split import Experiment

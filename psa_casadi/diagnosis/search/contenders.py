@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Contender
-from psa_casadi.diagnosis.screening.evidence import credible_set
+from psa_casadi.diagnosis.screening import credible_set
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import hypothesis, scale_of
 from psa_casadi.diagnosis.search.steps import Step

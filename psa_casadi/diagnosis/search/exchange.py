@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.screening.screen import Copy, Score, copies
+from psa_casadi.diagnosis.screening import Copy, Score, copies
 from psa_casadi.diagnosis.search.fits import in_place, like, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import NEAR, SHARE, Known

@@ -7,8 +7,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.probes import Direction
-from psa_casadi.diagnosis.screening.screen import Copy, Score
-from psa_casadi.diagnosis.screening.sets import Together
+from psa_casadi.diagnosis.screening import Copy, Score, Together
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis
 from psa_casadi.diagnosis.search.quick_fits import (
     QUICK,

@@ -28,7 +28,7 @@ from psa_casadi.diagnosis.held_out.errors import (
     output_gain,
     whole_residuals,
 )
-from psa_casadi.diagnosis.screening.evidence import evidence
+from psa_casadi.diagnosis.screening import evidence
 from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit

@@ -8,7 +8,7 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.probes import Direction
-from psa_casadi.diagnosis.screening.evidence import temperature
+from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.fits import begun_again, to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, scale_of, tried
 from psa_casadi.diagnosis.search.quick_fits import cost_beside

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from psa_casadi.diagnosis.screening.sets import best_sets
+from psa_casadi.diagnosis.screening import best_sets
 from psa_casadi.diagnosis.search.fits import in_place, to_end, with_causes, with_causes_afresh
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, Known

@@ -8,8 +8,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Omnibus
-from psa_casadi.diagnosis.screening.evidence import levelled, probabilities, temperature
-from psa_casadi.diagnosis.screening.screen import Screening
+from psa_casadi.diagnosis.screening import Screening, levelled, probabilities, temperature
 from psa_casadi.diagnosis.search.fits import with_cause, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, root_of
 from psa_casadi.diagnosis.search.known import Searched

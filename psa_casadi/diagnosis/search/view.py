@@ -9,8 +9,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus, residual_colour
 from psa_casadi.diagnosis.noise import knowable_of, known_colour
 from psa_casadi.diagnosis.probes import Direction, directions
-from psa_casadi.diagnosis.screening.evidence import estimated
-from psa_casadi.diagnosis.screening.screen import Score, Screening, screen
+from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds

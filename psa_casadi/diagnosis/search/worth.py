@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import DISPLACEMENT_PEAKS, Component
-from psa_casadi.diagnosis.screening.screen import independent, without
+from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError
