@@ -6,16 +6,19 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise import NoiseFloor
-from psa_casadi.diagnosis.residual.coordinates import (
-    Drive,
-    axes,
-    drive_of,
-    hold_axis,
-    time_axis,
-)
 from psa_casadi.diagnosis.residual.harmonics import HarmonicSplit, harmonic_split
 from psa_casadi.diagnosis.residual.spectrum import Spectrum, spectrum_of
-from psa_casadi.diagnosis.residual.views import Ground, View, ground_of, view
+from psa_casadi.diagnosis.views import (
+    Drive,
+    Ground,
+    View,
+    axes,
+    drive_of,
+    ground_of,
+    hold_axis,
+    time_axis,
+    view,
+)
 from psa_casadi.errors import InputError
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.drive import drive_frequency

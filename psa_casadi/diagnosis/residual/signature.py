@@ -13,8 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component
-from psa_casadi.diagnosis.residual.coordinates import axes, drive_of, hold_axis, time_axis
-from psa_casadi.diagnosis.residual.views import Axis, View, ground_of, view
+from psa_casadi.diagnosis.views import (
+    Axis,
+    View,
+    axes,
+    drive_of,
+    ground_of,
+    hold_axis,
+    time_axis,
+    view,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
