@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from psa_casadi.diagnosis.misfit import misfit
 from psa_casadi.diagnosis.noise import noise_floor
-from psa_casadi.diagnosis.residual.misfit import misfit
 from psa_casadi.records import Record, excitation
 from tests.misfit_cases import MULTISINE, NOISE, SINE, TIME, FloatArray, grid, noise, seen, shares
 

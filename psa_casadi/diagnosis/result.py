@@ -11,9 +11,9 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.budget import Budget
 from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.held_out.errors import Errors, Gain
+from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.diagnosis.remedy.size import Size
-from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model

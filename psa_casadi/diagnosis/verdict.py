@@ -29,10 +29,10 @@ from psa_casadi.diagnosis.judgement import (
     verdict_of,
     withdrawn_names,
 )
+from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.next_record import next_experiment
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.remedy.size import sizes
-from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.result import (
     Candidate,
     Cause,

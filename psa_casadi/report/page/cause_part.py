@@ -1,7 +1,7 @@
 """The part of a page that says why a cause was named: evidence, signature beside the data."""
 
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
-from psa_casadi.diagnosis.residual.misfit import Misfit
+from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.residual.signature import Signature, signature
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.report.page.document import Document

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psa_casadi.diagnosis.residual.misfit import WORTH_SAYING, Misfit
+from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture

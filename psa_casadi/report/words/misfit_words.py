@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from psa_casadi.diagnosis.residual.misfit import Misfit
+from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.notes import Note
 from psa_casadi.report.words.phrases import quantity, signed
 
