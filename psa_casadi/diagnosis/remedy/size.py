@@ -7,7 +7,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.remedy.trials import SIGNED, TESTS, Figure, drive_of
-from psa_casadi.diagnosis.residual.signature import STACK
+from psa_casadi.diagnosis.signature import STACK
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.residual.signature import standard_voltage
+from psa_casadi.diagnosis.signature import standard_voltage
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.linear_part import linear_part

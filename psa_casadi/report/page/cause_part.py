@@ -2,8 +2,8 @@
 
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.diagnosis.misfit import Misfit
-from psa_casadi.diagnosis.residual.signature import Signature, signature
 from psa_casadi.diagnosis.result import Cause, Diagnosis
+from psa_casadi.diagnosis.signature import Signature, signature
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.misfit_part import data_view, drawn
 from psa_casadi.report.page.packed import Picture

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.residual.signature import Signature
+from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.files import atomic_path
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.phrases import Scale, length_scale, number, percent, plain, with_unit

@@ -6,7 +6,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from psa_casadi.diagnosis.misfit import Misfit, Spectrum
-from psa_casadi.diagnosis.residual.signature import Signature
+from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.diagnosis.views import View
 from psa_casadi.report.plots.theme import INK, Plot, logarithmic, styled
 from psa_casadi.report.words.misfit_words import AXES
