@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import sawtooth
 
+from psa_casadi.diagnosis.confirmation import coverage_notes, unconfirmed
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.confirmation import unconfirmed
-from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.start.other_quantities import doubtful_quantity

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.diagnosis.held_out.coverage import coverage_notes
+from psa_casadi.diagnosis.confirmation import coverage_notes
 from psa_casadi.notes import texts
 from psa_casadi.records import Record
 from psa_casadi.records.quality.noise import correlation_inflation, high_frequency_noise
