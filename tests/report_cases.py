@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.held_out.errors import Errors, Gain
+from psa_casadi.diagnosis.held_out import Errors, Gain
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.remedy.size import Size

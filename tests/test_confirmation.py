@@ -8,7 +8,7 @@ from scipy.signal import sawtooth
 
 from psa_casadi.diagnosis.confirmation import coverage_notes, unconfirmed
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.errors import Gain
+from psa_casadi.diagnosis.held_out import Gain
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.start.other_quantities import doubtful_quantity
 from psa_casadi.records.quality.suspects import suspects

@@ -8,7 +8,7 @@ import pytest
 
 from psa_casadi.diagnosis.corrections.correct import Correction
 from psa_casadi.diagnosis.corrections.kinds import KINDS
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.judgement import (
     Weighed,
     too_small,

@@ -12,7 +12,7 @@ from plotly.offline import get_plotlyjs
 
 import psa_casadi as psa
 from psa_casadi.command_line import typed
-from psa_casadi.diagnosis.held_out.errors import Errors
+from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.report.page.design_page import write_design_page
 from psa_casadi.report.page.fit_page import write_fit_report
 from psa_casadi.report.words.phrases import handy_scale, length_scale, one_unit, quantity

@@ -8,8 +8,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Budget, Share
 from psa_casadi.diagnosis.result import Cause, Estimate, Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.cli.diagnosis_files import models
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Budget, Share
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.report.page.diagnosis import write_report

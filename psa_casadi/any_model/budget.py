@@ -1,7 +1,7 @@
 """The error budget of any model: what each cause removes of the base's held-out error.
 
 Shares are of the power above the noise, outputs over their noise, with the intervals of a stack's
-budget (`psa_casadi.diagnosis.held_out.shares`).
+budget (`psa_casadi.diagnosis.held_out`).
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.runs import Run, counted
-from psa_casadi.diagnosis.held_out.shares import Removed, Share
+from psa_casadi.diagnosis.held_out import Removed, Share
 
 FloatArray = npt.NDArray[np.float64]
 

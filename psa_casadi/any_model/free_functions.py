@@ -26,7 +26,7 @@ from psa_casadi.any_model.search import Known
 from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.any_model.start import start_of
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.screening import independent, whitened_jacobian, without
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model

@@ -15,7 +15,7 @@ from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.trials import Table, trial_directions
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
-from psa_casadi.diagnosis.held_out.errors import output_gain
+from psa_casadi.diagnosis.held_out import output_gain
 from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
 from psa_casadi.diagnosis.search.worth import confirmed

@@ -21,7 +21,7 @@ from psa_casadi.any_model.weighing import (
     why_not_named,
 )
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.held_out.shares import Removed, Share
+from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.diagnosis.screening import probabilities, temperature

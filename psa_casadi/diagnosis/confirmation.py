@@ -8,7 +8,7 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.colour import Colour, rms
-from psa_casadi.diagnosis.held_out.errors import Gain, held_out_residuals
+from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
 from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit

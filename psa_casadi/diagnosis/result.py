@@ -8,9 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.budget import Budget
 from psa_casadi.diagnosis.corrections.patch import Patch
-from psa_casadi.diagnosis.held_out.errors import Errors, Gain
+from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.diagnosis.remedy.size import Size

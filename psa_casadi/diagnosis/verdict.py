@@ -8,13 +8,14 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.alternatives import alternatives
 from psa_casadi.diagnosis.blind_spots import blind_spots, shown
-from psa_casadi.diagnosis.budget import Budget, budget
 from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections.correct import corrections
 from psa_casadi.diagnosis.corrections.export import with_patch
 from psa_casadi.diagnosis.corrections.patch import patch_of
 from psa_casadi.diagnosis.evidence import diagnosis_evidence
-from psa_casadi.diagnosis.held_out.errors import (
+from psa_casadi.diagnosis.held_out import (
+    Budget,
+    budget,
     errors_of,
     gain_of,
     lost_elsewhere,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections.kinds import KINDS, Kind, Signals
-from psa_casadi.diagnosis.held_out.errors import held_out_rms
+from psa_casadi.diagnosis.held_out import held_out_rms
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, rms
-from psa_casadi.diagnosis.held_out.errors import (
+from psa_casadi.diagnosis.held_out import (
     held_out_further,
     held_out_rms,
     output_gain,

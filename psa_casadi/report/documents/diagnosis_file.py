@@ -5,8 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.held_out.errors import Errors, Gain
+from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
 from psa_casadi.diagnosis.result import Candidate, Cause, Verdict, unnamed_causes
 from psa_casadi.shown import Lined
 

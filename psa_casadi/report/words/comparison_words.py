@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import BudgetShare, Finding
 from psa_casadi.population.parameters import Estimates, display_unit

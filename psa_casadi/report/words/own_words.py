@@ -6,7 +6,7 @@ import numpy as np
 
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
     either,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words.phrases import (
