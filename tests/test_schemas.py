@@ -10,7 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.corrections.patch import Patch
+from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.result import Alternative
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.check.check import CheckReport

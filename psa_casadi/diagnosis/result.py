@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
+from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured

@@ -10,8 +10,6 @@ from psa_casadi.diagnosis.alternatives import alternatives
 from psa_casadi.diagnosis.blind_spots import blind_spots, shown
 from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections.correct import corrections
-from psa_casadi.diagnosis.corrections.export import with_patch
-from psa_casadi.diagnosis.corrections.patch import patch_of
 from psa_casadi.diagnosis.evidence import diagnosis_evidence
 from psa_casadi.diagnosis.held_out import (
     Budget,
@@ -31,6 +29,7 @@ from psa_casadi.diagnosis.judgement import (
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.next_record import next_experiment
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
+from psa_casadi.diagnosis.patch import patch_of, with_patch
 from psa_casadi.diagnosis.remedy.size import sizes
 from psa_casadi.diagnosis.result import (
     Candidate,

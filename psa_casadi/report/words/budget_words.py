@@ -1,7 +1,7 @@
 """The error budget and the unnamed correction in words and as a table."""
 
-from psa_casadi.diagnosis.corrections.patch import Patch
 from psa_casadi.diagnosis.held_out import Budget, Share
+from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.words.phrases import Scale, listing, number, plain
 from psa_casadi.report.words.tables import Table
