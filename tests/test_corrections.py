@@ -8,7 +8,7 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.corrections.correct import Correction, corrections
+from psa_casadi.diagnosis.corrections import Correction, corrections
 from psa_casadi.diagnosis.held_out import budget, held_out_rms
 from psa_casadi.diagnosis.judgement import Weighed
 from psa_casadi.diagnosis.patch import patch_of, with_patch

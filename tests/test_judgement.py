@@ -6,8 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.corrections.correct import Correction
-from psa_casadi.diagnosis.corrections.kinds import KINDS
+from psa_casadi.diagnosis.corrections import KINDS, Correction
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.judgement import (
     Weighed,

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from psa_casadi.diagnosis.corrections.correct import Correction
+from psa_casadi.diagnosis.corrections import Correction
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.screening import credible_set, temperature

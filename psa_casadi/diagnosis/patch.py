@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.corrections.correct import Correction
-from psa_casadi.diagnosis.corrections.kinds import time_constants
+from psa_casadi.diagnosis.corrections import Correction, time_constants
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight

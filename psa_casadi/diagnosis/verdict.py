@@ -9,7 +9,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.alternatives import alternatives
 from psa_casadi.diagnosis.blind_spots import blind_spots, shown
 from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
-from psa_casadi.diagnosis.corrections.correct import corrections
+from psa_casadi.diagnosis.corrections import corrections
 from psa_casadi.diagnosis.evidence import diagnosis_evidence
 from psa_casadi.diagnosis.held_out import (
     Budget,

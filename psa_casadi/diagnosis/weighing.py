@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from psa_casadi.diagnosis.corrections.correct import Correction, corrections
+from psa_casadi.diagnosis.corrections import Correction, corrections
 from psa_casadi.diagnosis.held_out import removed_from
 from psa_casadi.diagnosis.judgement import Weighed
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
