@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.base_fit.between_samples import smooth_between
+from psa_casadi.diagnosis.base_fit import smooth_between
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.stacks import stack_model

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.base_fit.between_samples import smooth_between
+from psa_casadi.diagnosis.base_fit import smooth_between
 from psa_casadi.diagnosis.columns import decisions
 from psa_casadi.diagnosis.driven import driven
 from psa_casadi.diagnosis.noise import without_stuck_readings

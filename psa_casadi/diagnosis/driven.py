@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.base_fit.variants import from_resonances
+from psa_casadi.diagnosis.base_fit import from_resonances
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError

@@ -9,13 +9,13 @@ one of them is better; where much is left, from another base and with all effect
 
 import numpy as np
 
-from psa_casadi.diagnosis.base_fit.ringing import ringing
-from psa_casadi.diagnosis.base_fit.variants import (
+from psa_casadi.diagnosis.base_fit import (
     SEEN,
     from_band,
     from_resonances,
     instead_of,
     instead_of_mode,
+    ringing,
     rings,
 )
 from psa_casadi.diagnosis.colour import noise_rms
