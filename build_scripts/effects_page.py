@@ -8,7 +8,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.remedy.size import example
+from psa_casadi.diagnosis.remedy import example
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES

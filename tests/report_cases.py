@@ -9,7 +9,7 @@ from psa_casadi.components import BASE
 from psa_casadi.diagnosis.held_out import Errors, Gain
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,

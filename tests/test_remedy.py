@@ -8,7 +8,7 @@ import pytest
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.remedy.size import Size, example, sizes
+from psa_casadi.diagnosis.remedy import Size, example, sizes
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.modal_series import MODAL_SERIES

@@ -8,7 +8,7 @@ import numpy as np
 from psa_casadi.any_model.fit import OdeFit
 from psa_casadi.any_model.runs import Run
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.errors import PsaError
 
 

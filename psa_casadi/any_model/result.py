@@ -11,7 +11,7 @@ import numpy.typing as npt
 from psa_casadi.any_model.budget import OdeBudget
 from psa_casadi.any_model.fit import OdeFit
 from psa_casadi.any_model.runs import Run
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict, told
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts

@@ -30,7 +30,7 @@ from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.next_record import next_experiment
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.patch import patch_of, with_patch
-from psa_casadi.diagnosis.remedy.size import sizes
+from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
     Candidate,
     Cause,

@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model

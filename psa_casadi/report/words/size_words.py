@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.report.words.phrases import (
     Scale,
     interval_text,

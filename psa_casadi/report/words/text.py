@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import Errors
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import Identification
