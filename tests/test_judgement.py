@@ -16,8 +16,8 @@ from psa_casadi.diagnosis.judgement import (
     withdrawn_names,
 )
 from psa_casadi.diagnosis.screening import probabilities
+from psa_casadi.diagnosis.search.hypothesis import View
 from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.search.view import View
 
 
 def _share(what: str, share: float) -> Share:

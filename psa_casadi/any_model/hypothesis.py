@@ -18,7 +18,7 @@ from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
 from psa_casadi.diagnosis.held_out import output_gain
 from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
-from psa_casadi.diagnosis.search.worth import confirmed
+from psa_casadi.diagnosis.search.hypothesis import confirmed
 from psa_casadi.errors import PsaError
 
 FloatArray = npt.NDArray[np.float64]
@@ -195,7 +195,7 @@ def held_out_confirms(
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
-    The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.worth.confirmed`), what is
+    The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.hypothesis.confirmed`), what is
     promised summed over the outputs; `score` is what is gained of it.
     """
     gained, promise = held_out_gain(of, before, runs, colour), 0.0

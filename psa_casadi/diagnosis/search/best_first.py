@@ -27,11 +27,10 @@ from psa_casadi.diagnosis.search.fits import (
     with_cause,
     without,
 )
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names, Searched, is_left
 from psa_casadi.diagnosis.search.modes import one_mode, with_modes
 from psa_casadi.diagnosis.search.several import fit_from_other_parents, fit_sets
-from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE

@@ -6,9 +6,8 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.screening import credible_set
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
-from psa_casadi.diagnosis.search.hypothesis import hypothesis, scale_of
+from psa_casadi.diagnosis.search.hypothesis import examine, hypothesis, scale_of
 from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.search.view import examine
 from psa_casadi.diagnosis.task import Task, same_curves
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import InputError

@@ -8,7 +8,7 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import Copy, Score, Together
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis, near_end
 from psa_casadi.diagnosis.search.quick_fits import (
     QUICK,
     Start,
@@ -18,7 +18,6 @@ from psa_casadi.diagnosis.search.quick_fits import (
     fit_with_all,
     quick_fit,
 )
-from psa_casadi.diagnosis.search.worth import near_end
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.search.refitting import quick_rtol, refit

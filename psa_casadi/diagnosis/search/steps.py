@@ -10,10 +10,8 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Omnibus
 from psa_casadi.diagnosis.screening import Screening, levelled, probabilities, temperature
 from psa_casadi.diagnosis.search.fits import with_cause, without
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, root_of
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, in_character, root_of
 from psa_casadi.diagnosis.search.known import Searched
-from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import in_character
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit
