@@ -9,7 +9,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import temperature
-from psa_casadi.diagnosis.search.fits import begun_again, to_end
+from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
     Scale,
@@ -23,7 +23,6 @@ from psa_casadi.diagnosis.search.hypothesis import (
     shows_memory,
     tried,
 )
-from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.task import State, Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.identification.fitting.fit import Fit

@@ -6,9 +6,8 @@ from dataclasses import asdict, replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.search.fits import exchanged, to_end
+from psa_casadi.diagnosis.search.fits import Start, exchanged, fit_with_all, to_end
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.quick_fits import Start, fit_with_all
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES, MOST
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.errors import PsaError

@@ -3,10 +3,15 @@
 from collections.abc import Sequence
 
 from psa_casadi.diagnosis.screening import best_sets
-from psa_casadi.diagnosis.search.fits import in_place, to_end, with_causes, with_causes_afresh
+from psa_casadi.diagnosis.search.fits import (
+    cost_beside,
+    in_place,
+    to_end,
+    with_causes,
+    with_causes_afresh,
+)
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, Known
-from psa_casadi.diagnosis.search.quick_fits import cost_beside
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.simulation.side_by_side import side_by_side
