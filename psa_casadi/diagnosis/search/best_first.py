@@ -19,7 +19,6 @@ from psa_casadi.diagnosis.base_fit import (
     rings,
 )
 from psa_casadi.diagnosis.colour import noise_rms
-from psa_casadi.diagnosis.search.exchange import exchange
 from psa_casadi.diagnosis.search.fits import (
     afresh,
     any_afresh,
@@ -29,8 +28,13 @@ from psa_casadi.diagnosis.search.fits import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names, Searched, is_left
-from psa_casadi.diagnosis.search.modes import one_mode, with_modes
-from psa_casadi.diagnosis.search.several import fit_from_other_parents, fit_sets
+from psa_casadi.diagnosis.search.moves import (
+    exchange,
+    fit_from_other_parents,
+    fit_sets,
+    one_mode,
+    with_modes,
+)
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
