@@ -102,7 +102,7 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
 
     from psa_casadi.design.experiment.experiment import resolving_experiment
     from psa_casadi.diagnosis.result import NextExperiment
-    from psa_casadi.diagnosis.search.contenders import one_of_each
+    from psa_casadi.diagnosis.search.steps import one_of_each
     from psa_casadi.errors import PsaError
     from psa_casadi.report.page.experiment_part import sentences, write_voltage
 

@@ -39,9 +39,8 @@ from psa_casadi.diagnosis.result import (
     Remaining,
     Verdict,
 )
-from psa_casadi.diagnosis.search.contenders import contenders
 from psa_casadi.diagnosis.search.hypothesis import Scale
-from psa_casadi.diagnosis.search.steps import Step
+from psa_casadi.diagnosis.search.steps import Step, contenders
 from psa_casadi.diagnosis.task import same_curves
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.diagnosis.weighing import Balance

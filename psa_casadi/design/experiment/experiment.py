@@ -21,7 +21,7 @@ from psa_casadi.design.experiment.rivals import (
 from psa_casadi.design.experiment.search import BRIEF, GRID, Best, Effort, Progress, coarse, search
 from psa_casadi.design.experiment.separation import Separation, overall
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.search.contenders import one_of_each
+from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import FAST
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
