@@ -19,8 +19,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     scale_of,
 )
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.task import STEPS, Method, Task
-from psa_casadi.diagnosis.thresholds import Thresholds, thresholds, using
+from psa_casadi.diagnosis.task import STEPS, Method, Task, Thresholds, thresholds, using
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose

@@ -11,7 +11,7 @@ from psa_casadi.components import BASE
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.probes import Direction, Span, combined, directions, spans
 from psa_casadi.diagnosis.screening import Score, Screening, best_sets, copies, screen
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose

@@ -25,7 +25,7 @@ from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.diagnosis.screening import probabilities, temperature
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.notes import Note, note
 from psa_casadi.records.checks import FEWEST_SAMPLES

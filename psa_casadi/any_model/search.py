@@ -27,7 +27,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.screening import Score, Together, best_sets, evidence
 from psa_casadi.diagnosis.search.hypothesis import another_minimum, inside_ranges
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError

@@ -8,7 +8,7 @@ from psa_casadi.any_model.hypothesis import OdeHypothesis
 from psa_casadi.any_model.identify import MISSED
 from psa_casadi.any_model.search import Known
 from psa_casadi.diagnosis.screening import temperature
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.notes import Note, note
 
 

@@ -8,7 +8,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.judgement import told_from
 from psa_casadi.diagnosis.result import BlindSpot
 from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.notes import note
 
 

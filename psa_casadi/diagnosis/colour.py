@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.notes import Note, note
 from psa_casadi.records.quality.filtering import filtered
 from psa_casadi.records.quality.noise import first_order_noise

@@ -10,7 +10,7 @@ import scipy
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
 from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.start.doubts import doubtful_voltage
 from psa_casadi.identification.start.other_quantities import doubtful_quantity

@@ -11,8 +11,7 @@ from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
-from psa_casadi.diagnosis.task import Method, Task, Tried
-from psa_casadi.diagnosis.thresholds import using
+from psa_casadi.diagnosis.task import Method, Task, Tried, using
 from psa_casadi.diagnosis.verdict import conclude
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished

@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.base_fit import from_resonances
-from psa_casadi.diagnosis.task import shows_ringing
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import shows_ringing, thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured

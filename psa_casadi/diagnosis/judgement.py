@@ -8,7 +8,7 @@ from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.notes import Note, note
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour, noise_rms, rms
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.notes import Note, note

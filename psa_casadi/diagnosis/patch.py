@@ -11,7 +11,7 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections import Correction, time_constants
 from psa_casadi.diagnosis.screening import temperature
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit

@@ -27,7 +27,7 @@ from psa_casadi.component import (
     SPECTRAL_PEAKS,
     Component,
 )
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column

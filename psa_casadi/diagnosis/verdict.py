@@ -41,8 +41,7 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
-from psa_casadi.diagnosis.task import same_curves
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import same_curves, thresholds
 from psa_casadi.diagnosis.weighing import Balance
 from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy

@@ -35,8 +35,7 @@ from psa_casadi.diagnosis.search.moves import (
     one_mode,
     with_modes,
 )
-from psa_casadi.diagnosis.task import Task
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import Task, thresholds
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side

@@ -39,8 +39,7 @@ from psa_casadi.diagnosis.screening import (
     screen,
     without,
 )
-from psa_casadi.diagnosis.task import State, Task, Tried
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import State, Task, Tried, thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import with_column

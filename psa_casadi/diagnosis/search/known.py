@@ -23,8 +23,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     shows_memory,
     tried,
 )
-from psa_casadi.diagnosis.task import State, Task
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import State, Task, thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 

@@ -22,8 +22,7 @@ from psa_casadi.diagnosis.search.fits import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, SHARE, Known
-from psa_casadi.diagnosis.task import Task
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import Task, thresholds
 from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES, MOST
 from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.errors import PsaError

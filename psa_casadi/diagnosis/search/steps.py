@@ -27,8 +27,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     scale_of,
 )
 from psa_casadi.diagnosis.search.known import Searched
-from psa_casadi.diagnosis.task import Task, same_curves
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import Task, same_curves, thresholds
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import as_read
