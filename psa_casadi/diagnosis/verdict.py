@@ -20,6 +20,7 @@ from psa_casadi.diagnosis.held_out import (
     whole_residuals,
 )
 from psa_casadi.diagnosis.judgement import (
+    Balance,
     told_from,
     too_small,
     vague_note,
@@ -42,7 +43,6 @@ from psa_casadi.diagnosis.result import (
 from psa_casadi.diagnosis.search.hypothesis import Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
 from psa_casadi.diagnosis.task import same_curves, thresholds
-from psa_casadi.diagnosis.weighing import Balance
 from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
 from psa_casadi.identification.identify import with_provenance
