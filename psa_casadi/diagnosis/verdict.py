@@ -6,8 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.alternatives import alternatives
-from psa_casadi.diagnosis.blind_spots import blind_spots, shown
 from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import corrections
 from psa_casadi.diagnosis.evidence import diagnosis_evidence
@@ -28,28 +26,190 @@ from psa_casadi.diagnosis.judgement import (
     withdrawn_names,
 )
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
-from psa_casadi.diagnosis.next_record import next_experiment
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.patch import patch_of, with_patch
 from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
+    Alternative,
+    BlindSpot,
     Candidate,
     Cause,
     Diagnosis,
     Estimate,
+    NextExperiment,
     Remaining,
     Verdict,
 )
-from psa_casadi.diagnosis.search.hypothesis import Scale
+from psa_casadi.diagnosis.search.fits import to_end, with_cause
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
 from psa_casadi.diagnosis.task import same_curves, thresholds
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import note
+from psa_casadi.notes import Note, note
+from psa_casadi.records.quality.repeats import repeats
+from psa_casadi.records.quality.repetitions import held
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
+from psa_casadi.records.stretches import counts, loop_sizes
+from psa_casadi.simulation.simulate import simulate_record
+from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
+
+
+def shown(steps: Sequence[Step]) -> set[str]:
+    """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
+
+    Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
+    """
+    price = thresholds().price
+    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > price}
+    return fitted.union(*(told_from(s) for s in steps))
+
+
+def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
+    """Return effects whose smallest gain that shows on these records is more than ordinary."""
+    spots = []
+    present = {c.name for c in final.fit.model.components}
+    for effect in table:
+        if effect.name in present:
+            continue
+        scores = [s for s in final.screening.scores if s.direction.effect is effect]
+        gain = next(p for p in effect.parameters if p.name == effect.gain)
+        extended = final.fit.model.with_effect(effect, {gain.name: 0.0})
+        practical = gain.typical(extended.values)
+        factor = np.sqrt(final.screening.threshold)
+        smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
+        if smallest > practical:
+            why = note(
+                "blind_spot" if np.isfinite(smallest) else "blind",
+                effect=effect.name, gain=gain.name,
+                smallest=(smallest, gain.unit), ordinary=(practical, gain.unit),
+            )  # fmt: skip
+            spots.append(BlindSpot(effect.name, float(min(smallest, 1e300)), gain.unit, why))
+    return tuple(spots)
+
+
+#: A hold lasts so long [s]; the durations of the largest rises lie in so many bands, each a factor
+#: of four wide, and loops have so many sizes.
+_HOLD, _RATES, _SIZES = 3.0, 2, 3
+
+
+def next_experiment(
+    causes: Sequence[Cause],
+    verdict: Verdict,
+    alike: Sequence[Sequence[str]],
+    records: Sequence[Record],
+    *,
+    doubted: bool,
+) -> NextExperiment:
+    """Return what to do next; `alike` are groups of effects that only a resonance tells apart."""
+    if verdict == "not_driven":
+        return NextExperiment(None, (), (note("correct_columns"),))
+    if doubted:
+        return NextExperiment(None, (), (note("record_again"),))
+    open_ones = [(c.effect, *c.cannot_be_told_from) for c in causes if c.cannot_be_told_from]
+    rivals = tuple(dict.fromkeys(n for own in open_ones for n in own))
+    same = [own for own in open_ones if any(set(own) <= set(group) for group in alike)]
+    steps = [note("same_curve", effects=own) for own in same]
+    if verdict in ("unexplained", "partly_explained") or len(same) < len(open_ones):
+        steps.append(useful_records(records))
+    if steps:
+        return NextExperiment(None, rivals, tuple(steps))
+    return NextExperiment(None, (), (note("no_next"),))
+
+
+def useful_records(records: Sequence[Record]) -> Note:
+    """Return what to record next: what of holds, rates, amplitudes and repeats is lacking.
+
+    Where nothing is, other conditions or quantities must decide.
+    """
+    span = max(float(np.ptp(r.voltage)) for r in records)
+    kinds = counts(records, [np.ones(r.n, dtype=bool) for r in records], span)
+    moves = [k for k in kinds if k.way]
+    largest = max((k.size for k in moves), default=0)
+    holds = max((float(r.time[b - 1] - r.time[a]) for r in records for a, b in held(r)), default=0)
+    there = {
+        "hold": holds >= _HOLD,
+        "rates": len({k.band for k in moves if k.size == largest}) >= _RATES,
+        "amplitudes": loop_sizes(records, span) >= _SIZES,
+        "repeats": any(repeats(r) is not None for r in records),
+    }
+    lacking = tuple(what for what, found in there.items() if not found)
+    return note("lacking", what=lacking) if lacking else note("other_conditions")
+
+
+def alternatives(
+    named: Sequence[Step],
+    final: Fit,
+    experiments: Sequence[Experiment],
+    table: Sequence[Component],
+    *,
+    stiffness_given: bool,
+) -> tuple[Alternative, ...]:
+    """Return, for each cause that may lie on the other side of the sensor, the model with that one.
+
+    Of several such effects the likeliest that can be fitted and simulated.
+    """
+    effects = {e.name: e for e in table}
+    found = []
+    for step in named:
+        other = [
+            n
+            for n in told_from(step)
+            if n in effects and effects[n].in_plant != step.cause.in_plant
+        ]
+        for name in sorted(other, key=lambda n: -step.probability.get(n, 0.0)):
+            fitted = _fitted(step, name, experiments)
+            if fitted is None:
+                continue
+            try:
+                differs = _difference(final, fitted.fit, experiments)
+            except PsaError:
+                continue
+            told = determinacy(fitted.fit, experiments)
+            records = [e.record for e in experiments]
+            evidence = diagnosis_evidence(fitted.fit, told, experiments, fitted.predicted)
+            model = with_provenance(
+                fitted.fit.model, told, records, stiffness_given, evidence=evidence
+            )
+            found.append(
+                Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
+            )
+            break
+    return tuple(found)
+
+
+def _fitted(step: Step, name: str, experiments: Sequence[Experiment]) -> Hypothesis | None:
+    """Return the hypothesis with another effect in a cause's place, fitted to its end."""
+    known = step.instead.get(name)
+    if known is None and step.beside is not None:
+        starts = step.beside.starts_of(name)
+        known = with_cause(step.beside.of, experiments, starts) if starts else None
+    return known if known is None or known.final else to_end(known, experiments)
+
+
+def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[float, float]:
+    """Return by how much the plants of two fits differ on the records: most [m], and % of range.
+
+    About the mean difference of each record, as the sensor's zero is free.
+    """
+    most = span = 0.0
+    for k, e in enumerate(experiments):
+        moved = []
+        for fit in (one, other):
+            plant = fit.model.plant()
+            names = memory_names(plant.structure)
+            memory = {n: v for n, v in fit.starts()[k].items() if n in names}
+            moved.append(simulate_record(plant, e.record, memory).outputs["displacement"])
+        apart = moved[0] - moved[1]
+        most = max(most, float(np.max(np.abs(apart - np.mean(apart)))))
+        span = max(span, e.record.range_m)
+    return most, 100.0 * most / span
+
 
 FloatArray = npt.NDArray[np.float64]
 
