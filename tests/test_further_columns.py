@@ -15,7 +15,7 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.components import MONITOR
 from psa_casadi.components.flexure import FLEXURE
-from psa_casadi.diagnosis.columns import decided
+from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import fit
