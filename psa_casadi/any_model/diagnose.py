@@ -11,9 +11,8 @@ from psa_casadi.any_model.identify import free_of, known_zeros, search_starts
 from psa_casadi.any_model.judge import judged
 from psa_casadi.any_model.levels import reweighted, unlike, with_noise
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import runs_of, told_of_columns
+from psa_casadi.any_model.runs import runs_of, sized, sizes_of, told_of_columns
 from psa_casadi.any_model.search import search
-from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.any_model.trials import Table
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from psa_casadi.any_model.certainty import Certainty, certainty
 from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted, refuse_unfit
 from psa_casadi.any_model.levels import first_levels, relevelled, reweighted, unlike, with_noise
-from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
-from psa_casadi.any_model.sizes import sized
+from psa_casadi.any_model.runs import Run, noise_share, runs_of, sized, told_of_columns
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts

@@ -3,7 +3,7 @@
 from psa_casadi.any_model.effects.attached import Attached
 from psa_casadi.any_model.effects.of_rates import rate_effects
 from psa_casadi.any_model.effects.of_signals import signal_effects
-from psa_casadi.any_model.sizes import Sizes
+from psa_casadi.any_model.runs import Sizes
 from psa_casadi.model.compose import Model
 from psa_casadi.model.from_casadi.ports import ports_of
 
