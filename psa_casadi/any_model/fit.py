@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.beginnings import begun
-from psa_casadi.any_model.coordinates import coordinates_of
-from psa_casadi.any_model.predict import STEP_RTOL, output_of, shown_by
+from psa_casadi.any_model.predict import STEP_RTOL, coordinates_of, output_of, shown_by
 from psa_casadi.any_model.runs import Run, measured_spans
 from psa_casadi.errors import Problems, PsaError
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum, minimise

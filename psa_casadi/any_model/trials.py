@@ -7,12 +7,10 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.coordinates import zero_name
 from psa_casadi.any_model.effects.attached import Attached, extended
 from psa_casadi.any_model.fit import FittedOutput, OdeFit
-from psa_casadi.any_model.predict import traced
+from psa_casadi.any_model.predict import start_of, traced, zero_name
 from psa_casadi.any_model.runs import Run
-from psa_casadi.any_model.start import start_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.errors import MachineError, PsaError
