@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.certainty import Certainty, certainty
-from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted, refuse_unfit
+from psa_casadi.any_model.fit import Certainty, OdeFit, certainty, fit_ode, refitted, refuse_unfit
 from psa_casadi.any_model.levels import first_levels, relevelled, reweighted, unlike, with_noise
 from psa_casadi.any_model.runs import Run, noise_share, runs_of, sized, told_of_columns
 from psa_casadi.errors import InputError

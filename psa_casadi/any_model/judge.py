@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from psa_casadi.any_model.budget import OdeBudget, removed_from
-from psa_casadi.any_model.certainty import certainty
+from psa_casadi.any_model.fit import certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
 from psa_casadi.any_model.identify import with_told
