@@ -7,9 +7,15 @@ from typing import Any
 
 from psa_casadi.any_model.effects.table import effects_of
 from psa_casadi.any_model.fit import refuse_unfit
-from psa_casadi.any_model.identify import free_of, known_zeros, search_starts
+from psa_casadi.any_model.identify import (
+    free_of,
+    known_zeros,
+    reweighted,
+    search_starts,
+    unlike,
+    with_noise,
+)
 from psa_casadi.any_model.judge import judged
-from psa_casadi.any_model.levels import reweighted, unlike, with_noise
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import runs_of, sized, sizes_of, told_of_columns
 from psa_casadi.any_model.search import search

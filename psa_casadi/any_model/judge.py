@@ -8,8 +8,7 @@ from psa_casadi.any_model.budget import OdeBudget, removed_from
 from psa_casadi.any_model.fit import certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
-from psa_casadi.any_model.identify import with_told
-from psa_casadi.any_model.levels import noise_left, noise_told
+from psa_casadi.any_model.identify import noise_left, noise_told, with_told
 from psa_casadi.any_model.remedy import changes
 from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
 from psa_casadi.any_model.runs import Run, missed_rms

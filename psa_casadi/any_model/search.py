@@ -20,7 +20,7 @@ from psa_casadi.any_model.hypothesis import (
     hypothesis_of,
     look,
 )
-from psa_casadi.any_model.levels import relevelled
+from psa_casadi.any_model.identify import relevelled
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.trials import Table
 from psa_casadi.component import Component
