@@ -7,6 +7,7 @@ from typing import Any
 
 from psa_casadi.any_model.effects.table import effects_of
 from psa_casadi.any_model.fit import refuse_unfit
+from psa_casadi.any_model.hypothesis import Table
 from psa_casadi.any_model.identify import (
     free_of,
     known_zeros,
@@ -19,7 +20,6 @@ from psa_casadi.any_model.judge import judged
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import runs_of, sized, sizes_of, told_of_columns
 from psa_casadi.any_model.search import search
-from psa_casadi.any_model.trials import Table
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.records.signals import Hold, signals_given

@@ -14,6 +14,7 @@ from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted
 from psa_casadi.any_model.hypothesis import (
     OdeHypothesis,
     OdeView,
+    Table,
     can_be_told,
     held_out_confirms,
     held_out_gain,
@@ -22,7 +23,6 @@ from psa_casadi.any_model.hypothesis import (
 )
 from psa_casadi.any_model.identify import relevelled
 from psa_casadi.any_model.runs import Run
-from psa_casadi.any_model.trials import Table
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.screening import Score, Together, best_sets, evidence
