@@ -15,12 +15,12 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.budget import removed_from
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.any_model.fit import OdeFit, fit_ode
 from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of
 from psa_casadi.any_model.identify import noise_left
 from psa_casadi.any_model.predict import shown_by, start_of, states_of, traced
+from psa_casadi.any_model.result import removed_from
 from psa_casadi.any_model.runs import Run, Sizes, sizes_of
 from psa_casadi.any_model.search import Known
 from psa_casadi.component import Component, Equations, Symbols

@@ -4,13 +4,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from psa_casadi.any_model.budget import OdeBudget, removed_from
 from psa_casadi.any_model.fit import certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
 from psa_casadi.any_model.identify import noise_left, noise_told, with_told
 from psa_casadi.any_model.remedy import changes
-from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
+from psa_casadi.any_model.result import (
+    FreeFunction,
+    OdeBudget,
+    OdeDiagnosis,
+    OutputError,
+    PortCause,
+    removed_from,
+)
 from psa_casadi.any_model.runs import Run, missed_rms
 from psa_casadi.any_model.search import Known, Names, with_cause, without
 from psa_casadi.any_model.weighing import (

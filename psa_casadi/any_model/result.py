@@ -1,16 +1,17 @@
 """What a diagnosis of any model says, as frozen records."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.budget import OdeBudget
 from psa_casadi.any_model.fit import OdeFit
-from psa_casadi.any_model.runs import Run
+from psa_casadi.any_model.runs import Run, counted
+from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict, told
 from psa_casadi.model.compose import Model
@@ -18,6 +19,48 @@ from psa_casadi.notes import Note, note, texts
 from psa_casadi.shown import StillReported, frame, with_units
 
 FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OdeBudget:
+    """Where the held-out error of the base model above the noise goes.
+
+    `together` is what all causes remove, `causes` what each does beside the others (the model
+    fitted again without it leaves so much more), `unnamed` what a free function would remove.
+    """
+
+    together: Share
+    causes: tuple[Share, ...]
+    unnamed: Share | None = None
+
+
+def removed_from(
+    runs: Sequence[Run], outputs: Sequence[int], base: Sequence[FloatArray], noise: Sequence[float]
+) -> Removed:
+    """Return what models remove of a base's held-out error in the given outputs of a model.
+
+    `base` are its predictions (n, ny) of all runs, `noise` is the rms of each output's noise in the
+    output's unit.
+    """
+    return Removed(partial(_judged_errors, runs, tuple(outputs)), base, tuple(noise))
+
+
+def _judged_errors(
+    runs: Sequence[Run], outputs: Sequence[int], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return the errors (n, outputs) where any output is judged, else nan.
+
+    An output of which no sample is held out is judged by its fitted ones.
+    """
+    parts = []
+    told = zip(*(counted(runs, j) for j in outputs), strict=True)
+    for r, y, own in zip(runs, predicted, told, strict=True):
+        which = np.column_stack(own)
+        errors = np.where(which, r.errors(y)[:, outputs], np.nan)
+        parts.append(errors[which.any(axis=1)])
+    return parts
+
+
 FORMAT = "psa_casadi.own_model_diagnosis/1"
 
 
