@@ -7,8 +7,8 @@ import pytest
 
 from psa_casadi.any_model.free_functions import Free
 from psa_casadi.any_model.hypothesis import OdeHypothesis
+from psa_casadi.any_model.judge import beaten_by, left_out, weighed, why_not_named
 from psa_casadi.any_model.search import Known
-from psa_casadi.any_model.weighing import beaten_by, left_out, weighed, why_not_named
 
 #: Held-out errors of a circuit with a coil that saturates: current [A] and voltage [V].
 BASE, NOISE = (0.44, 7.92), (0.0096, 0.052)
