@@ -7,7 +7,7 @@ from functools import wraps
 from inspect import signature
 from typing import Any, overload
 
-from psa_casadi.any_model.effects.table import effects_of
+from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.fit import refuse_unfit
 from psa_casadi.any_model.hypothesis import Table
 from psa_casadi.any_model.identify import (

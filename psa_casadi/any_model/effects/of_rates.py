@@ -14,7 +14,7 @@ from psa_casadi.any_model.effects.attached import (
     rounded,
     scale_of,
 )
-from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of
+from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of, signal_effects
 from psa_casadi.any_model.runs import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.effects.bend import ANGLES
@@ -271,3 +271,14 @@ def _is_rate(port: Port, state: str) -> bool:
 
 def _range(name: str, model: Model, sizes: Sizes, x: str) -> Parameter:
     return scale_of(f"{name}_range", sizes.states[x], state_unit(model, x), x)
+
+
+def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
+    """Return every generic effect at every port of a model that has no effects yet."""
+    found: list[Attached] = []
+    for port in ports_of(model):
+        if port.kind == "rate":
+            found += rate_effects(model, port, sizes)
+        else:
+            found += signal_effects(port, sizes)
+    return tuple(found)
