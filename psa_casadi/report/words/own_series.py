@@ -3,17 +3,14 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import in_brackets
-from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, Series
+from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, FloatArray, Series
 from psa_casadi.report.words.verdict_words import added
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Readings that an output must have in a record to be a series.
 _FEWEST = 8
