@@ -16,13 +16,14 @@ from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.plots.patch_plot import free_plot
 from psa_casadi.report.words.fit_words import whiteness_sentence
-from psa_casadi.report.words.own_series import own_fit_series, own_series
 from psa_casadi.report.words.own_words import (
     own_budget_table,
     own_error_table,
     own_fit_sentence,
+    own_fit_series,
     own_fit_table,
     own_record_table,
+    own_series,
     own_verdict_sentence,
     with_its_unit,
 )

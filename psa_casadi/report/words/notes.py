@@ -6,7 +6,7 @@ from typing import Any
 
 from psa_casadi.notes import Note
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
-from psa_casadi.report.words.own_notes import OWN_MODELS
+from psa_casadi.report.words.own_words import OWN_MODELS
 from psa_casadi.report.words.phrases import quantity, raised, with_unit
 
 Probable = Sequence[tuple[str, float]]
