@@ -12,7 +12,6 @@ from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note
-from psa_casadi.report.words.budget_words import share_row
 from psa_casadi.report.words.phrases import (
     either,
     in_brackets,
@@ -32,6 +31,7 @@ from psa_casadi.report.words.verdict_words import (
     cause_size,
     named_cause,
     naming_sentence,
+    share_row,
     within,
 )
 

@@ -14,7 +14,6 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.budget_words import budget_sentence
 from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.own_words import own_lines
@@ -35,6 +34,7 @@ from psa_casadi.report.words.verdict_words import (
     VERDICTS,
     added,
     alternative_sentence,
+    budget_sentence,
     cause_size,
     column_sentence,
     verdict_sentence,
