@@ -15,7 +15,7 @@ from psa_casadi.identification.search.multistart import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.grades import grade
+from psa_casadi.report.words.fit_words import grade
 from psa_casadi.report.words.phrases import (
     Scale,
     interval_text,
