@@ -17,8 +17,7 @@ from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.plots.figure import save_figure
 from psa_casadi.report.plots.finding_plots import evidence_plot
 from psa_casadi.report.words.phrases import length_scale, listing, number, plain, share_text
-from psa_casadi.report.words.residuals import noise_density, spectrum
-from psa_casadi.report.words.series import series_of, telling_window
+from psa_casadi.report.words.series import noise_density, series_of, spectrum, telling_window
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
 from psa_casadi.report.words.text import check_sentence, effect_page, story
 from psa_casadi.report.words.verdict_words import cause_size, verdict_sentence

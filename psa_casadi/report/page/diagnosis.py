@@ -23,8 +23,7 @@ from psa_casadi.report.words.phrases import (
     rest_sentence,
     scale_of,
 )
-from psa_casadi.report.words.residuals import residual_figures
-from psa_casadi.report.words.series import Series, most_telling, series_of
+from psa_casadi.report.words.series import Series, most_telling, residual_figures, series_of
 from psa_casadi.report.words.tables import (
     blind_table,
     candidate_table,

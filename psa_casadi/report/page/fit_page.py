@@ -28,8 +28,13 @@ from psa_casadi.report.words.fit_words import (
     strong_pairs,
 )
 from psa_casadi.report.words.phrases import Scale, number, one_unit
-from psa_casadi.report.words.residuals import ResidualFigures, residual_figures
-from psa_casadi.report.words.series import Series, most_telling, series_of_fit
+from psa_casadi.report.words.series import (
+    ResidualFigures,
+    Series,
+    most_telling,
+    residual_figures,
+    series_of_fit,
+)
 from psa_casadi.report.words.tables import (
     fit_error_table,
     record_table,

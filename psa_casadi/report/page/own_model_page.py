@@ -28,8 +28,7 @@ from psa_casadi.report.words.own_words import (
     with_its_unit,
 )
 from psa_casadi.report.words.phrases import percent, plain, rest_sentence
-from psa_casadi.report.words.residuals import residual_figures
-from psa_casadi.report.words.series import Series, most_telling
+from psa_casadi.report.words.series import Series, most_telling, residual_figures
 from psa_casadi.report.words.tables import candidate_table, parameter_table, record_table
 from psa_casadi.report.words.verdict_words import VERDICTS, added
 

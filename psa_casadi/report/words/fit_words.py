@@ -8,7 +8,7 @@ from psa_casadi.identification.certainty.determinacy import DETERMINED_WIDTH
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import Scale, listing, number, percent
-from psa_casadi.report.words.residuals import ResidualFigures
+from psa_casadi.report.words.series import ResidualFigures
 
 Degree = Literal["determined", "weak", "undetermined", "on its bound", "fixed"]
 DEGREES: tuple[Degree, ...] = get_args(Degree)

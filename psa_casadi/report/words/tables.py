@@ -26,7 +26,7 @@ from psa_casadi.report.words.phrases import (
     shown_in,
     with_unit,
 )
-from psa_casadi.report.words.residuals import ResidualFigures
+from psa_casadi.report.words.series import ResidualFigures
 from psa_casadi.report.words.verdict_words import added
 from psa_casadi.units import convert
 
