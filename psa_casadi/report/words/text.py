@@ -13,6 +13,7 @@ from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
+from psa_casadi.posterior.result import Posterior
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.notes import brief_text
@@ -27,9 +28,10 @@ from psa_casadi.report.words.phrases import (
     probability_text,
     rest_sentence,
     scale_of,
+    shown_in,
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
-from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
+from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
 from psa_casadi.report.words.verdict_words import (
     VERDICTS,
     added,
@@ -39,9 +41,11 @@ from psa_casadi.report.words.verdict_words import (
     column_sentence,
     verdict_sentence,
 )
+from psa_casadi.units import convert
 
-if TYPE_CHECKING:  # which take long to load
+if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport
+
 
 _LABEL = 10
 
@@ -223,3 +227,37 @@ def _errors(e: Errors, scale: Scale) -> str:
         f" at most {scale.text(e.holdout_max_m)};"
         f" training {scale.text(e.train_rms_m)} rms"
     )
+
+
+def posterior_table(found: Posterior) -> Table:
+    """Return every parameter with mean, sd, 94 % interval, effective draws and r-hat."""
+    rows = []
+    for f in found.figures:
+        unit, display = shown_in(found.model, f.name)
+        mean, low, high = (convert(x, unit, display) for x in (f.mean, f.low, f.high))
+        spread = convert(f.mean + f.sd, unit, display) - mean
+        rows.append(
+            (
+                f.name,
+                number(mean, 4),
+                number(spread),
+                f"{number(low, 4)} to {number(high, 4)}",
+                display,
+                f"{f.ess:.0f}",
+                f"{f.r_hat:.3f}",
+                found.model.parameter(f.name).description,
+            )
+        )
+    head = ("parameter", "mean", "sd", "94 % interval", "unit", "ess", "r-hat", "meaning")
+    return Table(head, tuple(rows))
+
+
+def posterior_text(found: Posterior, *, origin: str = "measured", width: int = 100) -> str:
+    """Return a posterior: records, chains, the parameters, warnings."""
+    drawn = f"{found.chains} chains of {found.draws} draws, {found.divergences} divergent"
+    head = [("records", records_text(found.task.experiments, origin)), ("drawn", drawn)]
+    tail = [("warning", w) for w in found.warnings] + [("note", n) for n in found.sentences]
+    blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
+    blocks.append(posterior_table(found).fitted(width))
+    blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
+    return "\n\n".join(blocks)
