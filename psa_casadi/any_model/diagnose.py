@@ -1,4 +1,4 @@
-"""Diagnose any model: fit it, search for causes at its ports, judge."""
+"""Diagnose any model; `psa.identify` and `psa.diagnose` of a stack or of any model."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Prediction-error fit of any model: all outputs of all experiments, with exact sensitivities."""
+"""Prediction-error fit of any model with exact sensitivities, and how sure its values are."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A model with some causes, fitted; what its residual still shows; and whether it is worth having.
+"""A model with some causes, fitted: what its residual still shows, by which directions.
 
 The score is that of a stack's diagnosis: ln of the Bayes factor over the base, less a price for
 every cause (`psa_casadi.diagnosis.search.hypothesis`).

@@ -1,4 +1,4 @@
-"""Identify any model from its records: a search from several starts within the bounds."""
+"""Identify any model from its records: several starts, and the noise that every output leaves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

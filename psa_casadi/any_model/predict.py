@@ -1,4 +1,8 @@
-"""Predictions of any model for an experiment, and their exact derivatives."""
+"""Predictions of any model with their derivatives, from its start, in a fit's coordinates.
+
+x_0 = declared start + deviation for the states of the own equations and for memories; what is left,
+filters of effects, starts where it would rest: g(x_s, x_0, u_0, p) = 0 with g its rates.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

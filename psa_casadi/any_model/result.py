@@ -1,4 +1,8 @@
-"""What a diagnosis of any model says, as frozen records."""
+"""What a diagnosis of any model says, with its error budget.
+
+Shares are of the power above the noise, outputs over their noise, with the intervals of a stack's
+budget (`psa_casadi.diagnosis.held_out.shares`).
+"""
 
 import json
 from collections.abc import Mapping, Sequence

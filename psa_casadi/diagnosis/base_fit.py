@@ -1,4 +1,20 @@
-"""Variants of the base: resonances and lags that it has missed, which look like half the table."""
+"""Variants of the base fit: resonances, ringing, and a voltage that is smooth between samples.
+
+After each step of the force a resonance rings, and what the samples show of it is a tone below half
+the sampling rate f_s that decays as fast as the resonance itself, whatever its own frequency: one
+at f is seen at |f - k f_s|. Any such tone adds, with unknown amplitude and phase,
+
+    q_k = 2 Re(z) q_(k-1) - |z|^2 q_(k-2) + b_0 (F_k - F_(k-1)) + b_1 (F_(k-1) - F_(k-2)),
+    z = exp((-2 pi d + 2 pi i f) / f_s)
+
+to the prediction, F the force. The residual is projected on it for a grid of f and d, as in
+`screening`, the fitted parameters' directions taken out.
+
+A simulation joins the samples of the voltage by straight lines. Where an amplifier smooths them,
+chords cut the bends of a fast signal off: by u'' h^2/12 in the mean of a sampling interval h, 0.2 %
+of the amplitude of a sine with 40 samples a period. A plant that answers within some intervals
+shows this mean, and the error looks like a further resonance or a lag.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""Is anything missing at all? Tests of a residual that need no named effect."""
+"""The colour of the noise as an autoregression for each record, and tests for what it is not."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

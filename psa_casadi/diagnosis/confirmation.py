@@ -1,4 +1,4 @@
-"""What held-out samples can be asked: whether the fitted ones show the same kinds of stretch."""
+"""Whether held-out samples confirm a cause, what they cover, and whether a model holds there."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

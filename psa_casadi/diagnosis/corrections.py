@@ -1,8 +1,22 @@
-"""Fit the unnamed corrections beside a model, and say what each would remove.
+"""Unnamed corrections beside a model: their forms, and what each would remove.
 
 Beside the fitted model everything is linear: measured - predicted = J d + C w + noise, d the change
 of the model's own parameters, w ~ N(0, (s p)^2) the weights of one correction. The size s is that
 of the largest evidence. The evidence is on the scale of the hypotheses' score.
+
+A correction is a sum of columns with weights w_k ~ N(0, (s p_k)^2): s its size, found from the
+data, p_k the shape of the prior, smooth where 1/k or steeper. Quantities are over their range:
+
+    curve         cos(k pi q)                       p_k = 1/k            of voltage or displacement
+    direction     d cos(k pi q), k from 0           p_k = 1/(1 + k)      d a narrow stop, -1 to 1
+    memory        stops E_r, plays^2, plays^3       p_k = 1              of the voltage
+    relaxation    z_tau - x, tau z' + z = x         p_k = 1              tau over decades
+    modes         resonators driven by the force    p_k = 1              frequencies over decades
+    time          cos(k pi t/T)                     p_k = 1/k            of every record
+    gain in time  x cos(k pi t/T)                   p_k = 1/k
+
+Stops and plays: Visintin 1994; their squares and cubes make loops that are asymmetric or S-shaped
+(generalised Prandtl-Ishlinskii, Al Janaideh, Rakheja and Su 2009).
 """
 
 from collections.abc import Callable, Sequence

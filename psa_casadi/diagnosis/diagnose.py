@@ -1,4 +1,4 @@
-"""Diagnose: fit the base, search for causes, judge."""
+"""Diagnose: fit the base, ask whether it is driven, search for causes, judge, weigh columns."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

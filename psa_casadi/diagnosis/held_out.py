@@ -1,11 +1,18 @@
-"""The error budget: which share of the base model's held-out error each cause removes, what stays.
+"""Errors on held-out samples, the share that each cause removes, and the error budget.
+
+    share = sum_j (P_before,j - P_after,j) / s_j^2  /  sum_j (P_base,j - s_j^2) / s_j^2
+
+P_j are mean squares of the models' held-out errors in output j, s_j is the rms of its noise. A
+stack has one output, its displacement, of which s_j cancels. The interval is the jackknife's over
+the held-out records where there are four or more, else over eight blocks of each record's held-out
+samples (Efron and Tibshirani 1993, chapter 11).
 
 All powers are mean squares over the held-out samples, above that of the noise:
 
     share of a cause = (P_without - P_all) / (P_base - noise^2)
 
 P_without is that of the model fitted again without the cause. Its interval:
-`psa_casadi.diagnosis.held_out`.
+`psa_casadi.diagnosis.held_out.shares`.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""What a simulation gets wrong: one record's residual from every side."""
+"""What a simulation gets wrong: views, lines and harmonics of one record's residual."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""The noise of a record: its colour, its level, and what no noise explains."""
+"""The noise floor of every record: from repeats, from holds, or from the fast part."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

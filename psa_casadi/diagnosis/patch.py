@@ -1,4 +1,4 @@
-"""The unnamed correction as a component of the model, its weights fitted like any parameter."""
+"""The unnamed correction that is offered, and the component that stands for it in a model."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

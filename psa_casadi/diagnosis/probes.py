@@ -1,4 +1,4 @@
-"""Effects that are linear in weights: what they could add lies in a span, seen as a whole.
+"""Trial directions: what each effect would add to the prediction at its trial values.
 
 There is one direction for each weight, at its ordinary size. With the whitened directions W over
 the noise level, the residual r over it, and weights g with the prior N(0, s^2 I), s =

@@ -1,4 +1,19 @@
-"""How large an effect of a model is, with the interval that its parameters leave."""
+"""How large an effect is for one stack, in tests that anyone can repeat on the device.
+
+A test plays a voltage through the model with the effect and with the effect's gain at 0. The
+difference d(t) of what the two show is what the effect does:
+
+    hold       step to the highest voltage: d 10 s and 10 min later, less d at the step's end
+    reversal   slow loops: the largest difference of d between the two ways at one voltage
+    range      slow rise: the largest |d - (a + b y_0)|, and at the top d itself
+    slew       loop at the records' fastest rate: the largest |d|
+    resonance  linearised at rest: the largest ratios of the two responses, and where
+    record     the records themselves: the range of d in one of them, and its rms
+
+y_0 is what the model shows without the effect; offset a and slope b are fitted, since a user takes
+them for zero and sensitivity. Of an identified model voltages, rate and duration are those of its
+records; else the voltage is the rated one and the record a standard one.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,12 @@
-"""How much the data speak for one more effect: Laplace's approximation of the Bayes factor.
+"""Screening: which effects, alone or several at once, would lower the residual.
+
+Every direction is prewhitened, the fitted parameters' directions are projected out, and the
+decrease of the sum of squares is compared with one threshold for the maximum over all directions,
+drawn from Gaussian noise along the actual directions (family-wise; Davies 1987, Hansen 1996).
+
+A base fit bends itself to several missing causes at once, so that the effect that explains most
+alone need not be one of them. Linear in the gains, the best set of so many effects (best subset
+regression) costs one small system of equations each, over products of directions that are known.
 
     ln B = (n - k)/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
 

@@ -1,4 +1,10 @@
-"""What is left of a record: views, spectrum, harmonics, and each effect's signature."""
+"""What one effect does to an ordinary stack: its signature, as figures to draw.
+
+    d = y - (a + b y_0)
+
+is the difference of the readings with (y) and without (y_0) the effect; offset a and slope b are
+fitted, as an identification of the base would. It is looked at along every coordinate of a misfit.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,4 +1,8 @@
-"""What a search for causes works on, and by which method."""
+"""What a search for causes works on, by which method, and every constant that decides.
+
+What a search does with its time (how many fits, from how many starts) stands where it is done;
+these here decide what is said. `python -m tests.benchmarks ablation` doubles and halves each.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,4 +1,9 @@
-"""From the steps of the search to verdict, confidence, blind spots and what to do next."""
+"""From the steps of a search to the diagnosis: verdict, blind spots, rivals, next record.
+
+What belongs to the sensor or the environment stays out of an exported plant. Where the records
+cannot tell such a cause from one of the plant, which of the two is exported is not theirs to say.
+So there are two models, and the difference of their plants' displacements is told.
+"""
 
 from collections.abc import Sequence
 

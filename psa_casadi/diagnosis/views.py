@@ -1,4 +1,4 @@
-"""The coordinates that a residual is viewed along: time, voltage, rate, history, drive."""
+"""A residual against one coordinate: time, voltage, rate, history, drive."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""What may be missing in the rate of a state: friction, losses, curves, hysteresis, a constant."""
+"""Effects in the rate of a state, and the table of all effects of a model."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Fits of neighbours: one more cause, one less, another one in its place; and fits to the end."""
+"""Fits of a model with one cause more, one less, or another: from its parent and afresh."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

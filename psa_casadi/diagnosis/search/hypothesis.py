@@ -1,4 +1,4 @@
-"""A hypothesis: a model with a set of causes, fitted; and the one score that all are compared by.
+"""Hypotheses: a fitted model with a set of causes, its score, and what its residual shows.
 
     score = ln B + ln L - price * causes
     ln B  = (n - k)/2 ln(S_0 / S) - 1/2 ln det(1 + P H P)

@@ -1,4 +1,4 @@
-"""Several causes at once: sets that promise most together, from the base and from smaller sets."""
+"""Moves of the search beside one effect more: modes, exchanges, several at once."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace

@@ -1,4 +1,4 @@
-"""The causes of the best hypothesis one by one: what each was chosen from, and how likely it is."""
+"""The causes of the best hypothesis one by one, and the rivals of each."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,4 @@
-"""What a fit amounts to, in sentences."""
+"""What a fit amounts to in sentences, and how well each parameter is determined."""
 
 import math
 from dataclasses import dataclass

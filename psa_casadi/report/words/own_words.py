@@ -1,4 +1,4 @@
-"""The diagnosis of a model that is no stack, in sentences and tables."""
+"""Models that are no stacks in words: sentences, tables, and series to draw."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence

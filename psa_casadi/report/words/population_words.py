@@ -1,4 +1,4 @@
-"""What a population shows, in sentences and tables."""
+"""Several devices in words: the comparison of two, and a population."""
 
 import math
 from collections.abc import Sequence

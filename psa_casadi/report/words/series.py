@@ -1,4 +1,4 @@
-"""What a picture needs: curves over time, a telling window, fewer points, small numbers."""
+"""Records as what pictures need: one series of each, and what its residual looks like."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The verdict of a diagnosis in sentences: what is named, how sure it is, and what it removes."""
+"""The verdict of a diagnosis and its error budget in sentences."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
