@@ -17,8 +17,8 @@ from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import block_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.any_model.predict import Sizes, sizes_of
 from psa_casadi.any_model.runs import runs_of
-from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.from_casadi.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals

@@ -21,10 +21,10 @@ from psa_casadi.any_model.identify import (
     with_noise,
 )
 from psa_casadi.any_model.judge import judged
+from psa_casadi.any_model.predict import sized, sizes_of
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import runs_of, told_of_columns
 from psa_casadi.any_model.search import search
-from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import diagnose as stacks
 from psa_casadi.diagnosis.result import Diagnosis

@@ -19,11 +19,10 @@ from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, e
 from psa_casadi.any_model.fit import OdeFit, fit_ode
 from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of
 from psa_casadi.any_model.identify import noise_left
-from psa_casadi.any_model.predict import shown_by, start_of, states_of, traced
+from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, start_of, states_of, traced
 from psa_casadi.any_model.result import removed_from
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
-from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.screening import independent, whitened_jacobian, without

@@ -16,9 +16,8 @@ from psa_casadi.any_model.fit import (
     refitted,
     refuse_unfit,
 )
-from psa_casadi.any_model.predict import shown_by
+from psa_casadi.any_model.predict import shown_by, sized
 from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
-from psa_casadi.any_model.sizes import sized
 from psa_casadi.diagnosis.colour import Colour, noise_rms, uncertain
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model

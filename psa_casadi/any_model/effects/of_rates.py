@@ -15,7 +15,7 @@ from psa_casadi.any_model.effects.attached import (
     scale_of,
 )
 from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of, signal_effects
-from psa_casadi.any_model.sizes import Sizes
+from psa_casadi.any_model.predict import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.effects.bend import ANGLES
 from psa_casadi.model.compose import Model
