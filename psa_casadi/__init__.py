@@ -25,7 +25,7 @@ from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
     from psa_casadi import datasets, design, online, system
-    from psa_casadi.any_model.entry import diagnose, identify
+    from psa_casadi.any_model.diagnose import diagnose, identify
     from psa_casadi.any_model.identify import OdeIdentification
     from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.component import Component, Equations, Symbols
@@ -172,7 +172,7 @@ _HOMES = {
         "simulate",
         "simulate_record",
     ),
-    "psa_casadi.any_model.entry": ("identify", "diagnose"),
+    "psa_casadi.any_model.diagnose": ("identify", "diagnose"),
     "psa_casadi.any_model.identify": ("OdeIdentification",),
     "psa_casadi.any_model.result": ("OdeDiagnosis",),
     "psa_casadi.identification.identify": ("Identification",),
