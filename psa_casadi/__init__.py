@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from psa_casadi import design as design
     from psa_casadi import online as online
     from psa_casadi import system as system
-    from psa_casadi.any_model.entry import diagnose as diagnose
-    from psa_casadi.any_model.entry import identify as identify
+    from psa_casadi.any_model.diagnose import diagnose as diagnose
+    from psa_casadi.any_model.diagnose import identify as identify
     from psa_casadi.any_model.identify import OdeIdentification as OdeIdentification
     from psa_casadi.any_model.result import OdeDiagnosis as OdeDiagnosis
     from psa_casadi.component import Component as Component
@@ -149,7 +149,7 @@ _HOMES = {
     "psa_casadi.simulation.stepper": ("run",),
     "psa_casadi.identification.identify": ("Identification",),
     "psa_casadi.any_model.identify": ("OdeIdentification",),
-    "psa_casadi.any_model.entry": ("identify", "diagnose"),
+    "psa_casadi.any_model.diagnose": ("identify", "diagnose"),
     "psa_casadi.posterior.sample": ("sample",),
     "psa_casadi.posterior.result": ("Posterior",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),

@@ -19,7 +19,7 @@ from psa_casadi.errors import MachineError
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.records import write_record
 from psa_casadi.records.excitation import time_grid, triangle
-from psa_casadi.report.words.timings import timings_table
+from psa_casadi.report.words.tables import timings_table
 from psa_casadi.simulation import side_by_side as module
 from psa_casadi.simulation.side_by_side import (
     VARIABLE,
