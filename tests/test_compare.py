@@ -17,8 +17,8 @@ from psa_casadi.model.model_file import dumps
 from psa_casadi.population.finding import Finding, Found
 from psa_casadi.population.population import population
 from psa_casadi.population.replay import replayed
+from psa_casadi.report.documents.files import identification_file
 from psa_casadi.report.documents.findings import read_findings
-from psa_casadi.report.documents.identification_file import identification_file
 from psa_casadi.report.page.comparison_page import MOST, write_comparison
 from psa_casadi.report.page.population_page import write_population
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot

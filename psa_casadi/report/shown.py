@@ -17,8 +17,7 @@ from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.result import Posterior
 from psa_casadi.records.record import Record
-from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
-from psa_casadi.report.documents.own_model_file import OwnModelFile
+from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
 from psa_casadi.report.plots.figure import (

@@ -3,8 +3,7 @@
 import os
 
 from psa_casadi.errors import InputError
-from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
-from psa_casadi.report.documents.own_model_file import OwnModelFile
+from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
 from psa_casadi.report.documents.read_document import read_document
 from psa_casadi.strict_json import parse_json, read_json_text, shown
 

@@ -1,12 +1,14 @@
 """The schemas that the package ships (`psa_casadi/data/schemas`), made of the files' records."""
 
-from psa_casadi.report.documents.check_file import CheckFile
-from psa_casadi.report.documents.device_file import DeviceFile
-from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
-from psa_casadi.report.documents.identification_file import IdentificationFile
-from psa_casadi.report.documents.model_file import ModelFile
-from psa_casadi.report.documents.own_model_file import OwnModelFile
-from psa_casadi.report.documents.posterior_file import PosteriorFile
+from psa_casadi.report.documents.files import (
+    CheckFile,
+    DeviceFile,
+    DiagnosisFile,
+    IdentificationFile,
+    ModelFile,
+    OwnModelFile,
+    PosteriorFile,
+)
 from psa_casadi.report.documents.schema import json_schema
 from psa_casadi.strict_json import json_text
 
