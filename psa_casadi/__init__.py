@@ -77,7 +77,7 @@ if TYPE_CHECKING:
     )
     from psa_casadi.records.signals import Signals
     from psa_casadi.report.documents.findings import read_findings
-    from psa_casadi.report.documents.load_diagnosis import load_diagnosis
+    from psa_casadi.report.documents.reading import load_diagnosis
     from psa_casadi.report.page.comparison_page import write_comparison
     from psa_casadi.report.page.diagnosis import write_report
     from psa_casadi.report.page.fit_page import write_fit_report
@@ -192,7 +192,7 @@ _HOMES = {
     "psa_casadi.devices.jobs": ("Job",),
     "psa_casadi.devices.task": ("Options",),
     "psa_casadi.report.documents.findings": ("read_findings",),
-    "psa_casadi.report.documents.load_diagnosis": ("load_diagnosis",),
+    "psa_casadi.report.documents.reading": ("load_diagnosis",),
     "psa_casadi.report.page.comparison_page": ("write_comparison",),
     "psa_casadi.report.page.population_page": ("write_population",),
     "psa_casadi.report.page.fit_page": ("write_fit_report",),

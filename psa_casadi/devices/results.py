@@ -22,7 +22,7 @@ from psa_casadi.population.finding import Finding
 from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
 from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of
 from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding
-from psa_casadi.report.documents.read_document import read_document
+from psa_casadi.report.documents.reading import read_document
 from psa_casadi.strict_json import json_text, parse_json, read_json_text
 from psa_casadi.version import __version__
 

@@ -24,7 +24,7 @@ from psa_casadi.population.replay import replayed
 from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
 from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.report.documents.files import DeviceFile, DiagnosisFile, IdentificationFile, damage
-from psa_casadi.report.documents.read_document import read_document
+from psa_casadi.report.documents.reading import read_document
 from psa_casadi.strict_json import parse_json, read_json_text
 
 #: The file in a device's folder that says how its work ended.

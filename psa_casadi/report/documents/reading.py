@@ -1,11 +1,13 @@
-"""JSON read back as the frozen record that it was written from, checked field by field."""
+"""A diagnosis read back from the JSON file that `psa diagnose` or `to_json` wrote."""
 
+import os
 import types
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from psa_casadi.errors import InputError
-from psa_casadi.strict_json import shown
+from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
+from psa_casadi.strict_json import parse_json, read_json_text, shown
 
 Record = TypeVar("Record")
 _SIMPLE: dict[Any, tuple[type, ...]] = {
@@ -90,3 +92,31 @@ def _several(inner: tuple[Any, ...], content: Any, place: str) -> tuple[Any, ...
 def _unlike(content: Any, place: str) -> ValueError:
     where = f"'{place.lstrip('.')}'" if place else "the file"
     return ValueError(f"{where} is {shown(content)}, which does not belong there")
+
+
+_ADVICE = "give a file that `psa diagnose --json` or `Diagnosis.to_json` wrote"
+_KINDS: dict[str, type[DiagnosisFile | OwnModelFile]] = {
+    "psa_casadi.diagnosis/1": DiagnosisFile,
+    "psa_casadi.own_model_diagnosis/1": OwnModelFile,
+}
+
+
+def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile:
+    """Return what DIAGNOSIS.json holds: verdict, causes, errors by the names of a `Diagnosis`.
+
+    The file has no samples and no model (`load_model` reads that); to keep a whole result, pickle
+    it. A diagnosis of an own model gives what `OdeDiagnosis` names so.
+
+    Raises InputError for a file that cannot be read, is none of a diagnosis, or lacks something.
+    """
+    source = os.fspath(path)
+    try:
+        content = parse_json(read_json_text(source), source, f"{_ADVICE}.")
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{source}: cannot be read ({error}); {_ADVICE}.") from error
+    found = content.get("format") if isinstance(content, dict) else None
+    if found not in _KINDS:
+        raise InputError(f"{source}: its format is {shown(found)}, no diagnosis; {_ADVICE}.")
+    return read_document(_KINDS[found], content, source)
