@@ -16,10 +16,9 @@ import pytest
 
 from psa_casadi.cli import web
 from psa_casadi.errors import InputError
-from psa_casadi.workbench.desk import Desk
+from psa_casadi.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
-from psa_casadi.workbench.uploads import Limits, stored_name
 from tests.test_ended_commands import runs
 from tests.test_own_effects import RIPPLE, install
 
