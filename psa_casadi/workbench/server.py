@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
-from html import escape
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -19,6 +18,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
+
+from jinja2 import Environment
+from markupsafe import Markup
 
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.records.read.columns import COLUMNS
@@ -91,11 +93,16 @@ def _same(one: str, other: str) -> bool:
 _PAGE, _REPORT = "psa_casadi.workbench", "psa_casadi.report.page"
 _STYLES = ((_REPORT, "page.css"), (_REPORT, "live.css"), (_PAGE, "workbench.css"))
 _SCRIPTS = (
-    (_PAGE, "begin.js"), (_REPORT, "live_plot.js"), (_PAGE, "columns.js"), (_PAGE, "files.js"),
+    (_PAGE, "begin.js"), (_PAGE, "columns.js"), (_PAGE, "files.js"),
     (_PAGE, "search.js"), (_PAGE, "workbench.js"),
 )  # fmt: skip
-#: The door's only script: what follows comes from the page itself, and the token is in no address.
+#: What stands at the address with the token, and its only script: it leads to the page, which
+#: asks for all that follows, so that the token is in no address.
 _ENTER = "location.replace('/');"
+_DOOR = (
+    '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Diagnose records</title>'
+    f"</head><body><p><a href='/'>Open the page</a></p><script>{_ENTER}</script></body></html>\n"
+)
 
 
 def page(effects: Sequence[str]) -> str:
@@ -104,28 +111,10 @@ def page(effects: Sequence[str]) -> str:
         "effects": list(effects),
         "columns": {n: [u for q in c.quantities for u in units_of(q)] for n, c in COLUMNS.items()},
     }
-    data = json.dumps(told).replace("<", "\\u003c")
-    head = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Diagnose records</title><style>{_style()}</style></head>\n<body><main>\n"
-    )
-    return (
-        head
-        + _source(_PAGE, "workbench.html")
-        + f"<footer>psa_casadi {escape(__version__)}. Nothing leaves this machine.</footer>\n"
-        + f'<script type="application/json" id="told">{data}</script>\n</main>'
-        + f"<script>{_script()}</script>\n</body></html>\n"
-    )
-
-
-def door() -> str:
-    """Return what stands at the address with the token: it leads to the page itself."""
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Diagnose records'
-        f"</title></head><body><p><a href='/'>Open the page</a></p><script>{_ENTER}</script>"
-        "</body></html>\n"
-    )
+    return Environment(autoescape=True).from_string(_source(_PAGE, "workbench.html")).render(
+        style=Markup(_style()), script=Markup(_script()), version=__version__,
+        told=Markup(json.dumps(told).replace("<", "\\u003c")),
+    )  # fmt: skip
 
 
 @cache
@@ -255,7 +244,7 @@ class _Handler(BaseHTTPRequestHandler):
         if refused is not None:
             self._refuse(*refused)
         elif parts.path == "/" and self.server.gate.opens(asked.get("token", "")):
-            self._send(door(), _HTML, {"Set-Cookie": self.server.gate.cookie, **PAGE_POLICY})
+            self._send(_DOOR, _HTML, {"Set-Cookie": self.server.gate.cookie, **PAGE_POLICY})
         elif not self.server.gate.knows(dict(self.headers)):
             self._refuse(
                 HTTPStatus.FORBIDDEN,
