@@ -13,8 +13,8 @@ from plotly.offline import get_plotlyjs
 import psa_casadi as psa
 from psa_casadi.command_line import typed
 from psa_casadi.diagnosis.held_out.errors import Errors
-from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.fit_page import write_fit_report
+from psa_casadi.report.page.designs import write_design_page
+from psa_casadi.report.page.results import write_fit_report
 from psa_casadi.report.words.phrases import handy_scale, in_page_unit, length_scale, one_unit
 from tests.html_page import Page
 from tests.report_cases import diagnosis, identification

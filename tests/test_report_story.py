@@ -12,8 +12,7 @@ from psa_casadi.diagnosis.budget import Budget
 from psa_casadi.diagnosis.held_out.shares import Share
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, Verdict
 from psa_casadi.effects import EFFECTS
-from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.page.misfit_part import drawn, split_table
+from psa_casadi.report.page.results import drawn, split_table, write_report
 from psa_casadi.report.words.phrases import probability_text, strongest_sentence
 from psa_casadi.report.words.tables import blindest, candidate_table
 from psa_casadi.report.words.text import story

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from psa_casadi.report.plots.residual_plots import distribution_plot
+from psa_casadi.report.plots.records import distribution_plot
 from psa_casadi.report.words.fit_words import residual_sentence
 from psa_casadi.report.words.phrases import Scale
 from psa_casadi.report.words.residuals import (
@@ -112,14 +112,14 @@ def test_a_residual_can_be_read_beside_one_that_is_far_off() -> None:
     s = Series("r", time, time, 0.0 * time, curves, none, 1e-9, False)
     base, extended, normal = distribution_plot(s).data
     span = np.ptp(narrow)
-    assert np.ptp(normal.x) == pytest.approx(2e9 * span, rel=1e-5)
-    assert extended.name == "extended"
-    assert np.sum(extended.y) == pytest.approx(100.0)
+    assert np.ptp(normal["x"]) == pytest.approx(2e9 * span, rel=1e-5)
+    assert extended["name"] == "extended"
+    assert np.sum(extended["y"]) == pytest.approx(100.0)
     outside = 100.0 - 100.0 * 2e9 * span / 60.0
-    assert base.name == f"base ({outside:.0f} % outside)"
-    assert np.sum(base.y) == pytest.approx(100.0 - outside, abs=0.1)
+    assert base["name"] == f"base ({outside:.0f} % outside)"
+    assert np.sum(base["y"]) == pytest.approx(100.0 - outside, abs=0.1)
     near = Series("r", time, time, 0.0 * time, (curves[1], curves[1]), none, 1e-9, False)
-    assert np.ptp(distribution_plot(near).data[-1].x) == pytest.approx(1e9 * span, rel=1e-5)
+    assert np.ptp(distribution_plot(near).data[-1]["x"]) == pytest.approx(1e9 * span, rel=1e-5)
 
 
 def test_a_spectrum_of_many_lines_is_thinned_and_keeps_its_peaks() -> None:

@@ -13,7 +13,7 @@ from psa_casadi.diagnosis.residual.signature import signature, standard_voltage
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
+from psa_casadi.report.plots.figures import save_signature, size_sentence
 
 #: Coordinates along which physics says that an effect is to be seen.
 TOLD = {

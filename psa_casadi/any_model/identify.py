@@ -16,7 +16,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import first_order_noise
 from psa_casadi.records.signals import Hold, signals_given
-from psa_casadi.shown import StillReported, frame
+from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Parameter, Provenance
 from psa_casadi.version import __version__
@@ -37,7 +37,7 @@ _ALL = 0.8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OdeIdentification(StillReported):
+class OdeIdentification(Reported):
     """A model with fitted values, how sure they are, and warnings.
 
     `errors` are the parameters' standard errors, `intervals` their 95 % intervals in

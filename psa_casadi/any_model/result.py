@@ -14,7 +14,7 @@ from psa_casadi.any_model.runs import Run
 from psa_casadi.diagnosis.remedy.size import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
 from psa_casadi.model.compose import Model
-from psa_casadi.shown import StillReported, frame, with_units
+from psa_casadi.shown import Reported, frame, with_units
 
 FloatArray = npt.NDArray[np.float64]
 FORMAT = "psa_casadi.own_model_diagnosis/1"
@@ -88,7 +88,7 @@ class FreeFunction:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OdeDiagnosis(StillReported):
+class OdeDiagnosis(Reported):
     """A diagnosis of any model: verdict, causes, the extended model, errors, and what remains.
 
     The words of the verdict are those of a stack's diagnosis. `base` and `extended` (n, ny) are the

@@ -104,7 +104,8 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
     from psa_casadi.diagnosis.result import NextExperiment
     from psa_casadi.diagnosis.search.contenders import one_of_each
     from psa_casadi.errors import PsaError
-    from psa_casadi.report.page.experiment_part import sentences, write_voltage
+    from psa_casadi.records import write_record
+    from psa_casadi.report.words.design_words import sentences
 
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
@@ -118,7 +119,8 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
     if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
         why = " ".join((d.next_experiment.why, *each[:-1], same)).rstrip()
         return replace(d, next_experiment=replace(d.next_experiment, why=why))
-    write_voltage(path, design.record)
+    played = design.record
+    write_record(path, {"time [s]": played.time, "voltage [V]": played.voltage})
     why = " ".join((f"Apply {path} and diagnose all records together.", *each, same)).rstrip()
     following = NextExperiment(str(path), design.names, why, dict(design.chance))
     return replace(d, next_experiment=following)
