@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components import MONITOR
-from psa_casadi.components.flexure import FLEXURE
-from psa_casadi.diagnosis.columns import decision_sentence
+from psa_casadi.components.outputs import MONITOR
+from psa_casadi.components.surroundings import FLEXURE
+from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import fit
@@ -187,15 +187,15 @@ def test_a_turned_sign_is_told() -> None:
     ],
 )
 def test_decisions_in_words(now: dict[str, float], then: dict[str, float], said: str) -> None:
-    assert said in decision_sentence("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now)
+    assert said in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
 
 
 def test_a_column_explains_nothing_where_something_is_left() -> None:
     of = {"load_stiffness": 0.5, "sensor_nonlinearity": 0.5}
-    clear = decision_sentence("load_force", {}, of, 0.0, EFFECTS, clear=True)
+    clear = str(decided("load_force", {}, of, 0.0, EFFECTS, clear=True))
     assert "load_stiffness is in the column" in clear
-    assert "nothing is named" in decision_sentence("load_force", {}, of, 0.0, EFFECTS, clear=False)
-    assert "decides nothing" in decision_sentence("load_force", {}, {}, 0.0, EFFECTS, clear=False)
+    assert "nothing is named" in str(decided("load_force", {}, of, 0.0, EFFECTS, clear=False))
+    assert "decides nothing" in str(decided("load_force", {}, {}, 0.0, EFFECTS, clear=False))
 
 
 def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> None:

@@ -16,9 +16,8 @@ from psa_casadi.diagnosis.search.fits import (
     with_cause,
     without,
 )
-from psa_casadi.diagnosis.search.hypothesis import hypothesis
+from psa_casadi.diagnosis.search.hypothesis import View, examine, hypothesis
 from psa_casadi.diagnosis.search.steps import steps_of
-from psa_casadi.diagnosis.search.view import View, examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import fit

@@ -33,8 +33,7 @@ def compare(
     from psa_casadi.population.population import population
     from psa_casadi.report.documents.findings import read_findings
     from psa_casadi.report.page.devices import write_comparison, write_population
-    from psa_casadi.report.words.comparison_words import difference_sentence
-    from psa_casadi.report.words.population_words import population_sentences
+    from psa_casadi.report.words.population_words import difference_sentence, population_sentences
 
     given = Given(effects)
     given.outputs({"--output": output}, files)

@@ -21,13 +21,13 @@ def alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative
 
 
 def noted(d: "Diagnosis", left_out: Sequence[str]) -> "Diagnosis":
-    """Say in the notes which effects were not looked for."""
+    """Say in the remarks which effects were not looked for."""
     from dataclasses import replace
 
     if not left_out:
         return d
     names = ", ".join(dict.fromkeys(left_out))
-    return replace(d, notes=(*d.notes, f"Not looked for, as --leave-out says: {names}."))
+    return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
 
 
 def models(d: "Diagnosis", output: Path | None) -> list[str]:
@@ -102,7 +102,7 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
 
     from psa_casadi.design.experiment.experiment import resolving_experiment
     from psa_casadi.diagnosis.result import NextExperiment
-    from psa_casadi.diagnosis.search.contenders import one_of_each
+    from psa_casadi.diagnosis.search.steps import one_of_each
     from psa_casadi.errors import PsaError
     from psa_casadi.records import write_record
     from psa_casadi.report.words.design_words import sentences
@@ -110,19 +110,20 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
         return d
+    before = d.next_experiment
     try:
         design = resolving_experiment(d, progress=progress)
     except PsaError as error:
-        why = f"{d.next_experiment.why} No record could be designed: {error}"
-        return replace(d, next_experiment=replace(d.next_experiment, why=why))
+        reasons = (*before.reasons, f"No record could be designed: {error}")
+        return replace(d, next_experiment=replace(before, reasons=reasons))
     each = sentences(design, d.model.values.get("C_p"))
     if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
-        why = " ".join((d.next_experiment.why, *each[:-1], same)).rstrip()
-        return replace(d, next_experiment=replace(d.next_experiment, why=why))
+        reasons = (*before.reasons, *each[:-1], *same)
+        return replace(d, next_experiment=replace(before, reasons=reasons))
     played = design.record
     write_record(path, {"time [s]": played.time, "voltage [V]": played.voltage})
-    why = " ".join((f"Apply {path} and diagnose all records together.", *each, same)).rstrip()
-    following = NextExperiment(str(path), design.names, why, dict(design.chance))
+    reasons = (f"Apply {path} and diagnose all records together.", *each, *same)
+    following = NextExperiment(str(path), design.names, reasons, dict(design.chance))
     return replace(d, next_experiment=following)
 
 

@@ -78,7 +78,7 @@ def sample(
     from psa_casadi.posterior.sample import sample as run
     from psa_casadi.report.documents.files import posterior_file
     from psa_casadi.report.plots.figures import DPI, posterior_figure
-    from psa_casadi.report.words.posterior_words import posterior_text
+    from psa_casadi.report.words.text import posterior_text
     from psa_casadi.strict_json import json_text
 
     given = Given(effects, quiet=quiet)

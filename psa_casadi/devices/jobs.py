@@ -9,7 +9,7 @@ from pathlib import Path
 
 from psa_casadi.devices.job_table import job_rows
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.binary import READERS
+from psa_casadi.records.read.formats import READERS
 
 #: The table of jobs that is looked for in a folder of records.
 TABLE = "jobs.csv"

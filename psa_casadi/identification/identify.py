@@ -32,12 +32,10 @@ from psa_casadi.identification.start.time_unit import doubtful_time, refuse_othe
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
-from psa_casadi.records.excerpts import excerpts
-from psa_casadi.records.quality.gaps import without_gaps
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, whole
+from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
 from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.variables import Provenance

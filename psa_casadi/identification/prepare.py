@@ -8,10 +8,10 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.records.decimate import decimated
-from psa_casadi.records.excerpts import MOST
-from psa_casadi.records.quality.fast_noise import fast_noise
-from psa_casadi.records.quality.suspects import cleaned, masked, suspects
+from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
+from psa_casadi.records.split import MOST
+from psa_casadi.records.suspects import cleaned, masked, suspects
 
 
 def as_read(record: Record) -> Record:

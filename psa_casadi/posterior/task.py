@@ -22,10 +22,9 @@ from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.density import Block, Density
 from psa_casadi.posterior.within import Within
-from psa_casadi.records.quality.gaps import without_gaps
-from psa_casadi.records.quality.noise import autocovariance
+from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, Level, whole
+from psa_casadi.records.split import Experiment, Level, whole, without_gaps
 from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]

@@ -23,9 +23,8 @@ from psa_casadi.report.page.document import filled
 from psa_casadi.report.page.results import write_fit_report, write_report
 from psa_casadi.report.plots.figures import Plotted, figure_of, one_output
 from psa_casadi.report.words.phrases import number, percent, plain
-from psa_casadi.report.words.posterior_words import posterior_text
 from psa_casadi.report.words.tables import parameter_table
-from psa_casadi.report.words.text import identification_text, story
+from psa_casadi.report.words.text import identification_text, posterior_text, story
 from psa_casadi.simulation.simulate import Trajectory
 
 Told = DiagnosisFile | OwnModelFile

@@ -24,10 +24,9 @@ from psa_casadi.design.experiment.rivals import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.search import GRID
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.screening.evidence import levelled
-from psa_casadi.diagnosis.search.contenders import one_of_each
-from psa_casadi.diagnosis.search.hypothesis import hypothesis
-from psa_casadi.diagnosis.search.view import examine
+from psa_casadi.diagnosis.screening import levelled
+from psa_casadi.diagnosis.search.hypothesis import examine, hypothesis
+from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
@@ -39,7 +38,7 @@ from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Progress, TitledTable
+from tests.benchmarks.table import Progress, TitledTable
 from tests.plants.again import play_again
 from tests.plants.excitations import PoorKind
 from tests.plants.make import Truth, make_record

@@ -11,7 +11,7 @@ from functools import partial
 from psa_casadi import datasets
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.errors import errors_of
+from psa_casadi.diagnosis.held_out import errors_of
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -21,7 +21,7 @@ from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.split import Experiment, split
 from psa_casadi.report.plots.figures import narrow_figure
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 #: What is added to the paper's model, one after the other, and where the gains start.
 ADDED = {"rate_independent_asymmetry": {"delta_r": 0.01}, "sensor_delay": {"sensor_delay": 1e-3}}

@@ -9,8 +9,8 @@ import scipy
 from psa_casadi.design.experiment.designs import ASKED, PLAYS
 from psa_casadi.design.experiment.rivals import Rival
 from psa_casadi.design.experiment.separation import LEAST, Separation
-from psa_casadi.diagnosis.screening.evidence import temperature
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.screening import temperature
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.records.record import Record
 

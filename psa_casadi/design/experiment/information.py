@@ -18,7 +18,7 @@ import numpy as np
 
 from psa_casadi.design.experiment.criterion import Point
 from psa_casadi.design.experiment.rivals import Rival
-from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.errors import InputError
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray

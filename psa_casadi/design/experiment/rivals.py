@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psa_casadi.design.experiment.limits import Limits
-from psa_casadi.diagnosis.noise.colour import Colour, colour_of
+from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.fitting.unknowns import (

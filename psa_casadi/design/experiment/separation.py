@@ -19,7 +19,7 @@ import numpy as np
 
 from psa_casadi.design.experiment.criterion import Point
 from psa_casadi.design.experiment.rivals import Rival
-from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.levenberg_marquardt import minimise
 from psa_casadi.records.record import Record

@@ -7,11 +7,7 @@ from math import inf
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.components.prestress import (
-    PRESTRESS_MECHANISM,
-    PRESTRESS_MOUNTS,
-    PRESTRESS_PORT,
-)
+from psa_casadi.components.surroundings import PRESTRESS_MECHANISM, PRESTRESS_MOUNTS, PRESTRESS_PORT
 from psa_casadi.design.mechanism.goals import Limits, check_goals, goal_texts, wanted_pairs
 from psa_casadi.design.mechanism.loop import (
     ACTS_ON,

@@ -2,8 +2,11 @@
 
 from collections.abc import Mapping
 
-from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
-from psa_casadi.components.sampled_feed_forward import FEED_FORWARD, HYSTERESIS_OBSERVER
+from psa_casadi.components.online_identification import (
+    FEED_FORWARD,
+    HYSTERESIS_OBSERVER,
+    ONLINE_IDENTIFICATION,
+)
 from psa_casadi.design.online.streams import Block, Following
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model

@@ -5,8 +5,8 @@ from psa_casadi.design.online.observer import stack_values
 from psa_casadi.design.online.recursive_least_squares import identifier_for
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import PARTS, compensator_for, part_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
 
 __all__ = ["part_for"]
 

@@ -3,10 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from psa_casadi.components.hysteresis_step import COUNT, TRACKED, constants, estimates
-from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
-from psa_casadi.components.online_recursion import variances
-from psa_casadi.components.sampled_feed_forward import ADAPTIVE_FEED_FORWARD
+from psa_casadi.components.online_identification import ADAPTIVE_FEED_FORWARD, ONLINE_IDENTIFICATION
+from psa_casadi.components.online_recursion import COUNT, TRACKED, constants, estimates, variances
 from psa_casadi.design.online.observer import stack_values
 from psa_casadi.design.online.streams import Block, Following
 from psa_casadi.errors import InputError

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.verification import Response
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.noise import runs_of
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.convert import Request
+from psa_casadi.records.read.samples import Request
 from psa_casadi.units import parse_unit, to_si
 
 FloatArray = npt.NDArray[np.float64]

@@ -7,9 +7,9 @@ from math import ceil, floor, log10
 import numpy as np
 
 from psa_casadi.model.compose import Model
+from psa_casadi.records.drive import reversals
 from psa_casadi.records.excitation import decaying_triangle, multisine, sine, time_grid
 from psa_casadi.records.record import Record
-from psa_casadi.records.turns import reversals
 from psa_casadi.simulation.start import settling_time
 from psa_casadi.variables import Values
 

@@ -8,8 +8,7 @@ import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.fitting.prediction import predict_record
-from psa_casadi.records.quality.filtering import convolved
-from psa_casadi.records.quality.noise import autocovariance
+from psa_casadi.records.noise import autocovariance, convolved
 from psa_casadi.records.split import Experiment
 from psa_casadi.variables import Interval
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.components import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
+from psa_casadi.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.identification.fitting.prediction import trace_record, traced_by_theta
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.identification.paper.shapes import STEADY_SHARE, Step
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.identification.paper.shapes import Loop
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

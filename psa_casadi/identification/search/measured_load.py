@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]

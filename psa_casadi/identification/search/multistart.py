@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.components import MEMORY_SPECTRUM
+from psa_casadi.components.stack import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.search.force_start import retuned

@@ -11,7 +11,7 @@ from psa_casadi.identification.certainty.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, Level
 
 FloatArray = npt.NDArray[np.float64]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.variables import Interval
 

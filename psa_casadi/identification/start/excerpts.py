@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.identification.start.linear_response import FloatArray, orthonormal, plays
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 
 BoolArray = npt.NDArray[np.bool_]

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from psa_casadi.components import BOUC_WEN, MEMORY_SPECTRUM
+from psa_casadi.components.stack import BOUC_WEN, MEMORY_SPECTRUM
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 

@@ -22,7 +22,7 @@ from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 
 FloatArray = npt.NDArray[np.float64]

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.checks import FEWEST_SAMPLES
-from psa_casadi.records.record import Record
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.units import FloatArray
 
 #: Correlation with the voltage from which on a column holds what is correlated.

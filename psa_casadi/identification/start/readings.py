@@ -6,8 +6,7 @@ import numpy as np
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.checks import FEWEST_SAMPLES
-from psa_casadi.records.record import Record
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
 
 #: Numbers whose squares would overflow.
 _LARGEST = 1e30

@@ -6,8 +6,8 @@ import numpy as np
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import Record
-from psa_casadi.records.turns import reversals
 
 #: The largest mean speed of a stack's end [m/s]. A bar of length L has its first resonance at
 #: c / 4L and moves by S L at most; back and forth there it covers 2 S L c / 4L = S c / 2. With the

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from psa_casadi.identification.start.beats import FEWEST, Delays
 from psa_casadi.identification.start.linear_response import orthonormal, plays
-from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 
 FloatArray = npt.NDArray[np.float64]

@@ -17,25 +17,23 @@ from psa_casadi.report.plots.device_plots import (
     error_plots,
     spread_plot,
 )
-from psa_casadi.report.words.comparison_words import (
-    budget_table,
-    causes_text,
-    difference_sentence,
-    difference_table,
-    error_scale,
-    file_table,
-    verdict_table,
-)
 from psa_casadi.report.words.phrases import number, one_unit
 from psa_casadi.report.words.population_words import (
     METHOD,
     batch_table,
+    budget_table,
+    causes_text,
+    difference_sentence,
+    difference_table,
     drift_table,
+    error_scale,
+    file_table,
     frequency_table,
     left_out_sentence,
     outlier_table,
     population_sentences,
     spread_table,
+    verdict_table,
 )
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import VERDICTS

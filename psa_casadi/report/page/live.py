@@ -13,14 +13,14 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
-from psa_casadi.export.web.module import begun_module
+from psa_casadi.export.web import begun_module
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
-from psa_casadi.report.words.grades import determined
+from psa_casadi.report.words.fit_words import determined
 from psa_casadi.report.words.phrases import handy_scale, length_scale, plain, shown_in
 from psa_casadi.report.words.series import Series, spans, time_scale
 from psa_casadi.report.words.verdict_words import added

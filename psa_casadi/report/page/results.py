@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.residual.misfit import WORTH_SAYING, Misfit
-from psa_casadi.diagnosis.residual.signature import Signature, signature
+from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Cause, Diagnosis
+from psa_casadi.diagnosis.signature import Signature, signature
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.certainty.profile import Profile, profile_sentences
 from psa_casadi.identification.identify import Identification
@@ -43,23 +43,28 @@ from psa_casadi.report.plots.records import (
     time_plot,
     zoom_plot,
 )
-from psa_casadi.report.words.budget_words import budget_table, patch_text
 from psa_casadi.report.words.fit_words import (
+    Grade,
+    determined,
     determined_sentence,
     error_bar_note,
     error_sentence,
+    grades,
+    named,
     pairs_sentence,
     residual_sentence,
+    strong_pairs,
     whiteness_sentence,
 )
-from psa_casadi.report.words.grades import Grade, determined, grades, named, strong_pairs
-from psa_casadi.report.words.own_series import own_fit_series, own_series
+from psa_casadi.report.words.misfit_words import AXES, weight
 from psa_casadi.report.words.own_words import (
     own_budget_table,
     own_error_table,
     own_fit_sentence,
+    own_fit_series,
     own_fit_table,
     own_record_table,
+    own_series,
     own_verdict_sentence,
     with_its_unit,
 )
@@ -67,20 +72,25 @@ from psa_casadi.report.words.phrases import (
     Scale,
     either,
     handy_scale,
-    in_page_unit,
     length_scale,
     listing,
+    lowered,
     number,
     one_unit,
     percent,
     plain,
     rest_sentence,
     scale_of,
-    weight,
 )
 from psa_casadi.report.words.remedy_words import what_now
-from psa_casadi.report.words.residuals import ResidualFigures, residual_figures
-from psa_casadi.report.words.series import Series, most_telling, series_of, series_of_fit
+from psa_casadi.report.words.series import (
+    ResidualFigures,
+    Series,
+    most_telling,
+    residual_figures,
+    series_of,
+    series_of_fit,
+)
 from psa_casadi.report.words.tables import (
     Table,
     blind_table,
@@ -97,8 +107,10 @@ from psa_casadi.report.words.verdict_words import (
     VERDICTS,
     added,
     alternative_sentence,
+    budget_table,
     cause_size,
     gain_sentence,
+    patch_text,
     verdict_sentence,
 )
 
@@ -228,7 +240,7 @@ def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | No
         ),
         candidates=candidate_table(d),
         parameters=_parameters(d.model),
-        noises=[in_page_unit(n.sentence) for n in d.noise],
+        noises=[n.sentence for n in d.noise],
         used=record_table(d.experiments, origin),
     )
 
@@ -460,7 +472,7 @@ def _budget(d: Diagnosis) -> dict[str, Any]:
 def _sentences(misfits: Sequence[Misfit]) -> list[list[str]]:
     """Return the sentences on the records with the largest errors over their noise."""
     order = sorted(misfits, key=lambda m: -weight(m))[:_TOLD_RECORDS]
-    return [[in_page_unit(s) for s in m.sentences[:_TOLD]] for m in order]
+    return [list(m.sentences[:_TOLD]) for m in order]
 
 
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
@@ -492,7 +504,7 @@ def _data_view(d: Diagnosis, m: Misfit, name: str) -> Picture | None:
         return None
     plot = view_plot(before, view_named(after, name) if after else None, counts=counts)
     share = f", {percent(before.share)} of the excess" if before.significant else ""
-    return Picture(f"{m.record}: {before.title[0].lower()}{before.title[1:]}{share}", plot)
+    return Picture(f"{m.record}: {lowered(AXES[before.name].title)}{share}", plot)
 
 
 def _in_counts(d: Diagnosis, m: Misfit) -> bool:
@@ -561,7 +573,7 @@ def _signature(d: Diagnosis, cause: Cause) -> dict[str, Any] | None:
     note = size_sentence(seen)
     if seen.telling.name == "holds":
         note += " Counted from the beginning of the hold, in the direction of the last change."
-    title = f"{seen.telling.title[0].lower()}{seen.telling.title[1:]}"
+    title = lowered(AXES[seen.telling.name].title)
     caption = f"{plain(effect.name).capitalize()}, simulated: {title}"
     pictures = [Picture(caption, signature_plot(seen), note), _of_the_data(d, seen)]
     return {
@@ -585,9 +597,8 @@ def _of_the_data(d: Diagnosis, seen: Signature) -> Picture | None:
     other = _data_view(d, *strongest[0]) if strongest else None
     if other is None:
         return None
-    note = (
-        f"No record has {seen.telling.title.lower()} to compare; this is the view that shows most."
-    )
+    title = AXES[name].title.lower()
+    note = f"No record has {title} to compare; this is the view that shows most."
     return Picture(other.caption, other.panel, note)
 
 

@@ -13,8 +13,8 @@ from matplotlib.gridspec import GridSpec
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.residual.signature import Signature
 from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
 from psa_casadi.identification.fitting.prediction import measured
@@ -31,7 +31,8 @@ from psa_casadi.report.plots.records import (
     samples,
     zoom_plot,
 )
-from psa_casadi.report.words.own_series import own_fit_series, own_series
+from psa_casadi.report.words.misfit_words import AXES
+from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.phrases import (
     handy_scale,
     in_brackets,
@@ -434,7 +435,7 @@ def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[s
     draw(left, added_over_time, "What the effect adds, over time")
     left.margins(x=0.01)
     view = seen.telling
-    title = f"{view.title}: explains {percent(view.share)} of it"
+    title = f"{AXES[view.name].title}: explains {percent(view.share)} of it"
     if view.name == "spectrum":
         title = f"Spectrum: {percent(view.share)} of it in one peak"
     legend: dict[str, str] | None = None if view.name == "spectrum" else {}

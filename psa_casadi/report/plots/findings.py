@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psa_casadi.any_model.result import FreeFunction
-from psa_casadi.diagnosis.corrections.patch import Patch
-from psa_casadi.diagnosis.residual.misfit import Misfit
-from psa_casadi.diagnosis.residual.signature import Signature
-from psa_casadi.diagnosis.residual.spectrum import Spectrum
-from psa_casadi.diagnosis.residual.views import View
+from psa_casadi.diagnosis.misfit import Misfit, Spectrum
+from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
+from psa_casadi.diagnosis.signature import Signature
+from psa_casadi.diagnosis.views import View
 from psa_casadi.identification.certainty.profile import PROFILE_LIMIT, Profile
 from psa_casadi.identification.identify import Identification
 from psa_casadi.report.plots.panel import BOUND_COLOUR, INK, WEAK_COLOUR, Panel, logarithmic
-from psa_casadi.report.words.grades import DEGREES, WEAK_ERROR, Degree, Grade
+from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
+from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.phrases import (
     Scale,
     in_brackets,
@@ -161,7 +161,9 @@ def _view_panel(
 ) -> tuple[Panel, float]:
     """Return an empty plot of a view, and what its coordinate is multiplied by to be shown."""
     unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
-    plot = Panel(f"{view.x_label} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True)
+    plot = Panel(
+        f"{AXES[view.name].label} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True
+    )
     if view.name.startswith(("since_reversal", "holds", "spectrum")):
         plot.axes(logarithmic(_ends(factor * np.concatenate(shown))))
     return plot.axes(y={"zeroline": True, "zerolinecolor": NOISE_COLOUR}), factor

@@ -4,23 +4,21 @@ import numpy as np
 
 from psa_casadi.report.plots.panel import INK, Panel, logarithmic, stacked
 from psa_casadi.report.words.phrases import in_brackets
-from psa_casadi.report.words.residuals import (
-    autocorrelation,
-    distribution,
-    noise_density,
-    shown_lines,
-    spectrum,
-    white_band,
-)
 from psa_casadi.report.words.series import (
     MEASURED_COLOUR,
     NOISE_COLOUR,
     FloatArray,
     IndexArray,
     Series,
+    autocorrelation,
+    distribution,
     kept,
+    noise_density,
+    shown_lines,
     spans,
+    spectrum,
     telling_window,
+    white_band,
 )
 
 #: Points of a part of a record, measured samples shown one by one, and of a spectrum.
