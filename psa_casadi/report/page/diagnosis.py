@@ -17,6 +17,7 @@ from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.words.phrases import (
+    added,
     handy_scale,
     listing,
     one_unit,
@@ -34,7 +35,6 @@ from psa_casadi.report.words.tables import (
 from psa_casadi.report.words.verdict_words import (
     OWN_VOLTAGES,
     VERDICTS,
-    added,
     gain_sentence,
     verdict_sentence,
 )

@@ -10,9 +10,8 @@ from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.view_plots import spectrum_view_plot, view_named, view_plot
 from psa_casadi.report.words.misfit_words import AXES, weight
-from psa_casadi.report.words.phrases import length_scale, lowered, number, percent
+from psa_casadi.report.words.phrases import added, length_scale, lowered, number, percent
 from psa_casadi.report.words.tables import Table
-from psa_casadi.report.words.verdict_words import added
 
 #: Views that say much the same: one of each family is drawn.
 _FAMILIES = {

@@ -27,10 +27,10 @@ from psa_casadi.report.words.own_words import (
     own_verdict_sentence,
     with_its_unit,
 )
-from psa_casadi.report.words.phrases import percent, plain, rest_sentence
+from psa_casadi.report.words.phrases import added, percent, plain, rest_sentence
 from psa_casadi.report.words.series import Series, most_telling, residual_figures
 from psa_casadi.report.words.tables import candidate_table, parameter_table, record_table
-from psa_casadi.report.words.verdict_words import VERDICTS, added
+from psa_casadi.report.words.verdict_words import VERDICTS
 
 #: Outputs whose errors are drawn as bars, series whose residual is told at once, effects with bars.
 _DRAWN, _TOLD, _BARS = 4, 4, 16

@@ -13,6 +13,7 @@ from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note
 from psa_casadi.report.words.phrases import (
+    added,
     either,
     in_brackets,
     listing,
@@ -27,7 +28,6 @@ from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, 
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import (
     VERDICTS,
-    added,
     cause_size,
     named_cause,
     naming_sentence,

@@ -15,6 +15,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.report.words.phrases import (
     Scale,
+    added,
     handy_scale,
     interval_text,
     listing,
@@ -26,7 +27,7 @@ from psa_casadi.report.words.phrases import (
     shown_in,
     with_unit,
 )
-from psa_casadi.report.words.verdict_words import added, within
+from psa_casadi.report.words.verdict_words import within
 from psa_casadi.units import convert
 
 _FEED_FORWARD = "correct the voltage by the extended model (feed-forward)"

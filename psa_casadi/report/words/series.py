@@ -14,12 +14,12 @@ from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.phrases import (
     Scale,
+    added,
     handy_scale,
     in_brackets,
     length_scale,
     prefixed_scale,
 )
-from psa_casadi.report.words.verdict_words import added
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
