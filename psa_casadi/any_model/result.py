@@ -1,7 +1,7 @@
 """What a diagnosis of any model says, with its error budget.
 
 Shares are of the power above the noise, outputs over their noise, with the intervals of a stack's
-budget (`psa_casadi.diagnosis.held_out.shares`).
+budget (`psa_casadi.diagnosis.held_out`).
 """
 
 import json

@@ -32,7 +32,7 @@ def noted(d: "Diagnosis", left_out: Sequence[str]) -> "Diagnosis":
 
 def models(d: "Diagnosis", output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
-    from psa_casadi.report.words.verdict_words import added
+    from psa_casadi.report.words.phrases import added
 
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"

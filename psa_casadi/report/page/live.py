@@ -23,7 +23,6 @@ from psa_casadi.report.page.document import packed
 from psa_casadi.report.words.fit_words import determined
 from psa_casadi.report.words.phrases import handy_scale, length_scale, plain, shown_in
 from psa_casadi.report.words.series import Series, spans, time_scale
-from psa_casadi.report.words.verdict_words import added
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
 from psa_casadi.simulation.ways import output_of
