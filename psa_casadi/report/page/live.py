@@ -21,7 +21,7 @@ from psa_casadi.model.model_file import dumps
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words.fit_words import determined
-from psa_casadi.report.words.phrases import handy_scale, length_scale, plain, shown_in
+from psa_casadi.report.words.phrases import added, handy_scale, length_scale, plain, shown_in
 from psa_casadi.report.words.series import Series, spans, time_scale
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
