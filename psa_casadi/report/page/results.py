@@ -70,6 +70,7 @@ from psa_casadi.report.words.own_words import (
 )
 from psa_casadi.report.words.phrases import (
     Scale,
+    added,
     either,
     handy_scale,
     length_scale,
@@ -105,7 +106,6 @@ from psa_casadi.report.words.tables import (
 from psa_casadi.report.words.verdict_words import (
     OWN_VOLTAGES,
     VERDICTS,
-    added,
     alternative_sentence,
     budget_table,
     cause_size,

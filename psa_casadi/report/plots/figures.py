@@ -34,6 +34,7 @@ from psa_casadi.report.plots.records import (
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.phrases import (
+    added,
     handy_scale,
     in_brackets,
     length_scale,
@@ -60,7 +61,7 @@ from psa_casadi.report.words.series import (
     telling_window,
     time_scale,
 )
-from psa_casadi.report.words.verdict_words import VERDICTS, added, verdict_sentence
+from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
