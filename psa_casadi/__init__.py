@@ -21,6 +21,7 @@ first used, so that importing the package is quick.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import psa_casadi.shown  # where the reports are registered
 from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
@@ -97,12 +98,13 @@ if TYPE_CHECKING:
     from psa_casadi.records import write_record as write_record
     from psa_casadi.records.signals import Signals as Signals
     from psa_casadi.report.documents.findings import read_findings as read_findings
-    from psa_casadi.report.documents.load_diagnosis import load_diagnosis as load_diagnosis
-    from psa_casadi.report.page.comparison_page import write_comparison as write_comparison
-    from psa_casadi.report.page.diagnosis import write_report as write_report
-    from psa_casadi.report.page.fit_page import write_fit_report as write_fit_report
-    from psa_casadi.report.page.population_page import write_population as write_population
-    from psa_casadi.report.plots.figure import save_figure as save_figure
+    from psa_casadi.report.documents.reading import load_diagnosis as load_diagnosis
+    from psa_casadi.report.page.devices import write_comparison as write_comparison
+    from psa_casadi.report.page.devices import write_population as write_population
+    from psa_casadi.report.page.results import write_fit_report as write_fit_report
+    from psa_casadi.report.page.results import write_report as write_report
+    from psa_casadi.report.plots.figures import save_figure as save_figure
+    from psa_casadi.report.shown import report as report
     from psa_casadi.report.words.text import story as story
     from psa_casadi.simulation.many import simulate_many as simulate_many
     from psa_casadi.simulation.simulate import Trajectory as Trajectory
@@ -154,18 +156,16 @@ _HOMES = {
     "psa_casadi.posterior.result": ("Posterior",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),
     "psa_casadi.any_model.result": ("OdeDiagnosis",),
-    "psa_casadi.report.documents.load_diagnosis": ("load_diagnosis",),
+    "psa_casadi.report.documents.reading": ("load_diagnosis",),
     "psa_casadi.simulation.timings": ("timed", "Timings"),
     "psa_casadi.report.words.text": ("story",),
-    "psa_casadi.report.plots.figure": ("save_figure",),
-    "psa_casadi.report.page.diagnosis": ("write_report",),
-    "psa_casadi.report.page.fit_page": ("write_fit_report",),
+    "psa_casadi.report.plots.figures": ("save_figure",),
+    "psa_casadi.report.page.results": ("write_report", "write_fit_report"),
     "psa_casadi.devices.batch": ("batch", "BatchRun"),
     "psa_casadi.devices.jobs": ("Job",),
     "psa_casadi.devices.task": ("Options",),
     "psa_casadi.report.documents.findings": ("read_findings",),
-    "psa_casadi.report.page.comparison_page": ("write_comparison",),
-    "psa_casadi.report.page.population_page": ("write_population",),
+    "psa_casadi.report.page.devices": ("write_comparison", "write_population"),
     "psa_casadi.design.online.observer": ("HysteresisObserver", "FeedForward", "stack_values"),
     "psa_casadi.design.online.recursive_least_squares": (
         "OnlineIdentification",
@@ -182,8 +182,8 @@ _HOMES = {
     "psa_casadi.errors": ("InputError", "MachineError", "PsaError"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
-#: Packages and modules that are public as such.
-_SPACES = ("datasets", "design", "online", "system")
+#: Packages and modules that are public as such; `report` is called too.
+_SPACES = ("datasets", "design", "online", "report", "system")
 __all__ = [*_HOME_OF, *_SPACES, "__version__"]  # noqa: PLE0604
 
 
@@ -196,6 +196,14 @@ def __getattr__(name: str) -> Any:
     value = getattr(import_module(_HOME_OF[name]), name)
     globals()[name] = value
     return value
+
+
+def _show(what: str, *given: Any, **options: Any) -> Any:
+    """Make what a result shows of itself."""
+    return getattr(import_module("psa_casadi.report.shown"), what)(*given, **options)
+
+
+psa_casadi.shown.register(_show)
 
 
 def __dir__() -> list[str]:

@@ -3,20 +3,20 @@
 import re
 from pathlib import Path
 
-import plotly.graph_objects as go
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.report.page.design_input_part import Titled
-from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.packed import Picture
+from psa_casadi.report.page.designs import write_design_page
+from psa_casadi.report.page.document import Picture
+from psa_casadi.report.plots.panel import Panel
+from psa_casadi.report.words.design_words import Titled
 from psa_casadi.report.words.tables import Table
 
 
 def test_a_page_holds_summary_tables_and_figures(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     table = Titled("Errors <&>", Table(("a", "b"), (("x", "1.5"),)), "how to read it")
-    picture = Picture("A curve", go.Figure(go.Scatter(x=[0, 1], y=[2, 3])))
+    picture = Picture("A curve", Panel().line([0, 1], [2, 3]))
     write_design_page(
         path, title="A design", summary=["the result", "a detail"], tables=[table],
         figures=[picture], badges=["10 samples"],

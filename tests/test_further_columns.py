@@ -28,7 +28,7 @@ from psa_casadi.model.compose import compose
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
-from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.page.results import write_report
 from psa_casadi.simulation.simulate import Way, simulate
 from tests.plants import further_columns as plants
 from tests.plants.excitations import ExcitationKind

@@ -22,7 +22,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
-from psa_casadi.report.plots.profile_plot import profile_plot
+from psa_casadi.report.plots.findings import profile_plot
 from psa_casadi.simulation.simulate import simulate
 
 FloatArray = NDArray[np.float64]
@@ -184,16 +184,16 @@ def test_the_sentence_uses_the_display_unit(closed: Profile) -> None:
 
 def test_the_plot_shows_profile_limit_and_interval(closed: Profile) -> None:
     plot = profile_plot(closed)
-    assert plot.layout.xaxis.title.text == "tau [ms]"
-    np.testing.assert_allclose(plot.data[0].x, 1e3 * closed.values)
-    np.testing.assert_allclose(plot.data[0].y, closed.increase)
-    line, interval = plot.layout.shapes
-    assert line.y0 == line.y1 == PROFILE_LIMIT
+    assert plot.layout["xaxis"]["title"]["text"] == "tau [ms]"
+    np.testing.assert_allclose(plot.data[0]["x"], 1e3 * closed.values)
+    np.testing.assert_allclose(plot.data[0]["y"], closed.increase)
+    line, interval = plot.layout["shapes"]
+    assert line["y0"] == line["y1"] == PROFILE_LIMIT
     assert closed.low is not None
     assert closed.high is not None
-    assert (interval.x0, interval.x1) == pytest.approx((1e3 * closed.low, 1e3 * closed.high))
+    assert (interval["x0"], interval["x1"]) == pytest.approx((1e3 * closed.low, 1e3 * closed.high))
     # where the cost is quadratic the dotted parabola passes through the profile's points
-    parabola = np.interp(plot.data[0].x, plot.data[1].x, plot.data[1].y)
+    parabola = np.interp(plot.data[0]["x"], plot.data[1]["x"], plot.data[1]["y"])
     np.testing.assert_allclose(parabola, closed.increase, atol=0.3)
 
 

@@ -21,7 +21,7 @@ from psa_casadi.identification.search.refitting import Progress
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding
-from psa_casadi.report.documents.device_file import DeviceFile
+from psa_casadi.report.documents.files import DeviceFile
 
 #: Devices that are submitted for each that can run at once: none waits for the next.
 _AHEAD = 2

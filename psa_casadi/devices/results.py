@@ -19,13 +19,8 @@ from psa_casadi.devices.task import DeviceOutcome, Options
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.population.finding import Finding
-from psa_casadi.report.documents.device_file import (
-    FORMAT,
-    DeviceFile,
-    DeviceRecord,
-    damage,
-    hash_of,
-)
+from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
+from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of
 from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding
 from psa_casadi.strict_json import decode, json_text, read_json
 from psa_casadi.version import __version__

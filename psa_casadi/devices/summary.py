@@ -10,7 +10,7 @@ from typing import Any
 
 from psa_casadi.files import atomic_path, atomic_write
 from psa_casadi.population.finding import Finding
-from psa_casadi.report.documents.device_file import DeviceFile
+from psa_casadi.report.documents.files import DeviceFile
 from psa_casadi.report.documents.findings import finding_content
 
 CSV, PARQUET = "summary.csv", "summary.parquet"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from psa_casadi.devices.jobs import Job
 from psa_casadi.identification.start.form import Hysteresis
-from psa_casadi.report.documents.device_file import Status, Work
+from psa_casadi.report.documents.files import Status, Work
 from psa_casadi.version import __version__
 
 _BLOCK = 2**20

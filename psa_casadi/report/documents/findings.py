@@ -20,11 +20,9 @@ from psa_casadi.population.finding import (
     NamedCause,
 )
 from psa_casadi.population.replay import replayed
-from psa_casadi.report.documents.device_file import FORMAT as DEVICE
-from psa_casadi.report.documents.device_file import DeviceFile, damage
-from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
-from psa_casadi.report.documents.identification_file import FORMAT as IDENTIFICATION
-from psa_casadi.report.documents.identification_file import IdentificationFile
+from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
+from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
+from psa_casadi.report.documents.files import DeviceFile, DiagnosisFile, IdentificationFile, damage
 from psa_casadi.strict_json import decode, read_json
 
 #: The file in a device's folder that says how its work ended.

@@ -6,12 +6,14 @@ from typing import Any
 import msgspec
 
 from psa_casadi.model.model_file import ModelFile
-from psa_casadi.report.documents.check_file import CheckFile
-from psa_casadi.report.documents.device_file import DeviceFile
-from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
-from psa_casadi.report.documents.identification_file import IdentificationFile
-from psa_casadi.report.documents.own_model_file import OwnModelFile
-from psa_casadi.report.documents.posterior_file import PosteriorFile
+from psa_casadi.report.documents.files import (
+    CheckFile,
+    DeviceFile,
+    DiagnosisFile,
+    IdentificationFile,
+    OwnModelFile,
+    PosteriorFile,
+)
 from psa_casadi.strict_json import json_text
 
 #: The record of each file that is written as JSON, by the name of its schema.

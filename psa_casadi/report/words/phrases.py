@@ -233,3 +233,8 @@ def interval_text(low: float, high: float) -> str:
         return "not determined"
     digits = next((d for d in (3, 4, 5) if number(low, d) != number(high, d)), 6)
     return f"{number(low, digits)} to {number(high, digits)}"
+
+
+def added(d: "Diagnosis | OdeDiagnosis") -> bool:
+    """Say whether the extended model differs from the base."""
+    return bool(d.causes or (isinstance(d, Diagnosis) and d.kept))

@@ -18,6 +18,7 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.fit_words import grade
 from psa_casadi.report.words.phrases import (
     Scale,
+    added,
     interval_text,
     number,
     plain,
@@ -27,7 +28,6 @@ from psa_casadi.report.words.phrases import (
     with_unit,
 )
 from psa_casadi.report.words.series import ResidualFigures
-from psa_casadi.report.words.verdict_words import added
 from psa_casadi.simulation.timings import Stage
 from psa_casadi.units import convert
 

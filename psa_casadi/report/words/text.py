@@ -22,6 +22,7 @@ from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
     Scale,
+    added,
     listing,
     number,
     percent,
@@ -35,7 +36,6 @@ from psa_casadi.report.words.remedy_words import effect_advice, effect_size, wha
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
 from psa_casadi.report.words.verdict_words import (
     VERDICTS,
-    added,
     alternative_sentence,
     budget_sentence,
     cause_size,
@@ -171,7 +171,7 @@ def effect_page(
 ) -> str:
     """Return one effect: what it is, equation, signature, source, what now, parameters.
 
-    `seen` is a model that holds it, and how large it is there (`diagnosis.remedy.size.example`).
+    `seen` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
     """
     lines = [
         ("what", effect.description),

@@ -9,6 +9,7 @@ from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words.phrases import (
     Scale,
+    added,
     confidence_text,
     either,
     interval_text,
@@ -35,11 +36,6 @@ VERDICTS = {
     "unexplained": "unexplained",
     "not_driven": "not driven",
 }
-
-
-def added(d: "Diagnosis | OdeDiagnosis") -> bool:
-    """Say whether the extended model differs from the base."""
-    return bool(d.causes or (isinstance(d, Diagnosis) and d.kept))
 
 
 #: What an interval of the gain from blocks of few records says.
