@@ -19,10 +19,11 @@ from fmpy.ssp.ssd import read_ssd
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer.archive import unpack
-from psa_casadi.export.importer.fmu import CO_SIMULATION, FloatArray, Fmu, FmuError, Instance
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError, Instance
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.drawing import OUTSIDE, Port, Wire
 from psa_casadi.scratch import temporary_folder
+from psa_casadi.units import FloatArray
 
 #: Multiple of a port's nominal size beyond which a co-simulation counts as blown up.
 _BEYOND = 1e3

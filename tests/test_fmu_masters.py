@@ -17,8 +17,8 @@ import fmpy
 import numpy as np
 import pytest
 
-from psa_casadi.export.importer.masters import FloatArray
 from psa_casadi.reference import simulate
+from psa_casadi.units import FloatArray
 from tests.fmu_models import exported, model_named
 from tests.test_fmu_system import END, RATE, coupled, monolithic
 from tests.tiers import slow, slow_but

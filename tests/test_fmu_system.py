@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, Instance
-from psa_casadi.export.importer.masters import FloatArray
+from psa_casadi.units import FloatArray
 from tests.fmu_models import exported, model_named
 
 STACK, END, RATE = "P-885.51", 4e-4, 2e5

@@ -8,10 +8,11 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer.fmu import FmuError
-from psa_casadi.export.importer.masters import FloatArray, Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.archive import wiring_of
 from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from tests.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
 from tests.benchmarks.coupling_stability import settles
 from tests.ssp_master import SspArchive, couple, points

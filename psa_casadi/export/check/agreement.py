@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.export.check.rows import BREAKDOWNS
@@ -18,9 +17,8 @@ from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
 from psa_casadi.simulation.history import settled_at
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Largest difference from the independent computation, as a share of the range.
 LIMIT = 1e-6

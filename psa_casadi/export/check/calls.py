@@ -4,11 +4,10 @@ import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Problems = Iterator[str]
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.agreement import bare_truth, expected_outputs, has_reference, simulated
@@ -17,8 +16,6 @@ from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.strict_json import parse_json, read_json_text
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Errors are stated with two digits, and what they are compared with errs too.
 _ROUNDING, _OWN_ERROR = 1.06, 1e-8

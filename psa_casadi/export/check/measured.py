@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.binaries import binary_checks
@@ -30,8 +29,7 @@ from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: How far a repeated run may be off, as a share of its range, by the version of FMI: in FMI 3.0
 #: inputs cannot move within a step, see `_played`.

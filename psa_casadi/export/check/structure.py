@@ -4,13 +4,12 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 _POINTS = 3
 #: Knowns and unknowns whose derivatives through a step are compared.
 _MOST = 24

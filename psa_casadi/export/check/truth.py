@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from psa_casadi.export.importer.masters import FloatArray, Signals
+from psa_casadi.export.importer.masters import Signals
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True)
