@@ -4,13 +4,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from psa_casadi.export.check.agreement import Truth
 from psa_casadi.export.check.structure import (
     evaluate,
     held_values,
     random_point,
     sampled_starts,
 )
-from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, Instance
 
 _TOLERANCE = 1e-10

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.agreement import Run, Truth
 from psa_casadi.export.check.binaries import binary_checks
 from psa_casadi.export.check.calls import CALLS
 from psa_casadi.export.check.events import event_indicators, wrong_indicators
@@ -23,7 +24,6 @@ from psa_casadi.export.check.structure import (
     wrong_nominals,
     wrong_start,
 )
-from psa_casadi.export.check.truth import Run, Truth
 from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive

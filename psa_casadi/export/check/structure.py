@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.check.agreement import Truth
 from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
 from psa_casadi.units import FloatArray
