@@ -12,15 +12,16 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check.agreement import Run, Truth
 from psa_casadi.export.check.binaries import binary_checks
 from psa_casadi.export.check.calls import CALLS
-from psa_casadi.export.check.events import event_indicators, wrong_indicators
-from psa_casadi.export.check.input_line import input_line_error
 from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, Check, CheckRow, stopped
 from psa_casadi.export.check.structure import (
     adjoint_error,
     directional_error,
     equation_error,
+    event_indicators,
     incomplete_dependencies,
+    input_line_error,
     settled_start_error,
+    wrong_indicators,
     wrong_nominals,
     wrong_start,
 )

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from psa_casadi.export.check.agreement import Truth
-from psa_casadi.export.common.variable_table import START_VOLTAGE
+from psa_casadi.export.common.variable_table import INPUT_LINE, START_VOLTAGE
+from psa_casadi.export.fmu.fixed import fixed_step_of
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
 from psa_casadi.units import FloatArray
 
@@ -230,3 +231,148 @@ def equation_error(fmu: Fmu, truth: Truth) -> float:
             size = np.abs(expected) + np.abs(found) + 1e-300
             worst = max(worst, float(np.max(np.abs(found - expected) / size)))
     return worst
+
+
+#: Parts of a step in which its line is followed by values that are held.
+_PARTS = 50
+_TOLERANCE = 1e-9
+#: Rise of the inputs over a step, in nominal values: small beside the limits of a slew rate, else
+#: large enough to leave a dead band.
+_RISES = (1e-3, 1e-1)
+#: Changes of states, over the rise, below which the inputs count as without effect.
+_SMALL = 1e-5
+
+
+def input_line_error(fmu: Fmu) -> float:
+    """Return how far a step along the line is from where the inputs lead that follow it.
+
+    As a share of what holding the inputs over that step changes, the larger one of two rises. Two
+    values are given, a step apart; then the line through them goes on over the next step. The same
+    is done by `_PARTS` short steps with values held that lie on it. What these leave, an instant
+    of sampled states among them, is twice their difference from half as many at most, and is taken
+    off. Inputs that move no state within a step leave nothing to compare: 0.
+    """
+    return max(_share(fmu, rise) for rise in _RISES)
+
+
+def _share(fmu: Fmu, rise: float) -> float:
+    line, held = (_moved(fmu, value, rise, 1) for value in (1.0, 0.0))
+    coarse, fine = (_moved(fmu, 0.0, rise, parts) for parts in (_PARTS // 2, _PARTS))
+    change = float(np.max(np.abs(held - fine), initial=0.0))
+    left = np.abs(line - fine) - 2.0 * np.abs(coarse - fine)
+    return max(0.0, float(np.max(left))) / change if change > _SMALL * rise else 0.0
+
+
+def _moved(fmu: Fmu, line: float, rise: float, parts: int) -> FloatArray:
+    """Return the states, in nominal values, after two steps; the second one in parts."""
+    fixed, inputs = fixed_step_of(fmu.directory), fmu.names("input")
+    size = fmu.step_size if fixed is None else _PARTS * fixed  # a part must be a multiple of it
+    names = fmu.states() or fmu.sampled()
+    sizes: FloatArray = np.array([fmu.nominals[n] for n in names])
+    values = {INPUT_LINE.name: line}
+    with fmu.start(CO_SIMULATION, tolerance=_TOLERANCE, values=values) as instance:
+        instance.set({n: rise * fmu.nominals[n] for n in inputs})
+        instance.step(0.0, size)
+        for part in range(parts):
+            along = (part + 0.5) / parts if parts > 1 else 0.0
+            instance.set({n: rise * (2.0 + along) * fmu.nominals[n] for n in inputs})
+            instance.step(size * (1.0 + part / parts), size / parts)
+        return instance.get(names) / sizes
+
+
+_TOLERANCE_events = 1e-10
+_POINTS_events = 4
+#: Inputs at which an indicator is looked at, in nominal values.
+_SIZES = (0.1, -0.1, 1.0, -1.0, 10.0, -10.0, 100.0, -100.0)
+#: Of indicators, as shares of the largest value of the switch: error, and margin.
+_EXACT, _MARGIN = 1e-9, 1e-2
+
+
+def event_indicators(fmu: Fmu) -> Iterator[str]:
+    """As many as announced, equal to their variables, alive, and turned round by an event.
+
+    One that follows an input at rest has both signs as the inputs go either way, from a tenth to
+    many times their nominals. One that follows states, held values, parameters or time need not
+    have both within reach; it must move with one of them. After an event none is negative, for an
+    importer then waits for the next change of sign.
+    """
+    names, count = fmu.indicators(), fmu.indicator_count()
+    if count != len(names):
+        yield f"{count} event indicators are announced, {len(names)} variables switch.* repeat them"
+    with fmu.start(MODEL_EXCHANGE, tolerance=_TOLERANCE_events) as instance:
+        if fmu.version == 3:
+            yield from _numbers(fmu, instance)
+        yield from _one_sided(fmu, instance)
+    starts = sampled_starts(fmu, np.random.default_rng(7))
+    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
+        yield from dict.fromkeys(_dead_or_not_turned(fmu, instance))
+
+
+def _one_sided(fmu: Fmu, instance: Instance) -> Iterator[str]:
+    """Yield the indicators that follow the inputs at rest, but have one sign for all of them."""
+    names, count = fmu.indicators(), fmu.indicator_count()
+    rest = np.zeros(len(fmu.states()))
+    values = []
+    for size in _SIZES:
+        inputs = {n: size * fmu.nominals[n] for n in fmu.names("input")}
+        instance.derivatives(0.0, rest, inputs)
+        values.append(instance.vector("GetEventIndicators", count))
+        if values[-1].tobytes() != instance.get(names).tobytes():
+            yield "the event indicators differ from the variables that repeat them"
+            return
+    for name, z in zip(names, np.array(values).T, strict=False):
+        if np.ptp(z) > 0.0 and not np.min(z) * np.max(z) < 0.0:
+            yield f"'{name}' follows the inputs and does not change its sign when they turn"
+
+
+def _dead_or_not_turned(fmu: Fmu, instance: Instance) -> Iterator[str]:
+    """Yield the indicators that nothing moves, and those that an event leaves negative."""
+    names, generator = fmu.indicators(), np.random.default_rng(8)
+    points = [random_point(fmu, generator) for _ in range(_POINTS_events)]
+    before = [evaluate(instance, point, names) for point in points]
+    for name, z in zip(names, np.array(before).T, strict=True):
+        if not np.ptp(z) > 0.0:
+            yield f"'{name}' moves with nothing"
+    for point in sorted(points, key=lambda p: p["time"]):
+        evaluate(instance, point, names)
+        instance.require("EnterEventMode")
+        instance.update_discrete_states()
+        instance.require("EnterContinuousTimeMode")
+        for name, z in zip(names, instance.get(names), strict=True):
+            if not z >= 0.0:
+                yield f"'{name}' stays negative after an event"
+
+
+def _numbers(fmu: Fmu, instance: Instance) -> Iterator[str]:
+    """Yield what the binary counts otherwise than the description."""
+    if instance.fmi.getNumberOfEventIndicators() != fmu.indicator_count():
+        yield "the binary has another number of event indicators than the description"
+    if instance.fmi.getNumberOfContinuousStates() != len(fmu.states()):
+        yield "the binary has another number of states than the description"
+    if [u.variable.name for u in fmu.description.eventIndicators] != fmu.indicators():
+        yield "the event indicators of the description are not the variables switch.*"
+
+
+def wrong_indicators(fmu: Fmu, truth: Truth) -> Iterator[str]:
+    """Each event indicator is a switch of the model or its negative, plus a small fixed margin."""
+    generator = np.random.default_rng(5)
+    if fmu.indicators() != [f"switch.{name}" for name in truth.switch_names]:
+        named = ", ".join(truth.switch_names) or "none"
+        yield f"the event indicators are not those of the model: {named}"
+        return
+    found, expected = [], []
+    with fmu.start(MODEL_EXCHANGE) as instance:
+        for _ in range(_POINTS_events):
+            point = random_point(fmu, generator)
+            found.append(evaluate(instance, point, fmu.indicators()))
+            groups = (truth.state_names, truth.input_names, truth.parameter_names)
+            vectors = [np.array([point[n] for n in names]) for names in groups]
+            vectors += held_values(instance)
+            expected.append(np.array(truth.switches(point["time"], *vectors)).ravel())
+    for name, z, switch in zip(
+        fmu.indicators(), np.array(found).T, np.array(expected).T, strict=True
+    ):
+        size = float(np.max(np.abs(switch)))
+        margins = [z - switch, z + switch]
+        if not any(np.ptp(m) <= _EXACT * size and abs(m[0]) <= _MARGIN * size for m in margins):
+            yield f"'{name}' is not the switch of the model"
