@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from psa_casadi.export.ssp.drawing import OUTSIDE
-from psa_casadi.export.ssp.structure import WiredParts
+from psa_casadi.export.ssp.drawing import OUTSIDE, WiredParts
 from psa_casadi.model.compose import Model
 from psa_casadi.units import FloatArray
 

@@ -4,7 +4,7 @@ Source: SSP 1.0, section 5 (system structure description) and section 4.4 (commo
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.markup import (
@@ -15,10 +15,9 @@ from psa_casadi.export.common.markup import (
     xml_text,
 )
 from psa_casadi.export.common.parameter_sets import parameter_set
-from psa_casadi.export.ssp.drawing import OUTSIDE, Box, Layout, Port, Wire
+from psa_casadi.export.ssp.drawing import OUTSIDE, Box, Layout, Port, WiredParts
 from psa_casadi.model.compose import Model
 from psa_casadi.units import parse_unit
-from psa_casadi.variables import Publication
 
 SSD = "http://ssp-standard.org/SSP1/SystemStructureDescription"
 SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
@@ -32,36 +31,6 @@ SSV_TYPE = "application/x-ssp-parameter-set"
 SSM_TYPE = "application/x-ssp-parameter-mapping"
 #: What SSP calls otherwise than FMI does.
 _PUBLISHED = {"version": "fileversion"}
-
-
-@dataclass(frozen=True)
-class WiredParts:
-    """A system as SSP sees it: models by the names of the parts, wires, and its own ports.
-
-    A wire from or to `OUTSIDE` makes a port of the system, with the unit of the part's port.
-    """
-
-    name: str
-    parts: Mapping[str, Model]
-    wires: tuple[Wire, ...]
-    publication: Publication = field(default_factory=Publication)
-
-    def unit(self, port: Port) -> str:
-        """Return the unit of a port; that of the system is the unit of what it is wired to."""
-        if port.part == OUTSIDE:
-            ends = [w.end for w in self.wires if w.start == port]
-            port = ends[0] if ends else next(w.start for w in self.wires if w.end == port)
-        s = self.parts[port.part].structure
-        units = {v.name: v.unit for v in s.inputs} | {v.name: v.unit for v in s.outputs}
-        return units[port.name]
-
-    def ports(self, part: str) -> tuple[tuple[str, str], ...]:
-        """Return (name, kind) of the connected ports of a part, or of the system, inputs first."""
-        ends = dict.fromkeys(w.end.name for w in self.wires if w.end.part == part)
-        starts = dict.fromkeys(w.start.name for w in self.wires if w.start.part == part)
-        if part == OUTSIDE:
-            ends, starts = starts, ends
-        return (*((n, "input") for n in ends), *((n, "output") for n in starts))
 
 
 @dataclass(frozen=True)
