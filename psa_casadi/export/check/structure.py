@@ -290,7 +290,7 @@ def event_indicators(fmu: Fmu) -> Iterator[str]:
     names, count = fmu.indicators(), fmu.indicator_count()
     if count != len(names):
         yield f"{count} event indicators are announced, {len(names)} variables switch.* repeat them"
-    with fmu.start(MODEL_EXCHANGE) as instance:
+    with fmu.start(MODEL_EXCHANGE, tolerance=_TOLERANCE) as instance:
         if fmu.version == 3:
             if instance.fmi.getNumberOfEventIndicators() != count:
                 yield "the binary has another number of event indicators than the description"
