@@ -4,13 +4,19 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
+from scipy.integrate import solve_ivp
+
 from psa_casadi.export.ssp.archive import export_ssp
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.system import System
+from psa_casadi.units import FloatArray
 from tests.fmu_models import model_named
-from tests.test_fmu_system import STACK
 
 _FOLDER = TemporaryDirectory()
+
+#: Stack, end [s] and rise of the voltage [V/s] of the pushed stage.
+STACK, END, RATE = "P-885.51", 4e-4, 2e5
 
 
 def pushed_stage() -> System:
@@ -37,3 +43,32 @@ def closed_loop() -> System:
 def archive_of(name: str) -> Path:
     system = pushed_stage() if name == "pushed_stage" else closed_loop()
     return export_ssp(system, Path(_FOLDER.name) / f"{name}.ssp")
+
+
+def _voltage(t: float) -> float:
+    return RATE * t
+
+
+@cache
+def monolithic() -> tuple[FloatArray, FloatArray]:
+    """Return the final displacements of stack and stage, from one set of equations."""
+    stack, flexure = model_named(STACK).plant(), model_named("flexure")
+    f, g = stack.structure.f, flexure.structure.f
+    p, q = stack.parameter_vector(), flexure.parameter_vector()
+    count = len(stack.state_names)
+    at = [stack.output_names.index(name) for name in ("displacement", "velocity")]
+
+    def rates(t: float, z: FloatArray) -> FloatArray:
+        tip = np.array(f(t, z[:count], [_voltage(t), 0.0], p)[1]).ravel()[at]
+        slope, out = g(t, z[count:], tip, q)
+        force = float(out[flexure.output_names.index("reaction_force")])
+        own = f(t, z[:count], [_voltage(t), force], p)[0]
+        return np.concatenate([np.array(own).ravel(), np.array(slope).ravel()])
+
+    size = np.concatenate([stack.state_nominals(), flexure.state_nominals()])
+    solution = solve_ivp(
+        rates, (0.0, END), np.zeros(len(size)), method="LSODA", rtol=1e-9, atol=1e-11 * size
+    )
+    assert solution.success
+    final = solution.y[:, -1]
+    return final[stack.state_names.index("x")], final[count]

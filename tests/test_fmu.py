@@ -11,8 +11,9 @@ from psa_casadi.export.check.agreement import has_reference
 from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
-from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.reference import from_samples, simulate
+from psa_casadi.units import FloatArray
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow, slow_but
 

@@ -13,9 +13,10 @@ import pytest
 
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, Instance
-from psa_casadi.export.importer.masters import FloatArray, Signals, co_simulate, communicate
+from psa_casadi.export.importer.masters import Signals, co_simulate, communicate
 from psa_casadi.reference import simulate
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 from tests.benchmarks.work_precision_methods import STEP_SHARE, TIGHTEST_STEP
 from tests.fmu_models import exported, model_named

@@ -4,7 +4,6 @@ import ctypes
 import re
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -162,24 +161,6 @@ def test_rate_is_forgotten_after_its_step(slave: Instance) -> None:
     assert slave.get(["voltage"])[0] == pytest.approx(10.0)
 
 
-def test_instances_run_in_threads() -> None:
-    def run(share: float) -> bytes:
-        with fmu.start(CO_SIMULATION) as slave:
-            rows = []
-            for k in range(300):
-                slave.set({"voltage": share * (k % 50)})
-                slave.step(k * 1e-5, 1e-5)
-                rows.append(slave.get(["displacement", "velocity"]))
-            return np.array(rows).tobytes()
-
-    shares = [0.5, 1.0, 1.5, 2.0]
-    with Fmu(exported(STACK)) as fmu:
-        alone = [run(s) for s in shares]
-        with ThreadPoolExecutor(4) as pool:
-            assert list(pool.map(run, shares)) == alone
-    assert len(set(alone)) == 4
-
-
 def test_snapshot_of_another_model_or_interface_is_refused(slave: Instance) -> None:
     snapshot = slave.save()
     data = slave.serialize(snapshot)
@@ -193,15 +174,3 @@ def test_snapshot_of_another_model_or_interface_is_refused(slave: Instance) -> N
     ):
         stranger.deserialize(data)
     slave.drop(snapshot)
-
-
-def test_many_instances() -> None:
-    with Fmu(exported(STACK)) as fmu:
-        instances = [fmu.start(CO_SIMULATION) for _ in range(50)]
-        for k, slave in enumerate(instances):
-            slave.set({"voltage": float(k)})
-            slave.step(0.0, 1e-2)
-        final = [float(s.get(["charge"])[0]) for s in instances]
-        for slave in instances:
-            slave.free()
-    assert final == pytest.approx([1.5e-6 * k for k in range(50)], rel=1e-5, abs=1e-12)

@@ -220,7 +220,7 @@ def test_the_check_finds_the_errors_that_it_states(tmp_path: Path) -> None:
     names = {"life cycle", "snapshots", "line of the input", "start of a run", "settled start"}
     assert names < figures.keys()
     assert {"equations", "model exchange", "parameter changes"} < set(report.left_out)
-    assert ("intermediate update" in report.left_out) == (fmi == 3)
+    assert ("adjoint derivatives" in report.left_out) == (fmi == 3)
     assert figures.keys().isdisjoint(report.left_out)
     assert "Left out, as its step is fixed: model exchange inst" in check_sentence(report)
 

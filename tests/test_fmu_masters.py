@@ -17,10 +17,10 @@ import fmpy
 import numpy as np
 import pytest
 
-from psa_casadi.export.importer.masters import FloatArray
 from psa_casadi.reference import simulate
+from psa_casadi.units import FloatArray
 from tests.fmu_models import exported, model_named
-from tests.test_fmu_system import END, RATE, coupled, monolithic
+from tests.ssp_systems import END, RATE, monolithic
 from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
@@ -152,11 +152,3 @@ def test_ecos_couples_two_fmus(ecos: Any, fmi: int) -> None:
     assert errors[0] / errors[1] > 1.6, errors
     assert errors[1] / errors[2] > 1.6, errors
     assert errors[2] < 1e-2
-
-
-def test_ecos_agrees_with_the_project_s_own_coupling(ecos: Any) -> None:
-    """Both couplings differ from each other no more than from the exact answer."""
-    exact, own, theirs = monolithic(), coupled(1e-6, rates=False), _coupled_by_ecos(ecos, 2, 1e-6)
-    for a, b, c in zip(exact, own, theirs, strict=True):
-        assert abs(b - c) < 2.0 * max(abs(a - b), abs(a - c))
-        assert abs(b - c) < 5e-3 * abs(a)

@@ -19,8 +19,7 @@ from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.system import System
 from tests.fmu_models import assert_valid, model_named
 from tests.ssp_master import SspArchive
-from tests.ssp_systems import archive_of, closed_loop, pushed_stage
-from tests.test_fmu_system import STACK
+from tests.ssp_systems import STACK, archive_of, closed_loop, pushed_stage
 from tests.tiers import slow, slow_but
 
 #: Each archive is exported once: with pytest-xdist by one process.

@@ -20,7 +20,7 @@ from psa_casadi.cli.screen import (
 )
 
 if TYPE_CHECKING:
-    from psa_casadi.export.ssp.structure import WiredParts
+    from psa_casadi.export.ssp.drawing import WiredParts
 
 #: The stack of a system for which no model is given.
 DEFAULT_STACK = "P-885.51"

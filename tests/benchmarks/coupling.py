@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.export.importer.fmu import FloatArray, FmuError
+from psa_casadi.export.importer.fmu import FmuError
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.archive import export_ssp
 from psa_casadi.model.nanopositioner import nanopositioner, positioner_plant
@@ -24,6 +24,7 @@ from psa_casadi.model.system import System
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.stepper import run as integrate
+from psa_casadi.units import FloatArray
 from tests.benchmarks.coupling_figure import picture
 from tests.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
 from tests.benchmarks.coupling_stability import Limit, limits, limits_table

@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.components.outputs import OUTPUT as VALIDITY
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.check import binaries
-from psa_casadi.export.check.agreement import truth_of
+from psa_casadi.export.check.agreement import fixed_truth, stated_step, truth_of
 from psa_casadi.export.check.apart import OVERTIME, rows_apart
 from psa_casadi.export.check.description import (
     DESCRIBED,
@@ -22,7 +22,6 @@ from psa_casadi.export.check.description import (
     wrong_start_values,
 )
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
-from psa_casadi.export.check.fixed_step import fixed_truth, stated_step
 from psa_casadi.export.check.measured import Task
 from psa_casadi.export.check.rows import (
     LEFT_OUT,

@@ -25,8 +25,7 @@ from psa_casadi.identification.prepare import as_read, prepared
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence, RecordRun
 from psa_casadi.records.record import Record
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 _NONE = (
     "the model says nothing of its records and errors; identify or diagnose it with this version of"

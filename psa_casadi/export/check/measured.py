@@ -7,31 +7,30 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.agreement import Run, Truth
 from psa_casadi.export.check.binaries import binary_checks
 from psa_casadi.export.check.calls import CALLS
-from psa_casadi.export.check.events import event_indicators, wrong_indicators
-from psa_casadi.export.check.input_line import input_line_error
 from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, Check, CheckRow, stopped
 from psa_casadi.export.check.structure import (
     adjoint_error,
     directional_error,
     equation_error,
+    event_indicators,
     incomplete_dependencies,
+    input_line_error,
     settled_start_error,
+    wrong_indicators,
     wrong_nominals,
     wrong_start,
 )
-from psa_casadi.export.check.truth import Run, Truth
 from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: How far a repeated run may be off, as a share of its range, by the version of FMI: in FMI 3.0
 #: inputs cannot move within a step, see `_played`.

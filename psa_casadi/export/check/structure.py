@@ -2,22 +2,34 @@
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from psa_casadi.export.check.truth import Truth
-from psa_casadi.export.common.variable_table import START_VOLTAGE
+from psa_casadi.export.check.agreement import Truth
+from psa_casadi.export.common.variable_table import INPUT_LINE, START_VOLTAGE
+from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
-_POINTS = 3
+_POINTS, _TOLERANCE = 4, 1e-10
 #: Knowns and unknowns whose derivatives through a step are compared.
 _MOST = 24
 #: Difference that rounding may make, as a share of the nominal value.
 _ROUNDING = 1e-12
 #: A row whose entries are below this share of its unknown's value moves nothing; it is rounding.
 _NOTHING = 1e-6
+#: Parts of a step in which its line is followed by values that are held.
+_PARTS = 50
+#: Rise of the inputs over a step, in nominal values: small beside the limits of a slew rate, else
+#: large enough to leave a dead band.
+_RISES = (1e-3, 1e-1)
+#: Changes of states, over the rise, below which the inputs count as without effect.
+_SMALL = 1e-5
+#: Inputs at which an indicator is looked at, in nominal values.
+_SIZES = (0.1, -0.1, 1.0, -1.0, 10.0, -10.0, 100.0, -100.0)
+#: Of indicators, as shares of the largest value of the switch: error, and margin.
+_EXACT, _MARGIN = 1e-9, 1e-2
 
 
 def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
@@ -48,15 +60,25 @@ def evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) -
     return instance.get(unknowns)
 
 
-def held_values(instance: Instance) -> list[FloatArray]:
-    """Return the vector of the sampled states in a list; an empty list if there are none."""
-    names = instance.fmu.sampled()
-    return [instance.get(names)] if names else []
+def _at_points(fmu: Fmu, seed: int) -> Iterator[tuple[Instance, dict[str, float]]]:
+    """Yield an instance of model exchange with each of some random points, as time goes on.
+
+    Its sampled states start within their nominals.
+    """
+    drawn = np.random.default_rng(seed)
+    points = [random_point(fmu, drawn) for _ in range(_POINTS)]
+    starts = {n: float(fmu.nominals[n] * drawn.uniform(-1.0, 1.0)) for n in fmu.sampled()}
+    with fmu.start(MODEL_EXCHANGE, tolerance=_TOLERANCE, values=starts) as instance:
+        for point in sorted(points, key=lambda p: p["time"]):
+            yield instance, point
 
 
-def sampled_starts(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
-    """Return values of the sampled states to start from, within their nominals."""
-    return {n: float(fmu.nominals[n] * generator.uniform(-1.0, 1.0)) for n in fmu.sampled()}
+def _arguments(truth: Truth, point: dict[str, float], instance: Instance) -> list[Any]:
+    """Return what the functions of the truth take at a point."""
+    groups = (truth.state_names, truth.input_names, truth.parameter_names)
+    vectors = [np.array([point[n] for n in names]) for names in groups]
+    sampled = instance.fmu.sampled()
+    return [point["time"], *vectors, *([instance.get(sampled)] if sampled else [])]
 
 
 def wrong_nominals(fmu: Fmu) -> Iterator[str]:
@@ -74,7 +96,6 @@ def wrong_nominals(fmu: Fmu) -> Iterator[str]:
 
 def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
     """Whatever moves an output, derivative or indicator is listed, parameters included."""
-    generator = np.random.default_rng(1)
     described = fmu.description
     entries = [*described.outputs, *described.derivatives, *described.initialUnknowns]
     entries += described.eventIndicators if fmu.version == 3 else []
@@ -83,16 +104,13 @@ def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
             yield f"'{entry.variable.name}' lists no dependencies"
     unknowns = list(dict.fromkeys(e.variable.name for e in entries))
     found: dict[str, set[str]] = {name: set() for name in unknowns}
-    starts = sampled_starts(fmu, np.random.default_rng(6))
-    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
-        for _ in range(_POINTS):
-            point = random_point(fmu, generator)
-            here = evaluate(instance, point, unknowns)
-            for known in point:
-                moved = {**point, known: point[known] * 1.01}
-                changed = evaluate(instance, moved, unknowns) != here
-                for name in np.array(unknowns)[changed]:
-                    found[name].add(known)
+    for instance, point in _at_points(fmu, 1):
+        here = evaluate(instance, point, unknowns)
+        for known in point:
+            moved = {**point, known: point[known] * 1.01}
+            changed = evaluate(instance, moved, unknowns) != here
+            for name in np.array(unknowns)[changed]:
+                found[name].add(known)
     claims = [(e.variable.name, {d.name for d in e.dependencies or []}) for e in entries]
     missing = {(name, known) for name, claimed in claims for known in found[name] - claimed}
     for name, known in sorted(missing):
@@ -104,25 +122,26 @@ def directional_error(fmu: Fmu) -> float:
 
     Relative to the size of each unknown's derivative in nominal units of the knowns.
     """
-    generator = np.random.default_rng(2)
-    unknowns = [u.variable.name for u in (*fmu.description.outputs, *fmu.description.derivatives)]
-    unknowns += fmu.indicators()
-    worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
-    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
-        for _ in range(_POINTS):
-            point = random_point(fmu, generator)
-            knowns = [k for k in point if k != "time"]
-            seeds = np.array([fmu.nominals[k] * generator.uniform(-1.0, 1.0) for k in knowns])
-            step = 1e-6
-            ends = []
-            for sign in (1.0, -1.0):
-                moved = {k: point[k] + sign * step * d for k, d in zip(knowns, seeds, strict=True)}
-                ends.append(evaluate(instance, {**point, **moved}, unknowns))
-            here = evaluate(instance, point, unknowns)
-            exact = instance.directional(unknowns, knowns, seeds)
-            difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
-            worst = max(worst, float(np.max(difference / (np.abs(exact) + np.abs(here) + 1e-300))))
+    seeds, step, worst = np.random.default_rng(2), 1e-6, 0.0
+    unknowns = _differentiated(fmu)
+    for instance, point in _at_points(fmu, 2):
+        knowns = [k for k in point if k != "time"]
+        seed = np.array([fmu.nominals[k] * seeds.uniform(-1.0, 1.0) for k in knowns])
+        ends = []
+        for way in (step, -step):
+            moved = {k: point[k] + way * d for k, d in zip(knowns, seed, strict=True)}
+            ends.append(evaluate(instance, {**point, **moved}, unknowns))
+        here = evaluate(instance, point, unknowns)
+        exact = instance.directional(unknowns, knowns, seed)
+        difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
+        worst = max(worst, float(np.max(difference / (np.abs(exact) + np.abs(here) + 1e-300))))
     return worst
+
+
+def _differentiated(fmu: Fmu) -> list[str]:
+    """Return the names of outputs, derivatives and event indicators."""
+    listed = (*fmu.description.outputs, *fmu.description.derivatives)
+    return [*(u.variable.name for u in listed), *fmu.indicators()]
 
 
 def adjoint_error(fmu: Fmu) -> float:
@@ -134,10 +153,8 @@ def adjoint_error(fmu: Fmu) -> float:
     entry, or to what its unknown's value says is no more than rounding. Sampled states are held; a
     step into which an instant falls is not differentiated.
     """
-    generator = np.random.default_rng(4)
-    unknowns = [*fmu.names("output"), *(u.variable.name for u in fmu.description.derivatives)]
-    unknowns += fmu.indicators()
-    point = random_point(fmu, generator)
+    unknowns = _differentiated(fmu)
+    point = random_point(fmu, np.random.default_rng(4))
     knowns = [k for k in point if k != "time"]
     size = np.array([fmu.nominals[k] for k in knowns])
     with fmu.start(MODEL_EXCHANGE) as instance:
@@ -215,19 +232,123 @@ def settled_start_error(fmu: Fmu, truth: Truth) -> float:
 
 def equation_error(fmu: Fmu, truth: Truth) -> float:
     """Return the largest relative difference of derivatives and outputs from the model's."""
-    generator = np.random.default_rng(3)
-    unknowns = [*(f"der({n})" for n in truth.state_names), *truth.output_names]
-    worst, starts = 0.0, sampled_starts(fmu, np.random.default_rng(6))
-    with fmu.start(MODEL_EXCHANGE, values=starts) as instance:
-        for _ in range(_POINTS):
-            point = random_point(fmu, generator)
-            found = evaluate(instance, point, unknowns)
-            vectors = [
-                np.array([point[n] for n in names])
-                for names in (truth.state_names, truth.input_names, truth.parameter_names)
-            ]
-            xdot, y = truth.f(point["time"], *vectors, *held_values(instance))
-            expected = np.concatenate([np.array(xdot).ravel(), np.array(y).ravel()])
-            size = np.abs(expected) + np.abs(found) + 1e-300
-            worst = max(worst, float(np.max(np.abs(found - expected) / size)))
+    unknowns, worst = [*(f"der({n})" for n in truth.state_names), *truth.output_names], 0.0
+    for instance, point in _at_points(fmu, 3):
+        found = evaluate(instance, point, unknowns)
+        xdot, y = truth.f(*_arguments(truth, point, instance))
+        expected = np.concatenate([np.array(xdot).ravel(), np.array(y).ravel()])
+        size = np.abs(expected) + np.abs(found) + 1e-300
+        worst = max(worst, float(np.max(np.abs(found - expected) / size)))
     return worst
+
+
+def input_line_error(fmu: Fmu) -> float:
+    """Return how far a step along the line is from where the inputs lead that follow it.
+
+    As a share of what holding the inputs over that step changes, the larger one of two rises. Two
+    values are given, a step apart; then the line through them goes on over the next step. The same
+    is done by `_PARTS` short steps with values held that lie on it. What these leave, an instant
+    of sampled states among them, is twice their difference from half as many at most, and is taken
+    off. Inputs that move no state within a step leave nothing to compare: 0.
+    """
+    return max(_share(fmu, rise) for rise in _RISES)
+
+
+def _share(fmu: Fmu, rise: float) -> float:
+    line, held = (_moved(fmu, value, rise, 1) for value in (1.0, 0.0))
+    coarse, fine = (_moved(fmu, 0.0, rise, parts) for parts in (_PARTS // 2, _PARTS))
+    change = float(np.max(np.abs(held - fine), initial=0.0))
+    left = np.abs(line - fine) - 2.0 * np.abs(coarse - fine)
+    return max(0.0, float(np.max(left))) / change if change > _SMALL * rise else 0.0
+
+
+def _moved(fmu: Fmu, line: float, rise: float, parts: int) -> FloatArray:
+    """Return the states, in nominal values, after two steps; the second one in parts."""
+    fixed, inputs = fixed_step_of(fmu.directory), fmu.names("input")
+    size = fmu.step_size if fixed is None else _PARTS * fixed  # a part must be a multiple of it
+    names = fmu.states() or fmu.sampled()
+    sizes: FloatArray = np.array([fmu.nominals[n] for n in names])
+    values = {INPUT_LINE.name: line}
+    with fmu.start(CO_SIMULATION, tolerance=1e-9, values=values) as instance:
+        instance.set({n: rise * fmu.nominals[n] for n in inputs})
+        instance.step(0.0, size)
+        for part in range(parts):
+            along = (part + 0.5) / parts if parts > 1 else 0.0
+            instance.set({n: rise * (2.0 + along) * fmu.nominals[n] for n in inputs})
+            instance.step(size * (1.0 + part / parts), size / parts)
+        return instance.get(names) / sizes
+
+
+def event_indicators(fmu: Fmu) -> Iterator[str]:
+    """As many as announced, equal to their variables, alive, and turned round by an event.
+
+    One that follows an input at rest has both signs as the inputs go either way, from a tenth to
+    many times their nominals. One that follows states, held values, parameters or time need not
+    have both within reach; it must move with one of them. After an event none is negative, for an
+    importer then waits for the next change of sign.
+    """
+    names, count = fmu.indicators(), fmu.indicator_count()
+    if count != len(names):
+        yield f"{count} event indicators are announced, {len(names)} variables switch.* repeat them"
+    with fmu.start(MODEL_EXCHANGE, tolerance=_TOLERANCE) as instance:
+        if fmu.version == 3:
+            if instance.fmi.getNumberOfEventIndicators() != count:
+                yield "the binary has another number of event indicators than the description"
+            if instance.fmi.getNumberOfContinuousStates() != len(fmu.states()):
+                yield "the binary has another number of states than the description"
+            if [u.variable.name for u in fmu.description.eventIndicators] != names:
+                yield "the event indicators of the description are not the variables switch.*"
+        yield from _one_sided(fmu, instance)
+    yield from dict.fromkeys(_dead_or_not_turned(fmu))
+
+
+def _one_sided(fmu: Fmu, instance: Instance) -> Iterator[str]:
+    """Yield the indicators that follow the inputs at rest, but have one sign for all of them."""
+    names, count = fmu.indicators(), fmu.indicator_count()
+    rest = np.zeros(len(fmu.states()))
+    values = []
+    for size in _SIZES:
+        inputs = {n: size * fmu.nominals[n] for n in fmu.names("input")}
+        instance.derivatives(0.0, rest, inputs)
+        values.append(instance.vector("GetEventIndicators", count))
+        if values[-1].tobytes() != instance.get(names).tobytes():
+            yield "the event indicators differ from the variables that repeat them"
+            return
+    for name, z in zip(names, np.array(values).T, strict=False):
+        if np.ptp(z) > 0.0 and not np.min(z) * np.max(z) < 0.0:
+            yield f"'{name}' follows the inputs and does not change its sign when they turn"
+
+
+def _dead_or_not_turned(fmu: Fmu) -> Iterator[str]:
+    """Yield the indicators that nothing moves, and those that an event leaves negative."""
+    names, seen = fmu.indicators(), []
+    for instance, point in _at_points(fmu, 8):
+        seen.append(evaluate(instance, point, names))
+        instance.require("EnterEventMode")
+        instance.update_discrete_states()
+        instance.require("EnterContinuousTimeMode")
+        for name, z in zip(names, instance.get(names), strict=True):
+            if not z >= 0.0:
+                yield f"'{name}' stays negative after an event"
+    for name, z in zip(names, np.array(seen).T, strict=True):
+        if not np.ptp(np.abs(z)) > 0.0:
+            yield f"'{name}' moves with nothing"
+
+
+def wrong_indicators(fmu: Fmu, truth: Truth) -> Iterator[str]:
+    """Each event indicator is a switch of the model or its negative, plus a small fixed margin."""
+    if fmu.indicators() != [f"switch.{name}" for name in truth.switch_names]:
+        named = ", ".join(truth.switch_names) or "none"
+        yield f"the event indicators are not those of the model: {named}"
+        return
+    found, expected = [], []
+    for instance, point in _at_points(fmu, 5):
+        found.append(evaluate(instance, point, fmu.indicators()))
+        expected.append(np.array(truth.switches(*_arguments(truth, point, instance))).ravel())
+    for name, z, switch in zip(
+        fmu.indicators(), np.array(found).T, np.array(expected).T, strict=True
+    ):
+        size = float(np.max(np.abs(switch)))
+        margins = [z - switch, z + switch]
+        if not any(np.ptp(m) <= _EXACT * size and abs(m[0]) <= _MARGIN * size for m in margins):
+            yield f"'{name}' is not the switch of the model"

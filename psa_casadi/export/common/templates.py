@@ -7,7 +7,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 
 def filled(template: str, **given: object) -> str:
-    """Return a template of the folder `templates` with its values; HTML has them escaped."""
+    """Return a template of the folder `templates` with its values, escaped in HTML and XML."""
     return _environment().get_template(template).render(given)
 
 
@@ -16,7 +16,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("psa_casadi.export"),
         undefined=StrictUndefined,
-        autoescape=lambda name: name is not None and name.endswith(".html"),
+        autoescape=lambda name: name is not None and name.endswith((".html", ".ssd")),
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,

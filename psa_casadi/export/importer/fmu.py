@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 from fmpy import fmi1, fmi2, fmi3
 
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.importer.archive import Archive
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 OK, WARNING, DISCARD, ERROR = 0, 1, 2, 3

@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.export.fmu.archive import export_fmu
@@ -20,8 +19,7 @@ from psa_casadi.export.importer.fmu import (
 from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import start_state
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,13 @@ from psa_casadi.export.ssp.drawing import (
     Layout,
     Port,
     Wire,
+    WiredParts,
     arrange,
     save_wiring,
     wiring_picture,
 )
 from psa_casadi.export.ssp.steps import master_step
-from psa_casadi.export.ssp.structure import WiredParts, parameter_files, structure_description
+from psa_casadi.export.ssp.structure import parameter_files, structure_description
 from psa_casadi.files import atomic_path, temporary_folder
 from psa_casadi.model.system import System
 from psa_casadi.variables import Publication

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.ssp.structure import WiredParts
 from psa_casadi.files import atomic_path
+from psa_casadi.model.compose import Model
+from psa_casadi.variables import Publication
 
 Point = tuple[float, float]
 
@@ -38,6 +39,36 @@ class Wire:
 
     start: Port
     end: Port
+
+
+@dataclass(frozen=True)
+class WiredParts:
+    """A system as SSP sees it: models by the names of the parts, wires, and its own ports.
+
+    A wire from or to `OUTSIDE` makes a port of the system, with the unit of the part's port.
+    """
+
+    name: str
+    parts: Mapping[str, Model]
+    wires: tuple[Wire, ...]
+    publication: Publication = field(default_factory=Publication)
+
+    def unit(self, port: Port) -> str:
+        """Return the unit of a port; that of the system is the unit of what it is wired to."""
+        if port.part == OUTSIDE:
+            ends = [w.end for w in self.wires if w.start == port]
+            port = ends[0] if ends else next(w.start for w in self.wires if w.end == port)
+        s = self.parts[port.part].structure
+        units = {v.name: v.unit for v in s.inputs} | {v.name: v.unit for v in s.outputs}
+        return units[port.name]
+
+    def ports(self, part: str) -> tuple[tuple[str, str], ...]:
+        """Return (name, kind) of the connected ports of a part, or of the system, inputs first."""
+        ends = dict.fromkeys(w.end.name for w in self.wires if w.end.part == part)
+        starts = dict.fromkeys(w.start.name for w in self.wires if w.start.part == part)
+        if part == OUTSIDE:
+            ends, starts = starts, ends
+        return (*((n, "input") for n in ends), *((n, "output") for n in starts))
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
-from psa_casadi.export.ssp.drawing import OUTSIDE
-from psa_casadi.export.ssp.structure import WiredParts
+from psa_casadi.export.ssp.drawing import OUTSIDE, WiredParts
 from psa_casadi.model.compose import Model
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Growth of a step below which a system counts as stable: memories have the radius 1 itself.
 _GROWTH = 1e-7
