@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psa_casadi.export.fmu.reference_run import SHARE, STEPS_PER_PERIOD, held_step, reference_inputs
+from psa_casadi.export.fmu.reference_run import SHARE, STEPS_PER_PERIOD, reference_inputs
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.simulation.stepper import run
@@ -64,9 +64,3 @@ def test_a_sine_over_the_whole_range_needs_the_steps_that_the_page_names(
         found = run(model, grid[rows], u[rows], at_rest, rtol=1e-8, hold="zero").y[:, column]
         error = np.abs(found - truth[rows]).max() / np.ptp(truth)
         assert limits[0] * SHARE < error <= limits[1] * SHARE, (every, error)
-
-
-def test_a_model_without_input_or_motion_has_no_such_step() -> None:
-    flexure = model_named("flexure")
-    assert held_step(replace(flexure, structure=replace(flexure.structure, outputs=()))) is None
-    assert held_step(flexure) is not None

@@ -3,14 +3,12 @@
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from psa_casadi.component import Component, Symbols
+from psa_casadi.component import Component
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.strain import AGEING
-from psa_casadi.model.compose import compose
-from psa_casadi.scales import static_stiffness, stiffness_scale, stroke, stroke_scale
+from psa_casadi.scales import stroke_scale
 from psa_casadi.simulation.codegen import functions_of
 from psa_casadi.simulation.simulate import simulate
 from tests.effect_runs import (
@@ -23,8 +21,6 @@ from tests.effect_runs import (
 from tests.random_models import random_model, random_point
 from tests.stack_models import stack
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 PLANT = tuple(e for e in EFFECTS.values() if e.belongs_to == "plant")
 #: Parameters of a curve's form.
@@ -43,13 +39,6 @@ def bounded(effect: Component) -> bool:
 def has_room_in(base: tuple[Component, ...], effect: Component) -> bool:
     """Whether a base has what an effect needs."""
     return set(effect.needs) <= {c.name for c in base}
-
-
-@every_base
-def test_sizes_are_those_of_the_nominals(base: tuple[Component, ...]) -> None:
-    values = compose(base).values
-    assert static_stiffness(Symbols(values)) == pytest.approx(stiffness_scale(values))
-    assert stroke(Symbols(values)) == pytest.approx(stroke_scale(values))
 
 
 @every_effect

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE, SIMPLIFIED
@@ -26,8 +25,6 @@ from tests.effect_runs import (
 )
 from tests.plants.hysteresis_memory import play
 from tests.stack_models import stack
-
-FloatArray = NDArray[np.float64]
 
 every_base = pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
 
@@ -186,17 +183,6 @@ def test_backlash_dwells_over_the_gap(peak: float) -> None:
         assert crossed[0] < 0.01
         assert crossed[1] < 0.2
         assert crossed[2] == pytest.approx(4.0, abs=0.02)
-
-
-def test_backlash_does_not_creep_at_a_hold() -> None:
-    """Stopped in the middle of the gap after a reversal, the output stays there for 1000 s."""
-    t = np.array([0.0, 1.0, 1.01, *np.linspace(1.1, 1000.0, 50)])
-    voltage = np.interp(t, [0.0, 1.0, 1.01], [0.0, 60.0, 58.8])
-    model = linear(BACKLASH, 1.0, backlash_width=0.01)
-    found = driven(model, t, voltage)
-    w = 0.01 * stroke_scale(model.values)
-    assert abs(found.x[-1, -1]) < 0.8 * w
-    assert np.ptp(found.y[3:, -1]) < 1e-6 * w
 
 
 def test_self_heating_climbs_and_recovers() -> None:

@@ -68,28 +68,6 @@ def test_the_base_errs_by_what_its_header_says() -> None:
     assert all(f"{name:16} {value:.1e}" in header for name, value in found.items())
 
 
-def test_the_measured_error_is_the_one_against_simulate() -> None:
-    share = np.linspace(0.0, 1.0, 1001)
-    voltage = stack("P-885.51").values["u_rated"] * VOLTAGES["tones"][1](share)
-    model = base().plan.model
-    true = simulate(model, STEP * np.arange(1001), voltage, as_exported=True, rtol=1e-9)
-    own = error(play(base(), voltage), true.outputs[OUTPUT][1:])
-    assert own == pytest.approx(errors(base())["tones"], rel=0.02)
-
-
-@slow
-def test_substeps_of_half_the_length_err_far_less() -> None:
-    one, two = errors(base()), errors(base(substeps=2))
-    for name in ("triangle", "tones", "jumps"):
-        assert two[name] < 0.3 * one[name]
-
-
-@slow
-def test_held_inputs_are_those_of_a_zero_order_hold() -> None:
-    assert all(0.0 < e <= 1e-3 for e in errors(base(hold="zero")).values())
-    assert errors(base(hold="zero")) != errors(base())
-
-
 @slow
 def test_single_precision_rests_in_a_hold() -> None:
     """Half a second of rest after a ramp, where a rounded rate would go on for ever."""
@@ -134,16 +112,6 @@ def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str
             (folder / name).write_text(text, encoding="utf-8")
         for command in commands:
             run_compiler([*command, *STRICT, "-c", "stack.c", "-o", "stack.o"], folder)
-
-
-@slow
-def test_a_start_voltage_is_at_rest() -> None:
-    model = psa.settled_at(stack("P-885.51").plant(), 60.0, (120.0,))
-    found = fixed_step(model, name="stack", step=STEP, substeps=1)
-    held = play(found, np.full(500, 60.0))
-    first = simulate(model, [0.0, STEP], [60.0, 60.0]).outputs[OUTPUT][0]
-    assert first > 5e-6
-    assert np.max(np.abs(held - first)) <= 1e-6 * first
 
 
 def test_an_effect_that_does_not_fit_is_named() -> None:

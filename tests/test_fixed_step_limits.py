@@ -1,17 +1,12 @@
 """A fixed step beyond the rated voltage: as good as it says, or limited and told."""
 
 import ctypes
-import json
 
 import numpy as np
 import pytest
 
-import psa_casadi as psa
 from psa_casadi.export.fixed_step.export import GOOD, FixedStep, fixed_step
 from psa_casadi.export.fixed_step.probe import Probe, played_inputs
-from psa_casadi.export.fmu.sources import FIXED_ENTRY
-from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
-from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.stepper import run
 from tests.exact_cases import FloatArray, error
@@ -82,21 +77,3 @@ def test_the_step_tells_it_and_no_number_leaves_the_voltage(precision: str) -> N
     assert told(0.0, 100.0, 900.0, 100.0, -900.0)[0] == 0b00101
     assert told(60.0, 60.0, np.nan) == (0b001, told(60.0, 60.0, 60.0)[1])
     assert told(60.0, np.inf)[1] == told(60.0, found.plan.limit)[1]
-
-
-@pytest.mark.parametrize("fmi", [2, pytest.param(3, marks=slow)])
-def test_an_fmu_says_it_once(fmi: int) -> None:
-    with temporary_folder() as folder:
-        path = psa.export_fmu(stack("P-885.51"), folder / "fixed.fmu", fmi=fmi, step=STEP)
-        with Fmu(path) as fmu:
-            ends = []
-            limit = json.loads((fmu.directory / FIXED_ENTRY).read_text())["voltage_limit"]
-            for voltage in (limit, -limit, 900.0, -1e6, 1e6):
-                with fmu.start(CO_SIMULATION) as slave:
-                    slave.set({"voltage": voltage})
-                    slave.step(0.0, 10 * STEP)
-                    slave.step(10 * STEP, 10 * STEP)
-                    ends.append(slave.get(["displacement"])[0])
-                    said = [m for m in slave.messages if "beyond" in m]
-                    assert len(said) == (abs(voltage) > limit), said
-    assert ends[0] == ends[2] == ends[4] != ends[1] == ends[3]

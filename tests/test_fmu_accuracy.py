@@ -105,25 +105,6 @@ def test_error_is_within_ten_tolerances(name: str, kind: str, tolerance: float) 
     assert error < FACTOR * tolerance
 
 
-@pytest.mark.parametrize("tolerance", TOLERANCES)
-@pytest.mark.parametrize("name", slow_but([ONE], STACKS))
-def test_time_axis_cut_differently(name: str, tolerance: float) -> None:
-    """Steps of 0.5 ms, a third of it, and of random length give the same values every 0.5 ms."""
-    inputs = _signals(name, "ramps")
-    common = _grid(2e-2, 5e-4)
-    middle = np.random.default_rng(3).uniform(0.0, 2e-2, 150)
-    cuts = [common, _grid(2e-2, 5e-4 / 3.0), np.concatenate([middle, common])]
-    found = []
-    with Fmu(exported(name)) as fmu:
-        for cut in cuts:
-            times = np.unique(np.concatenate([np.round(cut, 12), common]))
-            run_ = co_simulate(fmu, times, inputs, ["displacement"], tolerance=tolerance)[:, 0]
-            found.append(run_[np.isin(times, common)])
-    scale = _scale(name, found[0])
-    spread = np.max(np.ptp(np.array(found), axis=0)) / scale
-    assert spread < FACTOR * tolerance
-
-
 def _held(instance: Instance, times: FloatArray, levels: FloatArray) -> FloatArray:
     """Hold each level from one time to the next; return the displacement at the ends."""
     found = []

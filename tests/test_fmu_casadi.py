@@ -89,17 +89,6 @@ def test_jacobians_forwards_and_backwards(weight: float, fmi: int, tmp_path: Pat
     assert by_expression(f, model) == pytest.approx(expected, rel=1e-10, abs=0.0)
 
 
-@pytest.mark.xfail(
-    ca.CasadiMeta.version() in ("3.8.0", "3.8.1", "3.8.2"), strict=True,
-    reason="CasADi 3.8 up to 3.8.2 keeps the last of several adjoint seeds of an FMI 3 FMU only",
-)  # fmt: skip
-def test_several_adjoint_seeds_at_once(tmp_path: Path) -> None:
-    model = model_named("P-885.51").plant()
-    f = imported("P-885.51", 3, tmp_path, ad_weight=1.0)
-    expected = by_expression(symbolic(model), model)
-    assert by_expression(f, model) == pytest.approx(expected, rel=1e-10, abs=0.0)
-
-
 STEPS, SIZE = 20, 2e-5
 #: The path to follow: a smooth rise of 8 um in 0.4 ms.
 PATH = 4e-6 * (1.0 - np.cos(np.pi * np.arange(1, STEPS + 1) / STEPS))

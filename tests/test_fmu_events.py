@@ -1,8 +1,7 @@
 """The voltage's reversal as an event: located by an importer, harmless where nobody looks."""
 
-import ctypes
 import itertools
-from ctypes import c_bool, c_double, c_size_t
+from ctypes import c_double, c_size_t
 from typing import Literal
 
 import fmpy
@@ -15,7 +14,7 @@ from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, OK, Fmu
 from tests import fmi3_instances as fmi3
 from tests.fmu_models import exported, model_named
-from tests.tiers import slow, slow_but
+from tests.tiers import slow
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -52,22 +51,6 @@ def test_indicator_is_the_rate_of_the_voltage_in_fmi_2() -> None:
         assert "1 event indicators" in instance.messages[-1]
         assert instance.call("GetEventIndicators", None, c_size_t(1)) == ERROR
         assert instance.call("EnterEventMode") == OK
-
-
-def test_indicator_is_the_rate_of_the_voltage_in_fmi_3() -> None:
-    with fmi3.Instance3(fmi3.loaded(STACK), MODEL_EXCHANGE) as instance:
-        instance.start({"u": 30.0, "voltage": 50.0})
-        z = instance.vector("GetEventIndicators", 1)
-        assert z[0] == pytest.approx(_rate(30.0, 50.0) + _margin(), rel=1e-12)
-        assert instance.get([SWITCH])[0] == z[0]
-        assert instance.try_set({SWITCH: 0.0}) == ERROR
-        instance.require("EnterEventMode")
-        assert instance.update_discrete_states() == [False] * 5
-        instance.require("EnterContinuousTimeMode")
-        nothing = (c_double * 1)()
-        assert instance.call("GetEventIndicators", nothing, c_size_t(0)) == ERROR
-        flags = [c_bool(True), c_bool(True)]
-        instance.require("CompletedIntegratorStep", True, *(ctypes.byref(f) for f in flags))
 
 
 def test_indicator_faces_the_other_way_after_an_event_and_noise_makes_none() -> None:
@@ -173,22 +156,3 @@ def test_loose_solver_without_events_is_right_too(
             found.append(float(instance.get(["displacement"])[0]))
     truth = _path(times)
     assert np.abs(np.array(found) - truth).max() < 10.0 * tolerance * np.ptp(truth)
-
-
-@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
-def test_fmpy_integrates_a_moving_voltage_at_the_default_tolerance(fmi: int) -> None:
-    """fmpy 0.3.32 moves the input in the root function only; the events bear that."""
-    time = np.linspace(0.0, 0.05, 2001)
-    signal = np.zeros(len(time), dtype=[("time", "f8"), ("voltage", "f8"), ("load_force", "f8")])
-    signal["time"], signal["voltage"] = time, 30.0 * (1.0 - np.cos(2.0 * np.pi * 50.0 * time))
-    found = {
-        kind: fmpy.simulate_fmu(
-            str(exported(STACK, fmi)), fmi_type=kind, input=signal, output=["displacement"],
-            stop_time=0.05, output_interval=5e-5,
-        )
-        for kind in ("CoSimulation", "ModelExchange")
-    }  # fmt: skip
-    path, other = found["ModelExchange"], found["CoSimulation"]
-    assert np.count_nonzero(np.diff(path["time"]) == 0.0) == 4
-    expected = np.interp(path["time"], other["time"], other["displacement"])
-    assert np.abs(path["displacement"] - expected).max() < 0.02 * np.ptp(expected)

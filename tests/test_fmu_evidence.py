@@ -19,25 +19,6 @@ from tests.evidence_models import evident_fmu, evident_model, files_inside, nois
 from tests.fmu_models import assert_valid
 
 
-def test_the_manifest_tells_the_role_of_every_file_of_evidence() -> None:
-    found = files_inside(evident_fmu())
-    root = ET.fromstring(found[f"{FOLDER}/fmi-ls-manifest.xml"])
-    roles = {}
-    for related in root:
-        source = related.attrib["source"]
-        place = source.removeprefix("../../") if source.startswith("..") else f"{FOLDER}/{source}"
-        assert place in found
-        roles[place] = related.attrib["role"]
-    assert roles[evidence.PAGE] == "report"
-    assert roles[evidence.META_DATA] == "meta-data"
-    assert roles[evidence.VALIDATION] == "experiment/validation"
-    assert roles[evidence.UNCERTAINTY] == "experiment/uncertainty-analysis"
-    assert roles[evidence.START] == roles[f"{evidence.SETS}/mean.ssv"] == "parameter"
-    assert {n for n in found if n.startswith("extra/")} - set(roles) == {
-        f"{FOLDER}/fmi-ls-manifest.xml"
-    }
-
-
 def test_experiments_name_files_that_are_there() -> None:
     found = files_inside(evident_fmu())
     (whole,) = ET.fromstring(found[evidence.VALIDATION])
@@ -78,14 +59,6 @@ def test_meta_data_and_page_say_the_same() -> None:
     assert "../documentation/evidence.html" in found["documentation/index.html"].decode()
 
 
-def test_meta_data_say_who_publishes_the_model() -> None:
-    by = psa.Publication(author="A. N. Other", version="2.1", license="CC BY 4.0")
-    root = ET.fromstring(evidence.meta_data(replace(evident_model(), publication=by)))
-    assert {n: root.attrib[n] for n in ("author", "fileversion", "license", "version")} == {
-        "author": "A. N. Other", "fileversion": "2.1", "license": "CC BY 4.0", "version": "1.0.0",
-    }  # fmt: skip
-
-
 def test_parameter_sets_are_as_their_schema_has_them() -> None:
     found = files_inside(evident_fmu())
     sets = [n for n in found if n.endswith(".ssv")]
@@ -122,16 +95,6 @@ def test_what_a_person_says_of_a_record_stays_text() -> None:
     assert "<b>" not in texts[evidence.PAGE]
     read = "".join(ET.fromstring(texts[evidence.META_DATA]).itertext())
     assert f"{name}, sha256" in read
-
-
-def test_a_file_is_no_folder_for_sets(tmp_path: Path) -> None:
-    place = tmp_path / "taken"
-    place.write_text("")
-    line = f"export fmu --stack demo -o {tmp_path / 'm.fmu'} --sets-to {place}"
-    said = CliRunner().invoke(app, line.split())  # ends before anything is compiled
-    assert said.exit_code != 0
-    assert not (tmp_path / "m.fmu").exists()
-    assert "name a folder for the parameter sets" in " ".join(said.output.split())
 
 
 @pytest.mark.slow

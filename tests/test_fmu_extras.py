@@ -14,14 +14,11 @@ from lxml import etree  # type: ignore[import-untyped]
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
-from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.fmu.reference_run import FOLDER, NOTES
-from psa_casadi.export.fmu.terminals import terminal_entries, terminals_and_icons, terminals_of
+from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.variables import Interval
+from psa_casadi.model.stacks import stack_model
 from tests.fmu_models import assert_valid, entries
 
 STACK = "P-885.51"
@@ -47,14 +44,6 @@ def test_terminals_are_valid_and_their_variables_exist(model: Model) -> None:
     assert icons <= set(ICONS)
 
 
-def test_terminals_of_a_stack() -> None:
-    found = {t.name: {v: k for v, _, k in t.members} for t in terminals_of(stack_model(STACK))}
-    assert found == {
-        "electrical": {"voltage": "signal", "current": "inflow"},
-        "mechanical": {"displacement": "signal", "velocity": "signal", "load_force": "inflow"},
-    }
-
-
 def test_a_stack_and_a_flexure_connect() -> None:
     """Equal names of members, an input on one side for each output on the other; forces opposed."""
     stack = stack_model(STACK)
@@ -68,22 +57,7 @@ def test_a_stack_and_a_flexure_connect() -> None:
         assert {kind, other_kind} in ({"signal"}, {"inflow", "outflow"})
 
 
-def test_a_model_without_known_variables_has_no_terminal() -> None:
-    drive = compose([COMPONENTS["drive"]])
-    assert [t.name for t in terminals_of(drive)] == ["electrical"]
-    renamed = replace(flexure, structure=replace(flexure.structure, inputs=()))
-    assert terminals_of(renamed) == ()
-    assert_valid(terminals_and_icons(renamed), "schema", "fmi3", "fmi3TerminalsAndIcons.xsd")
-
-
 # Icons
-
-
-@pytest.mark.parametrize(("model", "drawing"), [(stack_model(STACK), "stack"), (flexure, "block")])
-def test_only_a_stack_is_drawn_as_one(model: Model, drawing: str) -> None:
-    assert terminal_entries(model)["terminalsAndIcons/icon.png"] == png(ICONS[drawing])
-    shapes = svg(ICONS[drawing]).partition("\n")[2].strip()
-    assert shapes in documentation(model)
 
 
 @pytest.mark.parametrize("name", ICONS)
@@ -101,19 +75,6 @@ def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
     seen = expected[..., 3] > 0.0
     assert np.array_equal(picture[..., 3] > 0.0, seen)
     assert picture[seen] == pytest.approx(expected[seen], abs=1e-6)
-
-
-def test_places_in_the_archives() -> None:
-    three, two = entries(STACK, 3), entries(STACK, 2)
-    folder = {n for n in three if n.startswith("terminalsAndIcons/")}
-    pictures = {f"{n}.{s}" for n in ("icon", "electrical", "mechanical") for s in ("png", "svg")}
-    assert folder == {f"terminalsAndIcons/{n}" for n in (*pictures, "terminalsAndIcons.xml")}
-    assert not any(n.startswith("terminalsAndIcons/") for n in two)
-    assert two["model.png"] == three["terminalsAndIcons/icon.png"]
-    shared = {n for n in three if n.startswith(("documentation/", "extra/", "resources/"))}
-    shared -= {LICENSE_ENTRY}  # the notices of the headers differ
-    assert {n: three[n] for n in shared} == {n: two[n] for n in shared}
-    assert {"documentation/index.html", NOTES, f"{FOLDER}/fmi-ls-manifest.xml"} < shared
 
 
 # Documentation
@@ -151,29 +112,3 @@ def test_documentation_escapes_what_users_write() -> None:
     assert "<script" not in page
     assert "x &lt; y &amp; &lt;script&gt;" in page
     assert "<title>a&lt;b&gt;</title>" in page
-
-
-def test_documentation_tells_the_source_of_a_stack_s_figures() -> None:
-    page = html.unescape(documentation(stack_model(STACK)))
-    stack = STACKS[STACK]
-    assert all(figure.source in page for figure in stack.values.values())
-    assert page.count(">assumed: ") == len(stack.assumed)
-    changed = stack_model(STACK).with_values({"tau": 3e-4})
-    assert stack.values["tau"].source not in html.unescape(documentation(changed))
-
-
-@pytest.mark.parametrize(
-    ("scale", "said"), [("assumed", "share one unknown"), ("given", "outside")]
-)
-def test_documentation_states_force_scale_and_intervals(scale: str, said: str) -> None:
-    model = stack_model(STACK)
-    known = {"tau": Interval(9.5e-5, 1.05e-4)}
-    origin = replace(model.provenance, force_scale=scale, intervals=known)
-    page = documentation(replace(model, provenance=origin))
-    note = re.search(r'<p class="note">(.*?)</p>', page)
-    assert note is not None
-    assert said in note[1]
-    assert "0.095 ms to 0.105 ms" in page
-    assert "95 % interval" in page
-    assert "95 % interval" not in documentation(model)
-    assert 'class="note"' not in documentation(flexure)

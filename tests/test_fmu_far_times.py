@@ -7,12 +7,11 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, Fmu, FmuError
-from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from tests import sampled_fmus
 from tests.fmi3_instances import Instance3, Update
-from tests.fmu_models import exported, model_named
+from tests.fmu_models import exported
 from tests.sampled_models import PERIOD, loop
 from tests.tiers import slow, slow_but
 
@@ -53,17 +52,6 @@ def test_results_do_not_depend_on_the_start(fmi: int, tolerance: float | None) -
             assert np.array_equal(_held(fmu, _sums(start, sizes), sizes, tolerance), near)
 
 
-def test_points_that_are_rounded_cost_no_more_than_their_rounding() -> None:
-    """An importer whose points are start + k size moves each by up to half a last place."""
-    sizes = np.full(20, 1e-4)
-    with Fmu(exported(STACK)) as fmu:
-        near = _held(fmu, _sums(0.0, sizes), sizes, 1e-10)
-        for start in STARTS:
-            far = _held(fmu, np.array([start + k * 1e-4 for k in range(20)]), sizes, 1e-10)
-            fastest = 2.0 * np.abs(np.diff(near)).max() / 1e-4
-            assert np.abs(far - near).max() < fastest * np.spacing(start) + 1e-9 * np.ptp(near)
-
-
 @VERSIONS
 @TOLERANCES
 def test_long_steps(fmi: int, tolerance: float | None) -> None:
@@ -102,18 +90,6 @@ def test_a_jump_within_a_long_step() -> None:
     assert len(moments) == 1
     assert moments[0][1]
     assert varied == pytest.approx(plain, rel=1e-8)
-
-
-@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
-def test_a_simulation_that_starts_late(rtol: float) -> None:
-    model, t = model_named(STACK).plant(), np.arange(65) / 4096.0  # exact wherever they are put
-    v = np.where(t < 4e-3, 100.0, 20.0)
-    near = simulate(model, t, v, rtol=rtol, from_rest_at_zero=True)
-    for start in (10.0, 1e3, 1e6):
-        far = simulate(model, start + t, v, rtol=rtol, from_rest_at_zero=True)
-        assert np.abs(far.displacement - near.displacement).max() < 1e-12 * np.ptp(
-            near.displacement
-        )
 
 
 def test_a_step_below_the_resolution_of_time_is_refused() -> None:

@@ -9,8 +9,6 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.components import BASE, COMPONENTS
-from psa_casadi.export.check.check import check_fmu
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.identification.start.form import forms_of
 from psa_casadi.model.compose import Model, compose
@@ -76,15 +74,6 @@ def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
     assert any(s.startswith("hysteresis: Bouc-Wen") for s in found.sentences)
 
 
-@slow
-def test_a_diagnosis_begins_with_the_spectrum() -> None:
-    effects = [psa.EFFECTS[n] for n in ("hysteresis_memory", "backlash", "load_stiffness")]
-    d = psa.diagnose(psa.record_from(_loops()), hysteresis="spectrum", effects=effects)
-    assert "memory_spectrum" in [c.name for c in d.model.components]
-    assert d.base_errors.holdout_rms_m < 1.5 * _NOISE
-    assert {c.effect for c in d.causes} <= {"hysteresis_memory"}
-
-
 def test_a_model_without_hysteresis_has_no_other_form() -> None:
     bare = compose([c for c in BASE if c.name != "bouc_wen"])
     with pytest.raises(psa.InputError, match="no hysteresis of its own"):
@@ -94,9 +83,3 @@ def test_a_model_without_hysteresis_has_no_other_form() -> None:
 def test_modelica_has_the_equations_of_the_model() -> None:
     model = _with_spectrum()
     assert right_side_error(model, modelica_text(model, include_sensor=True)) < 1e-12
-
-
-@slow
-def test_an_fmu_with_the_spectrum_passes_its_check(tmp_path: Path) -> None:
-    report = check_fmu(export_fmu(_with_spectrum(), tmp_path / "spectrum.fmu"))
-    assert report.passed, report

@@ -1,7 +1,6 @@
 """Several modes at once: read off a residual, fitted beside the base, exported like any effect."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from psa_casadi.diagnosis.search.moves import one_mode
 from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.start.modes import Shaken, modes_of
-from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine
 from psa_casadi.records.split import split
@@ -63,24 +61,9 @@ def test_modes_are_read_off_a_residual() -> None:
         assert abs(mode.ahead) < 0.03 * share
 
 
-def test_records_of_other_sample_times_count_together() -> None:
-    (drive, time), fine = drive_and_time(), 2
-    coarse = Shaken(drive, response(*HIDDEN[0][:2], drive, time), np.ones(COUNT, bool), 1.0 / RATE)
-    own = np.arange(COUNT) / (fine * RATE)
-    other = Shaken(drive, response(*HIDDEN[0][:2], drive, own), np.ones(COUNT, bool), own[1])
-    (mode,) = modes_of([coarse, other], np.ones((2 * COUNT, 1)), most=1, better=0.95)
-    assert mode.frequency == pytest.approx(HIDDEN[0][0], rel=1e-3)
-    assert mode.share == pytest.approx(1.0, rel=1e-2)
-
-
 def test_noise_has_no_modes() -> None:
     drive, _ = drive_and_time()
     shaken = Shaken(drive, noise(COUNT, 3), np.ones(COUNT, bool), 1.0 / RATE)
-    assert modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95) == []
-
-
-def test_what_is_not_driven_has_no_modes() -> None:
-    shaken = Shaken(np.zeros(COUNT), noise(COUNT, 3), np.ones(COUNT, bool), 1.0 / RATE)
     assert modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95) == []
 
 
@@ -106,21 +89,6 @@ def test_its_equations_are_those_of_modal_superposition() -> None:
     added = sum(share * response(f, z, rest, time) for f, z, share in HIDDEN[:2])
     size = np.ptp(added)
     np.testing.assert_allclose(own.displacement - base.displacement, added, atol=2e-3 * size)
-
-
-def test_without_its_gain_nothing_is_added() -> None:
-    time = np.arange(500) / 20_000.0
-    voltage = 40.0 * (1.0 - np.cos(2.0 * np.pi * 100.0 * time))
-    none = with_two_modes().with_values({"series_gain": 0.0})
-    base = psa.simulate(stack_model("P-885.51"), time, voltage).displacement
-    np.testing.assert_allclose(psa.simulate(none, time, voltage).displacement, base, rtol=1e-6)
-
-
-def test_a_model_with_modes_is_saved_and_read() -> None:
-    model = with_two_modes()
-    again = loads(dumps(model))
-    assert again.values == model.values
-    assert again.components[-1] is MODAL_SERIES[2]
 
 
 def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN) -> Record:
@@ -197,11 +165,3 @@ def test_one_mode_is_enough_where_a_series_stands_for_one(healthy: psa.Diagnosis
     assert single.final
     assert single.fit.model.values["mode_frequency"] == pytest.approx(frequency, rel=5e-3)
     assert single.holdout_rms < 1.2e-3 * record.range_m  # the noise is 1e-3
-
-
-@slow
-@pytest.mark.usefixtures("code_runs_here")
-def test_a_model_with_modes_becomes_an_fmu(tmp_path: Path) -> None:
-    path = tmp_path / "modes.fmu"
-    psa.export_fmu(with_two_modes(), path)
-    assert psa.check_fmu(path, with_two_modes()).passed

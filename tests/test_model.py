@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.components.stack import LINEAR_FORCE
+from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file import dumps, load_model, loads, save_model
-from psa_casadi.model.stacks import STACKS
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Interval, Output, Parameter, Provenance, State
@@ -51,12 +49,6 @@ def test_a_loop_of_balances_is_named() -> None:
     assert "tip_force -> tip_force;" in message(lambda: compose((*BASE, own)))
 
 
-def test_what_a_component_reads_must_be_there() -> None:
-    text = message(lambda: compose((LINEAR_FORCE,)))
-    assert "'linear_force'" in text
-    assert "'u'" in text
-
-
 def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
     state = State("z", "m", "a state", 1.0)
     bare = component(
@@ -77,13 +69,6 @@ def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
 def test_a_name_belongs_to_one_component(name: str) -> None:
     twice = component(lambda _: Equations(), parameters=(gain_of(name),))
     assert f"Two components declare '{name}'" in message(lambda: compose((*BASE, twice)))
-
-
-def test_names_of_balances_and_time_are_taken() -> None:
-    taken = component(lambda _: Equations(), parameters=(gain_of("time"), gain_of("tip_force")))
-    text = message(lambda: compose((*BASE, taken)))
-    assert "declares 'time'" in text
-    assert "declares 'tip_force'" in text
 
 
 def test_every_bad_value_is_named_at_once() -> None:
@@ -170,13 +155,6 @@ def test_model_file_round_trip_is_exact(components: tuple[Component, ...], tmp_p
     assert dumps(read) == path.read_text(encoding="utf-8") == dumps(model)
 
 
-@pytest.mark.parametrize("name", sorted(STACKS))
-def test_named_stacks_round_trip(name: str) -> None:
-    model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()}, name=name)
-    assert loads(dumps(model)).values == model.values
-    assert set(model.values) == set(STACKS[name].values)
-
-
 def changed(change: Callable[[dict[str, Any]], object]) -> str:
     content = json.loads(dumps(identified()))
     change(content)
@@ -216,16 +194,6 @@ def test_each_mistake_in_a_file_is_named() -> None:
         assert all(line.startswith("m.json") for line in text.splitlines())
 
 
-def test_several_mistakes_come_together() -> None:
-    def spoil(content: dict[str, Any]) -> None:
-        content["effects"].append("magic")
-        content["parameters"]["tau"]["value"] = None
-        del content["parameters"]["A"]
-
-    text = changed(spoil)
-    assert all(word in text for word in ("'magic'", "'tau' is None", "'A' [N/V] has no value"))
-
-
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"x"', "null"])
 def test_what_is_no_model_file_says_so(text: str) -> None:
     assert message(lambda: loads(text, "m.json")).startswith("m.json is not ")
@@ -236,14 +204,3 @@ def test_a_file_that_cannot_be_read_says_so(tmp_path: Path) -> None:
     assert "cannot be read" in message(lambda: load_model(path))
     path.write_bytes(b"\xff\xfe\x00")
     assert "cannot be read" in message(lambda: load_model(path))
-
-
-def test_a_component_that_is_no_stack_composes_alone() -> None:
-    model = compose((COMPONENTS["flexure"],), name="flexure")
-    assert model.output_names == ("reaction_force", "stage_position")
-    rate, outputs = model.structure.f(0.0, [1e-6, 0.0], [3e-6, 0.0], model.parameter_vector())
-    force = model.values["k_c"] * 2e-6
-    assert float(outputs[0]) == pytest.approx(-force, rel=1e-12)
-    assert float(rate[1]) * model.values["m_f"] == pytest.approx(
-        force - model.values["k_f"] * 1e-6, rel=1e-12
-    )

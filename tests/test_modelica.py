@@ -11,10 +11,9 @@ from psa_casadi.component import Component, Equations
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.modelica.package import class_names, export_modelica, modelica_text
+from psa_casadi.export.modelica.package import export_modelica, modelica_text
 from psa_casadi.model.compose import compose
 from psa_casadi.model.ode_model import ode_model
-from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.variables import Input, Output, Parameter, State
 
@@ -47,51 +46,6 @@ def test_every_balance_and_state_has_one_equation_and_is_declared_once() -> None
         assert equations.count(f"der({name}) =") == 1, name
     for parameter in model.structure.parameters:
         assert f'parameter Real {parameter.name}(unit="{parameter.unit}"' in declared
-
-
-def test_declarations_carry_units_bounds_starts_and_usual_sizes() -> None:
-    text = modelica_text(stack_model("P-885.51"))
-    assert (
-        'parameter Real C_p(unit="F", displayUnit="uF", min=1e-10, max=0.01) = 1.5e-06'
-        ' "capacitance of the stack";'
-    ) in text
-    assert 'input Real voltage(unit="V", start=0.0, nominal=120.0) ' in text
-    assert (
-        'Real x(unit="m", displayUnit="um", start=0.0, fixed=true, nominal=2.1e-05)'
-        ' "displacement of the output mass";'
-    ) in text
-    assert "Yang and Zhu 2015, eqs. 4 and 5" in text
-
-
-def test_equations_are_short_and_speak_the_models_words() -> None:
-    text = modelica_text(stack_model("P-885.51"))
-    for line in (
-        "drive_current = (drive_voltage - u)/R_s; // drive",
-        "free_force = k_L*u + f_H; // linear_force, bouc_wen",
-        "der(v_y) = (wafer_force - transmitted_force)/m_P;",
-        "velocity = der(x);",
-    ):
-        assert f"    {line}\n" in text
-
-
-def test_the_sensor_stays_out_unless_it_is_wanted() -> None:
-    model = stack_model("P-885.51").with_effect(EFFECTS["sensor_lag"])
-    assert "sensor_lag" not in modelica_text(model)
-    assert "sensor_lag_time" in modelica_text(model, include_sensor=True)
-
-
-def test_the_same_model_gives_the_same_text() -> None:
-    first = modelica_text(compose((*BASE, *EFFECTS.values())))
-    assert modelica_text(compose((*BASE, *EFFECTS.values()))) == first
-
-
-def test_classes_are_those_in_the_text() -> None:
-    model = stack_model("P-885.51").plant()
-    text = modelica_text(model)
-    assert class_names(model) == ("Signal", "Acausal", "Examples.Sine", "Examples.Wired")
-    for name in class_names(model):
-        assert f"model {name.rpartition('.')[2]} " in text
-        assert f"end {name.rpartition('.')[2]};" in text
 
 
 def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> Component:
@@ -159,24 +113,6 @@ def test_the_command_writes_the_package_and_says_what_is_in_it(tmp_path: Path) -
     assert "left out: sensor" in result.output
     assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in result.output
     assert path.read_text(encoding="utf-8") == modelica_text(stack_model("P-885.51"))
-
-
-def test_the_command_refuses_an_impossible_name(tmp_path: Path) -> None:
-    arguments = ["export", "modelica", "--stack", "P-885.51", "--name", "end"]
-    result = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "x.mo")])
-    assert result.exit_code == 2
-    assert "'end' cannot name a Modelica package" in result.output
-
-
-def test_a_stack_has_a_stacks_icon_and_everything_else_a_plain_one() -> None:
-    stack, amplifier = (
-        modelica_text(m) for m in (stack_model("P-885.51"), part_model("voltage_amplifier"))
-    )
-    assert "extends Icons.Stack;" in stack
-    assert "Icons.Block" not in stack
-    assert "extends Icons.Block;" in amplifier
-    assert "partial model Block" in amplifier
-    assert "Stack" not in amplifier.replace("PiezoStack", "")
 
 
 @pytest.mark.parametrize(("start", "rests"), [(0.0, True), (2.0, True), (1.0, False)])

@@ -3,7 +3,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from psa_casadi.components import COMPONENTS, SIMPLIFIED
+from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.modelica.package import modelica_text, reciprocal
 from psa_casadi.model.compose import compose
@@ -90,12 +90,6 @@ def test_every_wired_example_is_a_balanced_system(name: str) -> None:
     assert structure.is_matched
 
 
-def test_one_mass_needs_no_reaction() -> None:
-    text = modelica_text(compose(SIMPLIFIED))
-    assert "reciprocal" not in text
-    assert load(STUB + text, _WIRED).structure().is_balanced
-
-
 def test_the_reaction_is_there_whatever_the_gain_of_the_model() -> None:
     assert "final parameter Real reciprocal_gain" in text_of("P-885.51")
     model = model_named("reciprocal_coupling")
@@ -130,15 +124,6 @@ def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
     # slow motion: contact and flexure are springs in series, but for the damper's drag
     drag = 50.0 * got["stage.v_f"][-1]
     assert contact[-1] == pytest.approx(5e6 * got["stage.x_f"][-1] + drag, rel=1e-3)
-
-
-@pytest.mark.parametrize("name", STACKS)
-def test_the_sine_moves_every_stack_up_and_down(name: str) -> None:
-    text = modelica_text(stack_model(name))
-    span = float(text.split("model Sine")[1].split("StopTime=")[1].split(",")[0])
-    x = simulated(text, "PiezoStack.Examples.Sine", span, rtol=1e-8)["device.displacement"]
-    assert 4 <= np.count_nonzero(np.diff(np.sign(np.diff(x))) < 0) <= 5
-    assert x.max() > 1e-6
 
 
 def test_scaled_forces_give_the_free_stroke_of_the_cascade() -> None:

@@ -60,15 +60,3 @@ def test_a_part_is_exported_by_its_name(name: str, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     assert path.read_text(encoding="utf-8") == modelica_text(part_model(name))
     assert f"inside: {', '.join(PARTS[name].components)}" in result.stdout
-
-
-def test_a_wrong_part_is_one_sentence(tmp_path: Path) -> None:
-    out = str(tmp_path / "x.fmu")
-    for choice, expected in (
-        (["--part", "servo"], "There is no part named 'servo'; there are flexure_stage"),
-        (["--part", "servo", "--stack", "demo"], "--stack and --part are both given"),
-    ):
-        result = CliRunner().invoke(app, ["export", "fmu", "-o", out, *choice])
-        assert result.exit_code == 2
-        assert expected in result.stderr
-        assert len(result.stderr.splitlines()) == 1

@@ -10,11 +10,9 @@ from scipy.interpolate import CubicSpline
 
 from psa_casadi import reference
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.nanopositioner import nanopositioner
-from psa_casadi.model.parts import PARTS, compensator_for, part_model
+from psa_casadi.model.parts import compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
@@ -52,31 +50,6 @@ def _two_periods(frequency: float) -> tuple[FloatArray, FloatArray, NDArray[np.b
     """Return times, a sine from 0 to 1 that starts at rest, and which samples are the second."""
     t = np.linspace(0.0, 2.0 / frequency, 801)
     return t, 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * t)), t >= 1.0 / frequency
-
-
-@pytest.mark.parametrize("name", PARTS)
-def test_a_part_goes_through_its_file(name: str) -> None:
-    model = part_model(name)
-    again = loads(dumps(model))
-    assert (again.values, again.name) == (model.values, model.name)
-    assert again.components == model.components
-
-
-def test_a_part_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(InputError, match="voltage_amplifier"):
-        part_model("voltage")
-    with pytest.raises(InputError, match="no parameter 'speed'"):
-        part_model("voltage_amplifier", speed=1.0)
-
-
-def test_the_compensator_knows_the_force_that_the_reference_has() -> None:
-    """Estimated force against f_H of the plain reference, which is driven by the same voltage."""
-    t, wave, _ = _two_periods(20.0)
-    compensator = compensator_for(stack_model(STACK))
-    found = _driven(compensator, t, command=80.0 * wave)
-    plant = reference.simulate(VALUES, _smooth(t, found["compensated_command"]), t, rtol=1e-8)
-    size = np.ptp(plant.states["f_H"])
-    assert np.abs(found["hysteresis_force"] - plant.states["f_H"]).max() < 2e-5 * size
 
 
 def test_the_compensator_makes_the_reference_linear() -> None:
@@ -117,11 +90,6 @@ def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gai
         errors.append(np.abs(found["stack_f_out"] - ideal)[last].max() / np.ptp(ideal))
     assert errors[0] < 1e-3
     assert errors[1] > 1e-2
-
-
-def test_a_compensator_needs_a_stack() -> None:
-    with pytest.raises(InputError, match="has no drive, linear_force, bouc_wen"):
-        compensator_for(part_model("flexure_stage"))
 
 
 def test_the_voltage_amplifier_has_bandwidth_range_and_slew_rate() -> None:
@@ -171,17 +139,6 @@ def test_the_charge_amplifier_sets_voltage_below_its_corner_and_charge_above() -
         assert abs(1e3 * (in_phase + 1j * quadrature) - expected) < 2e-3 * abs(expected)
 
 
-def test_a_charge_drive_does_not_linearise_this_model() -> None:
-    """The model's hysteresis is between voltage and force, its capacitance is linear."""
-    t, wave, last = _two_periods(10.0)
-    by_charge = _driven(_charge_drive(), t, amplifier_command=8.0 * wave)["stack_displacement"]
-    by_voltage = _driven(stack_model(STACK).plant(), t, voltage=80.0 * wave)["displacement"]
-    with_charge, with_voltage = (
-        _line_deviation(wave[last], d[last]) for d in (by_charge, by_voltage)
-    )
-    assert with_charge > 0.9 * with_voltage > 0.02
-
-
 def _closed_on(model: Model, reference_m: Callable[[float], float], count: int) -> FloatArray:
     """Return the commands of a controller whose plant is a fixed gain of 1 um/V, by the model."""
     names = model.state_names, model.sampled_names
@@ -215,18 +172,6 @@ def test_the_controller_is_the_recursion_of_a_textbook() -> None:
     assert found.max() == 12.0
     assert found.min() == -2.0
     np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_anti_windup_shortens_the_way_back() -> None:
-    """After 2 ms out of reach the position is back at once; without it, later."""
-    late = {}
-    for share in (0.0, 1.0):
-        model = part_model("position_controller", anti_windup=share, integral_gain=3e8,
-                           proportional_gain=1e5)  # fmt: skip
-        commands = _closed_on(model, lambda t: 50e-6 if t < 2e-3 else 5e-6, 200)
-        late[share] = int(np.flatnonzero(commands[40:] < 11.9)[0])
-    assert late[1.0] <= 1
-    assert late[0.0] > 10
 
 
 def test_the_plain_loop_has_the_reference_s_stack() -> None:

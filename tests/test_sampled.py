@@ -8,8 +8,6 @@ import pytest
 from psa_casadi.component import Component, Equations
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import compose
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Parameter, State
 from tests.sampled_models import (
@@ -74,25 +72,6 @@ def test_a_model_of_sampled_states_only() -> None:
     assert np.abs(steps.z - np.array(rows)).max() < 1e-14
 
 
-def test_another_period_is_another_clock() -> None:
-    times = np.linspace(0.0, 0.01, 101)
-    slow = run(loop().with_values({"T_s": 2e-3}), times, inputs(times, 0.0), np.zeros(1))
-    changes = times[1:][np.diff(slow.z[:, 1]) != 0.0]
-    assert changes == pytest.approx([2e-3, 4e-3, 6e-3, 8e-3, 1e-2])
-
-
-def test_functions_take_the_sampled_states() -> None:
-    s = loop().structure
-    p = loop().parameter_vector()
-    xdot, y = s.f(0.0, 0.5, [0.1, 1.0], p, [0.2, 0.7])
-    assert float(xdot) == pytest.approx((2.0 * 0.8 - 0.5) / 4e-3)
-    assert np.array(y).ravel() == pytest.approx([0.5, 0.7])
-    assert np.array(s.g(0.0, 0.5, [0.1, 1.0], p, [0.2, 0.7])).ravel() == pytest.approx(
-        [0.2 + 150.0 * 1e-3 * 0.5, 0.2 + 0.6 * 0.5]
-    )
-    assert stack_model("P-885.51").structure.f.n_in() == 4
-
-
 def test_balances_in_next_are_those_before_the_instant() -> None:
     """A sampled state that adds to a balance and reads it: z_k = 1 + z_(k-1)."""
     counter = Component(
@@ -146,20 +125,7 @@ def test_every_mistake_of_a_declaration_is_named() -> None:
         compose((PLANT, ALONE))
 
 
-def test_the_start_at_rest_holds_the_sampled_states_at_their_starts() -> None:
-    held = replace(CONTROLLER, sampled=(
-        CONTROLLER.sampled[0], replace(CONTROLLER.sampled[1], start=0.7)))  # fmt: skip
-    start = start_state(compose((PLANT, held)), [0.2, 5.0])
-    assert start.x == pytest.approx([2.0 * 0.9])
-
-
 def test_sensitivities_are_refused() -> None:
     times = grid(4, 1.0)
     with pytest.raises(InputError, match="Sensitivities of a model with sampled states"):
         run(loop(), times, inputs(times, 0.0), np.zeros(1), unknowns=["k_p"], output="shown")
-
-
-def test_wrong_starts_are_refused() -> None:
-    times = grid(4, 1.0)
-    with pytest.raises(InputError, match="array z0 has the shape"):
-        run(loop(), times, inputs(times, 0.0), np.zeros(1), z0=np.zeros(1))

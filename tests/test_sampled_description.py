@@ -1,15 +1,11 @@
 """What the FMU of a sampled model says of itself, and what it refuses."""
 
-from pathlib import Path
-
 import fmpy
 import numpy as np
 import pytest
 
 from psa_casadi.export.check.check import check_fmu
-from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.export.importer.fmu import CO_SIMULATION, DISCARD, ERROR, Fmu, FmuError
-from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.sampled_fmus import exported
 from tests.sampled_models import PERIOD, controller, loop
 from tests.tiers import slow_but
@@ -66,24 +62,6 @@ def test_description(fmi: int) -> None:
     assert initial["voltage"] == known | through
 
 
-def test_measured_dependencies_are_listed() -> None:
-    """Whatever moves the voltage at an instant is among its dependencies, and the reverse."""
-    listed = {"reference", "position", "k_p"}
-    with Fmu(exported("controller", 2)) as fmu:
-        names = [*fmu.names("input"), *fmu.varying("tunable")]
-        moving = set()
-        for name in names:
-            with fmu.start(CO_SIMULATION) as slave:
-                slave.set({"reference": 1.0, "position": 0.3})
-                slave.step(0.0, PERIOD)
-                before = slave.get(["voltage"])[0]
-                slave.set({name: slave.get([name])[0] * 1.01})
-                if slave.get(["voltage"])[0] != before:
-                    moving.add(name)
-        (entry,) = fmu.description.outputs
-        assert moving == {d.name for d in entry.dependencies} == listed
-
-
 @pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize(("name", "fmi"), slow_but([("loop", 3)], [("loop", 3), ("controller", 2)]))
 def test_check_passes(name: str, fmi: int) -> None:
@@ -91,16 +69,6 @@ def test_check_passes(name: str, fmi: int) -> None:
     report = check_fmu(exported(name, fmi), model)
     assert report.compared
     assert report.failures == ()
-
-
-@pytest.mark.parametrize("name", ["loop", "controller"])
-def test_sources_compile_without_a_warning(name: str, tmp_path: Path) -> None:
-    model = loop() if name == "loop" else controller()
-    for fmi in (2, 3):
-        folder = tmp_path / str(fmi)
-        names = [p.name for p in write_sources(model, folder, fmi=fmi) if p.suffix == ".c"]
-        flags = ["-std=c99", "-I.", *STRICT, "-fsyntax-only"]
-        run_compiler([*compiler_command(), *flags, *names], folder)
 
 
 def test_illegal_values_leave_an_error() -> None:

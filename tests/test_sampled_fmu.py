@@ -55,20 +55,6 @@ def test_model_exchange(fmi: int, step: float, start: float) -> None:
     assert error(found, times, SLOPE) < 1e-9
 
 
-@pytest.mark.parametrize("toward", [-1.0, 1.0])
-def test_a_knot_that_is_an_instant_but_for_rounding(toward: float) -> None:
-    times = grid(25, 0.25)
-    knot = float(np.nextafter(3 * PERIOD, toward))
-    jump = Signals(
-        ("disturbance", "reference"), np.array([0.0, knot]), np.array([[0, 1], [0, 2.0]])
-    )
-    with Fmu(exported("loop", 2)) as fmu:
-        held = Signals(jump.names, jump.times, jump.values, held=True)
-        found = integrate(fmu, times, held, OUTPUTS, tolerance=1e-11)
-    assert error(found[:12], times[:12], 0.0) < 1e-9
-    assert found[12, 1] - found[11, 1] > 0.5  # the instant sees the reference after the jump
-
-
 @VERSIONS
 @pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
 def test_fmpy_simulates_both_interfaces(fmi: int, kind: str) -> None:
@@ -111,25 +97,6 @@ def _replay(instance: Instance) -> list[tuple[float, ...]]:
         instance.step((1.5 + 0.7 * k) * PERIOD, 0.7 * PERIOD)
         rows.append(tuple(instance.get([*OUTPUTS, "command"])))
     return rows
-
-
-@VERSIONS
-def test_rollback_at_an_instant(fmi: int) -> None:
-    """What an output shows at an instant is not yet taken: the inputs may be set again."""
-    with Fmu(exported("controller", fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
-        slave.set({"reference": 1.0, "position": 0.5})
-        assert slave.get(["voltage"])[0] == pytest.approx(0.3)
-        slave.set({"position": 0.0})
-        assert slave.get(["voltage"])[0] == pytest.approx(0.6)
-        snapshot = slave.save()
-        slave.step(0.0, 0.5 * PERIOD)
-        slave.set({"position": 0.7})
-        assert slave.get(["voltage", "integral"]) == pytest.approx([0.6, 0.15])
-        slave.restore(snapshot)
-        slave.drop(snapshot)
-        slave.set({"position": 1.0})
-        slave.step(0.0, 0.5 * PERIOD)
-        assert slave.get(["voltage", "integral"]) == pytest.approx([0.0, 0.0])
 
 
 @VERSIONS
@@ -176,21 +143,3 @@ def test_event_mode_of_co_simulation() -> None:
         slave.update_discrete_states()
         assert slave.next_event_time == 3 * PERIOD
         assert slave.get(["voltage"])[0] == pytest.approx(0.6)
-
-
-def test_early_return_at_an_instant() -> None:
-    """A step that is ended at an instant inside of it goes on to the same end."""
-    ends = []
-    for watcher in (None, lambda _, u: u.time if abs(u.time - 2 * PERIOD) < 1e-12 else None):
-        with (
-            Fmu(exported("loop", 3)) as fmu,
-            Instance3(fmu, watcher=watcher).start(tolerance=1e-10) as slave,
-        ):
-            slave.set({"reference": 1.0})
-            done = slave.try_step(0.0, 3.6 * PERIOD)
-            assert done.early == (watcher is not None)
-            if done.early:
-                assert done.time == 2 * PERIOD
-                slave.step(done.time, 3.6 * PERIOD - done.time)
-            ends.append(slave.get([*OUTPUTS, "integral"]))
-    assert np.abs(ends[0] - ends[1]).max() < 1e-9

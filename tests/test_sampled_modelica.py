@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping
 
 import numpy as np
-import pytest
 import rumoca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
@@ -13,7 +12,7 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output, Parameter, State
 from tests.modelica_runs import load
-from tests.sampled_models import PERIOD, FloatArray, controller, expected, grid, loop
+from tests.sampled_models import PERIOD, FloatArray, expected, grid, loop
 
 COUNT = 121
 
@@ -36,16 +35,6 @@ def test_rumoca_follows_the_exact_recursion() -> None:
     columns = (truth.position, truth.voltage, truth.z[:, 0], truth.z[:, 1])
     for name, column in zip(names, columns, strict=True):
         assert np.abs(found[name] - column).max() < 1e-8, name
-
-
-def test_rumoca_simulates_a_model_without_continuous_states() -> None:
-    """Its inputs are sampled at the instants; rumoca is given those of a straight line."""
-    found = simulated(controller(), "reference=1.0, position=20.0*time", ("voltage", "integral"))
-    times = grid(COUNT, 0.25)
-    u = np.column_stack([np.ones(COUNT), 20.0 * times])
-    steps = run(controller(), times, u, np.zeros(0))
-    assert np.abs(found["voltage"] - steps.z[:, 1]).max() < 1e-12
-    assert np.abs(found["integral"] - steps.z[:, 0]).max() < 1e-12
 
 
 def _shared() -> Model:
@@ -103,23 +92,3 @@ def test_shared_parts_and_balances_have_their_values_before_the_instant() -> Non
         assert np.abs(found[name] - column).max() < 1e-8, name
     assert np.abs(found["shown"] - steps.y[:, 0]).max() < 1e-8
     assert np.ptp(steps.z[:, 0]) > 0.1
-
-
-def test_another_period_reaches_the_when_clause() -> None:
-    found = simulated(loop(), f"reference=1.0, disturbance=0, T_s={2 * PERIOD!r}", ("voltage",))
-    changes = grid(COUNT, 0.25)[1:][np.diff(found["voltage"]) != 0.0]
-    assert changes == pytest.approx(2 * PERIOD * np.arange(1, len(changes) + 1))
-    assert len(changes) == 15
-
-
-def test_text_of_the_clause() -> None:
-    text = modelica_text(loop())
-    lines = [line.strip() for line in text.split("\n")]
-    begin, end = lines.index("when sample(0, T_s) then"), lines.index("end when;")
-    assert lines[begin + 1 : end] == [
-        "// sampled_pi: textbook",
-        "integral = pre(integral) + k_i*T_s*(reference - position);",
-        "command = pre(integral) + k_p*(reference - position);",
-    ]
-    assert any(line.startswith('discrete Real integral(unit="V", start=0.0') for line in lines)
-    assert "as sample(0, T) says" in text

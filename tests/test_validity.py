@@ -1,20 +1,14 @@
 """What an FMU says outside of what the records behind its model have shown."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import psa_casadi as psa
 from psa_casadi.components.outputs import OUTPUT
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.export.fmu import evidence
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
-from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
 from psa_casadi.variables import Interval
 from tests.evidence_models import evident_fmu, evident_model
@@ -69,15 +63,6 @@ def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
     assert np.all(outside == 0.0)
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_model_exchange_says_it_too(fmi: int) -> None:
-    with Fmu(evident_fmu(fmi)) as fmu, fmu.start(MODEL_EXCHANGE) as instance:
-        rest = instance.get(fmu.states())
-        for volts in (50.0, 100.0, 120.0):
-            instance.derivatives(0.1, rest, {"voltage": volts})
-        assert sum(_SAID in m for m in instance.messages) == 1
-
-
 def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
     model = evident_model()
     assert model.evidence is not None
@@ -93,12 +78,3 @@ def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> No
         y = watched.structure.f(0.0, x, u, watched.parameter_vector())[1]
         assert float(y[column]) == pytest.approx(outside, abs=1e-12)
     assert seen_inputs(watched)[watched.input_names.index("temperature")] == (290.0, 300.0, np.inf)
-
-
-def test_the_output_is_there_on_request_only() -> None:
-    model = evident_model()
-    assert OUTPUT not in evidence.evidence_texts(model.plant(), 0)[evidence.INPUTS]
-    with Archive(evident_fmu()) as archive:
-        assert OUTPUT in archive.names("output")
-    with pytest.raises(InputError, match="does not say what its records have shown"):
-        export_fmu(psa.stack_model("demo"), Path("never.fmu"), validity_output=True)
