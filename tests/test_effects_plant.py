@@ -52,26 +52,6 @@ def test_loop_width_follows_the_logarithm_of_rate(peak: float) -> None:
         assert -0.5 < reach / gain < -0.05
 
 
-@pytest.mark.parametrize("frequency", [0.05, 0.5])
-def test_thresholds_that_grow_with_the_rate_widen_every_loop_alike(frequency: float) -> None:
-    """By twice what 0.3 (c - 1) w of voltage does, from 2 w after a reversal on, nothing before."""
-    values = {"rate_by_threshold": 1.0, "rate_threshold": 0.05, "rate_onset": 1e-3}
-    widths = []
-    for peak in (120.0, 48.0):
-        model = linear(RATE_DEPENDENT_HYSTERESIS, 0.1).with_values(values)
-        found = driven(model, *triangle(frequency, peak))
-        u, x = found.x[-401:, 0] / 120.0, found.y[-401:, -1] / stroke_scale(model.values)
-        behind = (x - x[200]) - (u - u[200])
-        down, up = (
-            np.interp(peak / 240.0, *pair)
-            for pair in ((u[200:][::-1], x[200:][::-1]), (u[:200], x[:200]))
-        )
-        decades = np.log10(2.0 * peak * frequency / 120.0 / 1e-3)
-        widths.append((down - up) / (2.0 * 0.3 * 0.05 * np.expm1(0.1 * decades)))
-        assert np.ptp(behind[202:206]) < 0.05 * (down - up)
-    assert widths == pytest.approx([1.0, 1.0], rel=0.02)
-
-
 def test_rayleigh_gain_grows_with_amplitude() -> None:
     """Gain in proportion to the peak; third harmonic -8/(15 pi) of it, as its square."""
     peaks = np.array([30.0, 60.0, 120.0])

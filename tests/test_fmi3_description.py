@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.export.common.variable_table import OPTIONS, variable_table
+from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.description import dependencies, model_description
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.model.stacks import STACKS
@@ -22,25 +22,6 @@ NAMES = (*STACKS, "every_effect", "single_mass", "flexure")
 @cache
 def xml_of(name: str) -> ET.Element:
     return ET.fromstring(model_description(model_named(name), "m", "{t}", fmi=3))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_variables(name: str) -> None:
-    variables = list(xml_of(name).iterfind("ModelVariables/*"))
-    assert {v.tag for v in variables} == {"Float64"}
-    assert [int(v.attrib["valueReference"]) for v in variables] == [
-        k + 1 for k in range(len(variables))
-    ]
-    independent = [v for v in variables if v.attrib["causality"] == "independent"]
-    assert independent == variables[:1]
-    by_reference = {int(v.attrib["valueReference"]): v.attrib["name"] for v in variables}
-    for v in variables:
-        if v.attrib["name"].startswith("der("):
-            assert v.attrib["name"] == f"der({by_reference[int(v.attrib['derivative'])]})"
-        between = v.attrib["name"] in (*model_named(name).parameter_names, *OPTIONS)
-        between = between or v.attrib["name"].startswith("switch.")
-        assert ("intermediateUpdate" in v.attrib) == (not between and v is not variables[0])
-        assert ("initial" in v.attrib) == (v.attrib["causality"] not in ("input", "independent"))
 
 
 @pytest.mark.parametrize("name", ["P-885.51", "every_effect", "flexure"])

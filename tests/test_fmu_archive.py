@@ -13,7 +13,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
+from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
 from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.model.compose import compose
 from psa_casadi.simulation.compiler import run_compiler
@@ -70,12 +70,6 @@ def test_impossible_exports_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no state"):
         variable_table(compose([gain]))
     assert not list(tmp_path.iterdir())
-
-
-def test_platforms() -> None:
-    assert [p.name for p in chosen_platforms(["all"])] == list(PLATFORMS)
-    assert len(chosen_platforms(["host", "all", "host"])) == 9
-    assert len({p.folder for p in PLATFORMS.values()}) == 9
 
 
 def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -207,38 +207,6 @@ def test_sensitivities_of_steps_multiply() -> None:
     assert _worst(second, both, _scales(states, name)) > 1e-3
 
 
-def test_what_is_set_after_a_step_does_not_change_its_sensitivity() -> None:
-    name = MODELS[0]
-    states = _names(name)["state"]
-    knowns = [*states, "voltage", "C_p"]
-    with _stepped(name, _point(name), [1e-4, 1e-4], 1e-6) as instance:
-        before = _jacobian(instance, states, knowns)
-        data = instance.serialized()
-        instance.set({"voltage": -5.0, "C_p": 1e-6})
-        assert np.array_equal(_jacobian(instance, states, knowns), before)
-        assert instance.try_step(2e-4, 1e-4).status == OK
-        assert not np.array_equal(_jacobian(instance, states, knowns), before)
-        assert instance.try_restore(data) == OK
-        assert np.array_equal(_jacobian(instance, states, knowns), before)
-        with Instance3(loaded(name)) as other:
-            assert other.try_restore(data) == OK
-            assert np.array_equal(_jacobian(other, states, knowns), before)
-
-
-def test_step_that_ended_early_has_the_sensitivity_up_to_its_end() -> None:
-    name, point = MODELS[0], _point(MODELS[0])
-    states = _names(name)["state"]
-    knowns = [*states, "voltage", "C_p"]
-    watched = Instance3(loaded(name), watcher=lambda _, u: u.time if u.time > 2e-5 else None)
-    with watched as instance:
-        instance.start(point, tolerance=1e-8)
-        done = instance.try_step(0.0, 1e-4)
-        assert done.early
-        found = _jacobian(instance, states, knowns)
-    with _stepped(name, point, [done.time], 1e-8) as instance:
-        assert _worst(found, _jacobian(instance, states, knowns), _scales(knowns, name)) < 1e-6
-
-
 def test_unknown_step_sensitivity_is_refused_with_the_reason() -> None:
     name, one = MODELS[0], c_size_t(1)
     value = (2 * c_double)()

@@ -1,8 +1,6 @@
 """The voltage's reversal as an event: located by an importer, harmless where nobody looks."""
 
-import itertools
 from ctypes import c_double, c_size_t
-from typing import Literal
 
 import fmpy
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, OK, Fmu
+from psa_casadi.export.importer.fmu import ERROR, MODEL_EXCHANGE, OK, Fmu
 from tests import fmi3_instances as fmi3
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow
@@ -115,44 +113,3 @@ def test_importer_locates_reversals_where_they_are(fmi: int) -> None:
     turns = CORNERS[1:-1] + values["R_s"] * values["C_p"] * np.log(2.0)
     assert len(events) == len(turns) == 3
     assert np.abs(events - turns).max() < 0.01 * values["R_s"] * values["C_p"]
-
-
-def _path(times: FloatArray) -> FloatArray:
-    """Return the displacement at times, by tight co-simulation with the input's slope."""
-    grid = np.union1d(times, CORNERS)
-    found = [0.0]
-    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION, tolerance=1e-9) as slave:
-        for begin, end in itertools.pairwise(grid):
-            low, high = np.interp([begin, end], CORNERS, VOLTS)
-            slave.set({"voltage": float(low)})
-            slave.set_rates({"voltage": float((high - low) / (end - begin))})
-            slave.step(float(begin), float(end - begin))
-            found.append(float(slave.get(["displacement"])[0]))
-    return np.interp(times, grid, found)
-
-
-@pytest.mark.parametrize("method", ["Radau", "LSODA", "RK23"])
-def test_loose_solver_without_events_is_right_too(
-    method: Literal["Radau", "LSODA", "RK23"],
-) -> None:
-    tolerance, end = 1e-3, float(CORNERS[-1])
-    times = np.linspace(0.0, end, 201)
-    with Fmu(exported(STACK)) as fmu, fmu.start(MODEL_EXCHANGE) as instance:
-        states = fmu.states()
-
-        def slope(time: float, x: FloatArray) -> FloatArray:
-            return instance.derivatives(
-                time, x, {"voltage": float(np.interp(time, CORNERS, VOLTS))}
-            )
-
-        nominal = np.array([fmu.nominals[n] for n in states])
-        solved = solve_ivp(
-            slope, (0.0, end), np.zeros(len(states)), method=method, t_eval=times,
-            rtol=tolerance, atol=tolerance * nominal, max_step=1e-3,
-        )  # fmt: skip
-        found = []
-        for time, x in zip(times, solved.y.T, strict=True):
-            slope(float(time), x)
-            found.append(float(instance.get(["displacement"])[0]))
-    truth = _path(times)
-    assert np.abs(np.array(found) - truth).max() < 10.0 * tolerance * np.ptp(truth)

@@ -9,10 +9,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.export.fixed_step.probe import VOLTAGES
@@ -159,22 +157,6 @@ def test_what_has_no_fixed_step_is_refused(
     with pytest.raises(psa.InputError, match=said):
         psa.export_fmu(model, tmp_path / "fixed.fmu", step=step)
     assert not (tmp_path / "fixed.fmu").exists()
-
-
-@slow
-def test_the_command_wants_both_options_or_neither(tmp_path: Path) -> None:
-    base = ["export", "fmu", "--stack", "P-885.51", "-o", str(tmp_path / "fixed.fmu")]
-    for options in (["--solver", "fixed"], ["--step", "10us"]):
-        done = CliRunner().invoke(app, [*base, *options])
-        assert done.exit_code != 0
-        assert not (tmp_path / "fixed.fmu").exists()
-    done = CliRunner().invoke(app, [*base, "--solver", "fixed", "--step", "10us"])
-    assert done.exit_code == 0, done.output
-    assert "step: 1e-05 s, 1 substep, double precision" in done.output
-    with zipfile.ZipFile(tmp_path / "fixed.fmu") as archive:
-        told = json.loads(archive.read(FIXED_ENTRY))
-    assert set(told["errors"]) == set(VOLTAGES)
-    assert all(f"{error:.1e}" in done.output for error in told["errors"].values())
 
 
 @cache

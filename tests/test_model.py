@@ -98,20 +98,6 @@ def test_effects_come_and_go_without_a_trace() -> None:
     assert back.values == base.values
 
 
-def test_the_plant_has_no_sensor() -> None:
-    model = compose((*BASE, *EFFECTS.values()), {"creep_gain": 0.02})
-    plant = model.plant()
-    assert {c.belongs_to for c in plant.components} == {"plant", "drive"}
-    assert "measured_displacement" not in plant.output_names
-    assert not {"sensor_delay", "drift_rate"} & set(plant.parameter_names)
-    assert plant.values["creep_gain"] == 0.02
-    point = model.state_nominals()
-    kept = [model.state_names.index(n) for n in plant.state_names]
-    whole = model.structure.f(1.0, point, [50.0, 10.0, 293.15], model.parameter_vector())
-    part = plant.structure.f(1.0, point[kept], [50.0, 10.0], plant.parameter_vector())
-    assert np.array_equal(np.array(whole[0])[kept], np.array(part[0]))
-
-
 @pytest.mark.parametrize("name", slow_but([n for n in SETS if n != "all"], SETS))
 def test_velocity_is_the_rate_of_the_displacement(name: str) -> None:
     model = compose(SETS[name])

@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from psa_casadi import reference
 from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import compensator_for, part_model
@@ -188,3 +189,16 @@ def test_the_plain_loop_has_the_reference_s_stack() -> None:
     plant = reference.simulate(VALUES, voltage, found.time, rtol=1e-8)
     assert np.ptp(plant.displacement) > 5e-6
     np.testing.assert_allclose(found.tip, plant.displacement, atol=1e-4 * np.ptp(found.tip))
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: part_model("voltage"), "voltage_amplifier"),
+        (lambda: part_model("voltage_amplifier", speed=1.0), "no parameter 'speed'"),
+        (lambda: compensator_for(part_model("flexure_stage")), "no drive, linear_force, bouc_wen"),
+    ],
+)
+def test_what_is_no_part_of_a_stack_is_refused(made: Callable[[], Model], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        made()

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, time_grid
-from psa_casadi.records.split import whole
+from psa_casadi.records import time_grid
 from psa_casadi.simulation.simulate import simulate
 from tests.plants.base import Run, simulate_base
 from tests.plants.reciprocal_coupling import two_masses
@@ -151,28 +149,3 @@ def test_energy_is_only_lost_in_the_dampers() -> None:
         assert free[-1] < 0.9 * free[0]
     assert grown[1.0] < 1e-8
     assert grown[0.0] > 1e-3
-
-
-@pytest.mark.parametrize("truth", [0.0, 1.0])
-def test_data_can_ask_for_it(truth: float) -> None:
-    """Where masses and stiffnesses are known, voltage and load tell the gain to a few percent."""
-    run = driven("PTBS200", 1.5e-3, 1500)
-    load = 300.0 * np.sin(np.clip(4e4 * (run.times - 1e-3), 0.0, None))
-    if truth == 1.0:
-        x = two_masses(run, load)
-    else:
-        x = simulate(
-            stack("PTBS200"), run.times, run.command, load_force=load, from_rest_at_zero=True
-        ).displacement
-    sigma = 1e-3 * float(np.ptp(x))
-    noisy = x + sigma * np.random.default_rng(4).standard_normal(len(x))
-    record = Record(
-        name="pushed", time=run.times, voltage=run.command, displacement=noisy, load_force=load
-    )
-    free = ["k_L", "tau", "c_P", "c_B", "reciprocal_gain"]
-    starts = [reciprocal("PTBS200", g) for g in (0.1, 0.9)]
-    fits = [fit(s, [whole(record)], free, sigma=[sigma], evaluations=80) for s in starts]
-    found = min(fits, key=lambda f: f.cost)
-    assert found.rms == pytest.approx(sigma, rel=0.05)
-    assert found.model.values["reciprocal_gain"] == pytest.approx(truth, abs=0.03)
-    assert found.model.values["k_L"] == pytest.approx(stack("PTBS200").values["k_L"], rel=0.02)

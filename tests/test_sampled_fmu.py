@@ -11,7 +11,6 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
-from tests.fmi3_instances import Instance3
 from tests.sampled_fmus import exported
 from tests.sampled_models import PERIOD, FloatArray, expected, grid
 
@@ -129,17 +128,3 @@ def test_time_events_of_model_exchange(fmi: int) -> None:
         instance.require("EnterEventMode")
         instance.update_discrete_states()
         assert instance.next_event_time == pytest.approx(1.2 * PERIOD)
-
-
-def test_event_mode_of_co_simulation() -> None:
-    with Fmu(exported("loop", 3)) as fmu, Instance3(fmu, events=True).start() as slave:
-        slave.update_discrete_states()
-        assert slave.next_event_time == PERIOD
-        slave.require("EnterStepMode")
-        needed = [slave.try_step(k * PERIOD / 4, PERIOD / 4).event_needed for k in range(8)]
-        assert needed == [False, False, False, True] * 2
-        slave.require("EnterEventMode")
-        slave.set({"reference": 1.0})
-        slave.update_discrete_states()
-        assert slave.next_event_time == 3 * PERIOD
-        assert slave.get(["voltage"])[0] == pytest.approx(0.6)

@@ -12,7 +12,7 @@ from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page.live_data import live_data
-from psa_casadi.simulation.simulate import input_samples, simulate
+from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.ways import accurate
 from psa_casadi.units import FloatArray
@@ -85,36 +85,6 @@ def test_every_effect_runs_in_one_module_as_it_does_here(browser: Browser) -> No
         assert off(row["shown"], wanted) < SAME, name
         changed.append(off(row["shown"], told[0]["shown"]))
     assert sum(c > 1e-5 for c in changed) >= 18  # the others need another voltage to show
-
-
-@slow
-def test_tight_tolerances_and_a_memory_agree(browser: Browser) -> None:
-    model = stack_model("P-885.51").with_effect(EFFECTS["hysteresis_memory"], {"memory_gain": 0.05})
-    t, v = loops(150)
-    memory = {"f_H": 20.0}
-    told = run_in_browser(
-        browser,
-        model,
-        [
-            case(model, t, v, rtol=1e-8),
-            case(model, t, v, deviation=memory),
-            case(model, t, v, rtol=1e-5, hold="zero"),
-            case(model.with_values({"k_L": 9.0, "tau": 3e-4}), t, v, rtol=1e-8),
-        ],
-    )
-    wanted = [
-        simulate(model, t, v, rtol=1e-8),
-        simulate(model, t, v, memory=memory),
-        simulate(model, t, v, rtol=1e-5, hold="zero"),
-        simulate(model.with_values({"k_L": 9.0, "tau": 3e-4}), t, v, rtol=1e-8),
-    ]
-    for row, here in zip(told, wanted, strict=True):
-        assert row["way"] == here.way
-        assert off(row["shown"], here.displacement) < SAME
-    assert [row["way"] for row in told] == ["stepper", "exact steps", "exact steps", "stepper"]
-    assert off(told[1]["shown"], told[0]["shown"]) > 1e-3  # the memory shows
-    # exact steps err by less than they are asked for
-    assert off(simulate(model, t, v).displacement, told[0]["shown"]) < 1e-6
 
 
 def test_a_model_that_no_page_runs_is_refused() -> None:
