@@ -214,7 +214,7 @@ class _Wiring:
         whole: Expression = self._wired(name, [every], ())[0]
         nx, nz = len(s.states), len(s.sampled)
         outputs = {o.name: self.output((name, o.name), ()) for o in s.outputs}
-        values = _Named(
+        values = Equations(
             der={f"{name}_{v.name}": whole[i] for i, v in enumerate(s.states)},
             next={f"{name}_{v.name}": whole[nx + i] for i, v in enumerate(s.sampled)},
             switches={f"{name}_{n}": whole[nx + nz + i] for i, n in enumerate(s.switches)},
@@ -253,7 +253,7 @@ class _Wiring:
         replaced: list[Expression] = ca.substitute(expressions, symbols, feeding)
         return replaced
 
-    def _equations(self, values: "_Named") -> Callable[[Symbols], Equations]:
+    def _equations(self, values: Equations) -> Callable[[Symbols], Equations]:
         """Return the function that gives a part's equations in the symbols of the system."""
         places = [(self.time, "time")]
         if self.plan.period is not None:
@@ -284,16 +284,6 @@ class _Wiring:
             )
 
         return equations
-
-
-@dataclass(frozen=True)
-class _Named:
-    """A part's equations by the names they have in the system, still in symbols of the parts."""
-
-    der: Mapping[str, Expression]
-    next: Mapping[str, Expression]
-    switches: Mapping[str, Expression]
-    out: Mapping[str, Expression]
 
 
 def _declared(

@@ -6,7 +6,6 @@ from xml.etree import ElementTree as ET
 
 import casadi as ca
 import numpy as np
-from markupsafe import Markup
 
 from psa_casadi.characters import check_text
 from psa_casadi.export.common.templates import filled
@@ -107,6 +106,6 @@ def page(title: str, parts: Iterable[str], what: str) -> str:
 
     Raises InputError for a character that HTML cannot carry; `what` names the page then.
     """
-    text = filled("page.html", title=title, parts=[Markup(part) for part in parts])
+    text = filled("page.html", title=title, parts=list(parts))
     check_text(text, what)
     return text

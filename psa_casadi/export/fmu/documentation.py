@@ -5,7 +5,6 @@ import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from markupsafe import Markup
 
 from psa_casadi.characters import check_text
 from psa_casadi.export.common.icon import ICONS, drawing_of, svg
@@ -61,7 +60,7 @@ def documentation(
         "documentation.html",
         model=model,
         title=model.name,
-        drawing=Markup(svg(ICONS[drawing_of(model)]).partition("\n")[2].strip()),
+        drawing=svg(ICONS[drawing_of(model)]).partition("\n")[2].strip(),
         what_it_is=what_it_is(model),
         force_scale=force_scale(model),
         published="; ".join(f"{name}: {text}" for name, text in stated),
