@@ -1,5 +1,9 @@
-"""The fixed step in C: its error, its form, what it refuses, and the command that writes it."""
+"""The fixed step in C: its error, its form, what it refuses, and the command that writes it.
 
+Beyond the rated voltage it is as good as it says, or limited and told.
+"""
+
+import ctypes
 import re
 from functools import cache
 from pathlib import Path
@@ -14,14 +18,21 @@ from psa_casadi.cli.inputs import step_seconds
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
+from psa_casadi.export.fixed_step.export import GOOD, FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
 from psa_casadi.export.fixed_step.probe import VOLTAGES, Probe, played_inputs
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.scratch import temporary_folder
-from psa_casadi.simulation.compiler import compiler_command, has_zig, run_compiler, zig_command
+from psa_casadi.simulation.compiler import (
+    compiler_command,
+    has_zig,
+    run_compiler,
+    shared_library,
+    zig_command,
+)
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.stepper import run
 from tests.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect
 from tests.stack_models import stack
 from tests.tiers import slow
@@ -205,3 +216,69 @@ def test_every_effect_and_every_stack_is_exported_and_compared() -> None:
         if not found.worst.error <= limit(name):
             far[name, stack_name] = (found.plan.substeps, found.worst)
     assert not far
+
+
+LONG_STEP = 1e-4
+TOLD = """#include "stack.h"
+#if !defined(_WIN32)
+__attribute__((visibility("default")))
+#endif
+int told(const double *voltage, int count, double *x) {
+    stack_state state;
+    stack_input input = {0};
+    stack_output output;
+    int all = 0;
+    stack_init(&state);
+    for (int k = 0; k < count; ++k) {
+        input.voltage = voltage[k];
+        all = 2 * all + stack_step(&state, &input, &output);
+    }
+    *x = output.displacement;
+    return all;
+}
+"""
+
+
+def planned(precision: str = "double") -> FixedStep:
+    return fixed_step(stack("P-885.51").plant(), name="stack", step=LONG_STEP, precision=precision)
+
+
+def jumps(voltage: float) -> FloatArray:
+    share = np.linspace(0.0, 1.0, 401)
+    return voltage * np.select([share < 0.1, share < 0.5, share < 0.8], [0.0, 1.0, -1.0], 1.0)
+
+
+def played(found: FixedStep, voltage: FloatArray) -> FloatArray:
+    u = played_inputs(found.plan.model, np.zeros(len(voltage)))
+    u[:, 0] = voltage
+    return Probe(found.plan, found.texts).play(u)[:, 0]
+
+
+def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
+    """900 V, 7.5 times the rated voltage, gave half a range of error; the limit is far above it."""
+    found = planned()
+    limit, model = found.plan.limit, found.plan.model
+    assert 1.25 * model.values["u_rated"] <= limit < 900.0
+    u = played_inputs(model, np.zeros(401))
+    u[:, 0] = jumps(limit)
+    x0, t = np.zeros(len(model.state_names)), LONG_STEP * np.arange(401, dtype=np.float64)
+    true = run(model, t, u, x0, rtol=1e-10).y[1:, 0]
+    assert error(played(found, u[:, 0]), true) <= max(GOOD, found.worst.error)
+    for share in (1.001, 900.0 / limit, 1e9, 1e305):
+        assert np.array_equal(played(found, share * u[:, 0]), played(found, u[:, 0]))
+
+
+@pytest.mark.parametrize("precision", ["double", pytest.param("single", marks=slow)])
+def test_the_step_tells_it_and_no_number_leaves_the_voltage(precision: str) -> None:
+    found = planned(precision)
+    library = ctypes.CDLL(str(shared_library({**found.texts, "told.c": TOLD}, ())))
+    assert "Returns 1 if the voltage was beyond" in " ".join(found.texts["stack.h"].split())
+
+    def told(*voltage: float) -> tuple[int, float]:
+        x = ctypes.c_double()
+        given = (ctypes.c_double * len(voltage))(*voltage)
+        return library.told(given, len(voltage), ctypes.byref(x)), x.value
+
+    assert told(0.0, 100.0, 900.0, 100.0, -900.0)[0] == 0b00101
+    assert told(60.0, 60.0, np.nan) == (0b001, told(60.0, 60.0, 60.0)[1])
+    assert told(60.0, np.inf)[1] == told(60.0, found.plan.limit)[1]
