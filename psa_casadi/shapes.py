@@ -7,7 +7,8 @@ from math import pi
 import casadi as ca
 
 from psa_casadi.component import Expression, Symbols
-from psa_casadi.variables import Parameter
+from psa_casadi.scales import stop_scale, voltage_scale
+from psa_casadi.variables import Parameter, State
 
 #: Exponent of the smooth stop; 2 bends gently, infinity is the ideal stop operator.
 _SHARPNESS = 4.0
@@ -80,6 +81,32 @@ def stop_rate(s: Symbols, z: Expression, threshold: Expression) -> Expression:
 
 #: What the elements add: the powers of their plays.
 _POWERS = {"play": "the plays", "square": "the plays' squares", "cube": "the plays' cubes"}
+
+
+def stop_rates(
+    s: Symbols, prefix: str, thresholds: Sequence[Expression]
+) -> tuple[list[Expression], dict[str, Expression]]:
+    """Return stop elements `prefix`1, `prefix`2, ... of these thresholds [V], and their rates."""
+    names = [f"{prefix}{i}" for i in range(1, len(thresholds) + 1)]
+    elements = [getattr(s, name) for name in names]
+    rates = [stop_rate(s, z, r) for z, r in zip(elements, thresholds, strict=True)]
+    return elements, dict(zip(names, rates, strict=True))
+
+
+def stop_states(prefix: str, thresholds: Sequence[str]) -> tuple[State, ...]:
+    """Return the states of stop elements, whose thresholds are told in words."""
+    return tuple(
+        State(
+            f"{prefix}{i}",
+            "V",
+            f"stop element {i}, threshold {threshold}",
+            stop_scale,
+            memory=True,
+            settles=False,
+            whole=voltage_scale,
+        )
+        for i, threshold in enumerate(thresholds, 1)
+    )
 
 
 def spectrum_force(

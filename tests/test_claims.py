@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from psa_casadi.component import READ_OFF, RECORD_DURATION, Component
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.compiler import functions_of, generate_c, shared_library
@@ -128,35 +127,6 @@ def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
         np.testing.assert_array_equal(outputs, base_outputs)
 
 
-@pytest.mark.parametrize(
-    "effects",
-    [SETS[0], EVERY],
-    ids=name_of,
-)
-def test_gain_0_is_the_base_trajectory(effects: tuple[Component, ...]) -> None:
-    """An effect of gain 0 adds to no equation: both runs have the base's trajectory.
-
-    With all effects at once, as what one of them added would show; equations of each one: above.
-
-    The rule is the tolerance of a step: after one step for each sample they may differ by 1e-8 of
-    a variable's largest value. Steps are not counted against each other: Newton's stopping test and
-    the halving at a turn see the norm of all states, the effect's own too.
-    """
-    model = random_model(effects, np.random.default_rng(2), gains=False)
-    base = model.without(e.name for e in effects)
-    t, u = drive(model, 10001, 1e-7, 0.0)
-    _, base_u = drive(base, 10001, 1e-7, 0.0)
-    extended = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
-    plain = run(base, t, base_u, np.zeros(len(base.state_names)), rtol=1e-8)
-    for steps in (plain.steps, extended.steps):
-        assert len(t) - 1 <= steps <= 1.01 * len(t)  # one a sample, and turns
-    assert np.ptp(plain.y[:, 0]) > 1e-6
-    for ours, base_values in ((extended.x, plain.x), (extended.y, plain.y)):
-        ranges = np.abs(base_values).max(axis=0)
-        differences = np.abs(ours[:, : len(ranges)] - base_values).max(axis=0)
-        assert np.all(differences <= 1e-8 * ranges)
-
-
 @each_in_turn
 def test_a_gain_changes_what_is_measured(effect: Component) -> None:
     """At its ordinary size every effect shows: by more than 1e-4 of the stroke, and alone."""
@@ -191,18 +161,6 @@ def test_declaration_is_complete(effect: Component) -> None:
         else:
             assert values
             assert all(low <= v <= high for v in values)
-
-
-@every_effect
-@pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
-def test_an_effect_composes_where_what_it_needs_is_there(
-    effect: Component, base: tuple[Component, ...]
-) -> None:
-    if set(effect.needs) <= {c.name for c in base}:
-        assert compose((*base, effect)).effects == (effect,)
-        return
-    with pytest.raises(InputError, match=f"'{effect.name}' cannot be composed"):
-        compose((*base, effect))
 
 
 def _model_with(component: Component) -> Model:

@@ -1,11 +1,20 @@
-"""The signatures of the plant's effects: each shows the figures that its equation promises."""
+"""The signatures of the plant's effects: each shows the figures that its equation promises.
 
+And what holds for all: finite slopes, ordinary costs, no run-away, rest at a hold.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import psa_casadi as psa
 from psa_casadi.component import Component
-from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
+from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.hysteresis import HYSTERESIS_MEMORY, RATE_DEPENDENT_HYSTERESIS
 from psa_casadi.effects.mechanics import BACKLASH, LOAD_STIFFNESS, PRELOAD_LOSS
 from psa_casadi.effects.strain import (
@@ -14,20 +23,29 @@ from psa_casadi.effects.strain import (
     SATURATION_OF_STRAIN,
     SELF_HEATING,
 )
+from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.start.form import forms_of
+from psa_casadi.model.compose import Model, compose
 from psa_casadi.scales import stiffness_scale, stroke_scale
+from psa_casadi.simulation.compiler import functions_of
 from psa_casadi.simulation.simulate import simulate
 from tests.effect_runs import (
+    HYSTERESIS,
     QUICK,
     driven,
     linear,
+    ordinary,
+    sine_and_steps,
     third_harmonic,
     triangle,
 )
+from tests.modelica_runs import right_side_error
 from tests.plants.hysteresis_memory import play
+from tests.plants.make import make_record
+from tests.random_models import random_model, random_point
 from tests.stack_models import stack
-
-FloatArray = NDArray[np.float64]
+from tests.tiers import slow
 
 every_base = pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
 
@@ -53,26 +71,6 @@ def test_loop_width_follows_the_logarithm_of_rate(peak: float) -> None:
         width, reach = np.polyfit(np.log10(rates), shown[gain] - shown[0.0], 1)[0]
         assert width == pytest.approx(gain, rel=0.1)
         assert -0.5 < reach / gain < -0.05
-
-
-@pytest.mark.parametrize("frequency", [0.05, 0.5])
-def test_thresholds_that_grow_with_the_rate_widen_every_loop_alike(frequency: float) -> None:
-    """By twice what 0.3 (c - 1) w of voltage does, from 2 w after a reversal on, nothing before."""
-    values = {"rate_by_threshold": 1.0, "rate_threshold": 0.05, "rate_onset": 1e-3}
-    widths = []
-    for peak in (120.0, 48.0):
-        model = linear(RATE_DEPENDENT_HYSTERESIS, 0.1).with_values(values)
-        found = driven(model, *triangle(frequency, peak))
-        u, x = found.x[-401:, 0] / 120.0, found.y[-401:, -1] / stroke_scale(model.values)
-        behind = (x - x[200]) - (u - u[200])
-        down, up = (
-            np.interp(peak / 240.0, *pair)
-            for pair in ((u[200:][::-1], x[200:][::-1]), (u[:200], x[:200]))
-        )
-        decades = np.log10(2.0 * peak * frequency / 120.0 / 1e-3)
-        widths.append((down - up) / (2.0 * 0.3 * 0.05 * np.expm1(0.1 * decades)))
-        assert np.ptp(behind[202:206]) < 0.05 * (down - up)
-    assert widths == pytest.approx([1.0, 1.0], rel=0.02)
 
 
 def test_rayleigh_gain_grows_with_amplitude() -> None:
@@ -188,17 +186,6 @@ def test_backlash_dwells_over_the_gap(peak: float) -> None:
         assert crossed[2] == pytest.approx(4.0, abs=0.02)
 
 
-def test_backlash_does_not_creep_at_a_hold() -> None:
-    """Stopped in the middle of the gap after a reversal, the output stays there for 1000 s."""
-    t = np.array([0.0, 1.0, 1.01, *np.linspace(1.1, 1000.0, 50)])
-    voltage = np.interp(t, [0.0, 1.0, 1.01], [0.0, 60.0, 58.8])
-    model = linear(BACKLASH, 1.0, backlash_width=0.01)
-    found = driven(model, t, voltage)
-    w = 0.01 * stroke_scale(model.values)
-    assert abs(found.x[-1, -1]) < 0.8 * w
-    assert np.ptp(found.y[3:, -1]) < 1e-6 * w
-
-
 def test_self_heating_climbs_and_recovers() -> None:
     """By the area of the loop while it is driven; back with heating_time at a hold.
 
@@ -237,3 +224,154 @@ def test_ageing_is_a_straight_line_in_log_time() -> None:
     slope = np.polyfit(np.log10(t[20:]), lost[20:], 1)[0]
     assert slope == pytest.approx(0.02, rel=1e-3)
     np.testing.assert_allclose(lost[20:], 0.02 * np.log10(1 + t[20:] / 1e-3), rtol=1e-4)
+
+
+PLANT = tuple(e for e in EFFECTS.values() if e.belongs_to == "plant")
+#: Parameters of a curve's form.
+ANGLES, WAVES = ("load_angle",), ("load_wave",)
+every_effect = pytest.mark.parametrize("effect", PLANT, ids=lambda e: e.name)
+
+
+def bounded(effect: Component) -> bool:
+    """Whether the gain's bounds are within a thousand of its ordinary sizes."""
+    model = ordinary(effect)
+    gain = model.parameter(str(effect.gain))
+    return max(map(abs, gain.bounds)) <= 1e3 * model.values[gain.name]
+
+
+def has_room_in(base: tuple[Component, ...], effect: Component) -> bool:
+    """Whether a base has what an effect needs."""
+    return set(effect.needs) <= {c.name for c in base}
+
+
+@every_effect
+@every_base
+def test_slopes_are_finite(effect: Component, base: tuple[Component, ...]) -> None:
+    """At random points, at rest, and far away before time zero; with gain and without."""
+    if not has_room_in(base, effect):
+        pytest.skip(f"needs {effect.needs}")
+    generator = np.random.default_rng(11)
+    for gains in (False, True):
+        model = random_model((effect,), generator, gains=gains, base=base)
+        point = random_point(model, generator)
+        for time, size in ((point.time, 1.0), (0.0, 0.0), (-5.0, 100.0)):
+            p = ca.DM(model.parameter_vector())
+            at = [ca.DM(time), ca.DM(size * point.x), ca.DM(size * point.u), p]
+            for function in functions_of(model.structure, sensitivities=True).values():
+                slopes = function.call(at)
+                assert all(np.isfinite(np.array(part)).all() for part in slopes)
+
+
+@every_effect
+def test_ordinary_size_shows_and_costs_little(effect: Component) -> None:
+    """Between 0.05 and 10 % of the range, at no more than 1.5 times the steps, at any probe.
+
+    A further resonance costs the steps of its oscillation. A weight may be 0 beside others.
+    """
+    t, voltage = sine_and_steps()
+    base = driven(stack("P-885.51"), t, voltage)
+    grids = {n: grid for n, grid in effect.probe.items() if isinstance(grid, tuple)}
+    grid = [{n: float(v)} for n, values in grids.items() for v in values]
+    grid = [g for g in grid if any(g.values()) or not set(g) & set(effect.linear)]
+    for values in grid or [{}]:
+        found = driven(ordinary(effect, **values), t, voltage)
+        change = np.abs(found.y[:, -1] - base.y[:, -1]).max() / np.ptp(base.y[:, -1])
+        assert 5e-4 < change < 0.1, values
+        assert effect.tone or found.steps <= 1.5 * base.steps, values
+
+
+@pytest.mark.parametrize("effect", [e for e in PLANT if bounded(e)], ids=lambda e: e.name)
+@pytest.mark.parametrize("end", [0, 1])
+def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> None:
+    """Within a thousand ordinary sizes: wider bounds say that stacks have no size in common."""
+    t, voltage = sine_and_steps()
+    bound = ordinary(effect).parameter(str(effect.gain)).bounds[end]
+    grid = [{n: float(v)} for n, values in effect.probe.items() for v in values if n in ANGLES]
+    waves = [{n: v} for n in WAVES for v in (-20.0, 20.0) if n in ordinary(effect).values]
+    for shape in [{}, *grid, *waves]:
+        model = ordinary(effect).with_values({str(effect.gain): bound, **shape})
+        x = driven(model, t, voltage).y[:, -1]
+        assert np.abs(x).max() < 3.0 * stroke_scale(model.values), shape
+
+
+@pytest.mark.parametrize("effect", [e for e in PLANT if e is not AGEING], ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    "base", [BASE, pytest.param(SIMPLIFIED, marks=slow)], ids=["cascade", "single mass"]
+)
+def test_a_held_voltage_holds_the_output(effect: Component, base: tuple[Component, ...]) -> None:
+    """The start at 100 V is an equilibrium of the extended model; ageing alone goes on."""
+    if not has_room_in(base, effect):
+        pytest.skip(f"needs {effect.needs}")
+    model = linear(effect, 0.3, base, **HYSTERESIS)
+    x = simulate(model, np.arange(11) * 10.0, np.full(11, 100.0)).displacement
+    assert x[0] > 0.3 * stroke_scale(model.values)
+    assert np.ptp(x) < 1e-6 * x[0]
+
+
+FloatArray = NDArray[np.float64]
+
+_STROKE, _RATED, _NOISE = 20e-6, 100.0, 20e-9
+
+
+def _plays(v: FloatArray, radii: FloatArray) -> FloatArray:
+    """Ideal play operators (n, k), from rest at 0 V."""
+    found = np.empty((v.size, radii.size))
+    state = np.zeros(radii.size)
+    for k, value in enumerate(v):
+        state = np.clip(state, value - radii, value + radii)
+        found[k] = state
+    return found
+
+
+def _loops() -> dict[str, FloatArray]:
+    """Loops of rising and falling amplitude of a generalised Prandtl-Ishlinskii stack."""
+    t = np.arange(3000) * 2e-3
+    swing = 0.5 * _RATED * np.interp(t, [0.0, 3.0, 6.0], [0.1, 1.0, 0.3])
+    v = swing * (1.0 - np.cos(2.0 * np.pi * 1.5 * t))
+    radii = _RATED * np.array([0.015, 0.04, 0.08, 0.13, 0.2, 0.3])
+    plays = _plays(v, radii) / _RATED
+    weights = np.array([0.04, 0.035, 0.03, 0.03, 0.025, 0.02])
+    x = 0.75 * v / _RATED + plays @ weights + plays**2 @ (0.6 * weights[::-1])
+    noise = np.random.default_rng(7).normal(0.0, _NOISE, t.size)
+    return {"time [s]": t, "voltage [V]": v, "displacement [m]": _STROKE * x / x.max() + noise}
+
+
+def _with_spectrum(**values: Any) -> Model:
+    own = [COMPONENTS["memory_spectrum"] if c.name == "bouc_wen" else c for c in BASE]
+    return compose(own, {"u_rated": 120.0, "play_0": -0.05, "square_0": 0.02, **values})
+
+
+@slow
+def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
+    record = psa.record_from(_loops())
+    bouc_wen = psa.identify(record)
+    best = psa.identify(record, hysteresis="best")
+    assert "memory_spectrum" in [c.name for c in best.model.components]
+    assert any("a spectrum of elements" in s for s in best.sentences)
+    assert bouc_wen.fit.rms > 3.0 * _NOISE
+    assert best.fit.rms < 1.3 * _NOISE
+    psa.save_model(best.model, tmp_path / "model.json")
+    again = psa.load_model(tmp_path / "model.json")
+    assert again.values == best.model.values
+    x = psa.simulate(again, record.time, record.voltage).outputs["displacement"]
+    assert np.ptp(x) == pytest.approx(record.range_m, rel=0.03)
+
+
+@slow
+def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
+    make_record(None, 3, tmp_path / "record.csv")
+    record = psa.read_record(tmp_path / "record.csv").slice(0, 1000)
+    found = psa.identify(record, hysteresis="best")
+    assert "bouc_wen" in [c.name for c in found.model.components]
+    assert any(s.startswith("hysteresis: Bouc-Wen") for s in found.sentences)
+
+
+def test_a_model_without_hysteresis_has_no_other_form() -> None:
+    bare = compose([c for c in BASE if c.name != "bouc_wen"])
+    with pytest.raises(psa.InputError, match="no hysteresis of its own"):
+        forms_of(bare, "spectrum")
+
+
+def test_modelica_has_the_equations_of_the_model() -> None:
+    model = _with_spectrum()
+    assert right_side_error(model, modelica_text(model, include_sensor=True)) < 1e-12

@@ -2,15 +2,12 @@
 
 import re
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.design.online.drifting_stack import DriftingStack
 from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
@@ -104,58 +101,6 @@ def test_learning_blocks_are_the_python_objects(precision: str) -> None:
     assert found[-1, at] == pytest.approx(learnt, rel=50.0 * limit)
 
 
-class Loop:
-    """The controller's law in plain Python: filter, notch by Tustin's rule, PI, back-calculation.
-
-    The signal between two samples is a line; the filter's answer to it is exact.
-    """
-
-    def __init__(self, p: dict[str, float]) -> None:
-        self.p = p
-        self.x = self.last = self.integral = self.before = 0.0
-        self.e, self.f = [0.0, 0.0], [0.0, 0.0]
-        T = p["sample_time"]
-        t = np.tan(min(np.pi * p["notch_frequency"] * T, 1.5))
-        self.b = np.array([1.0 + 2.0 * p["notch_floor"] * t + t * t, 2.0 * (t * t - 1.0),
-                           1.0 - 2.0 * p["notch_floor"] * t + t * t])  # fmt: skip
-        self.a = np.array([1.0 + 2.0 * p["notch_width"] * t + t * t, 2.0 * (t * t - 1.0),
-                           1.0 - 2.0 * p["notch_width"] * t + t * t])  # fmt: skip
-
-    def step(self, reference: float, position: float) -> float:
-        p, T = self.p, self.p["sample_time"]
-        q = np.exp(-T / p["filter_time"])
-        slope = (position - self.last) / T
-        behind = slope * p["filter_time"]
-        self.x = position - behind + (self.x - self.last + behind) * q
-        self.last = position
-        e = reference - self.x
-        past = self.b[1] * self.e[0] + self.b[2] * self.e[1]
-        f = (self.b[0] * e + past - self.a[1] * self.f[0] - self.a[2] * self.f[1]) / self.a[0]
-        self.e, self.f = [e, self.e[0]], [f, self.f[0]]
-        integral = self.integral + 0.5 * p["integral_gain"] * T * (f + self.before)
-        self.before = f
-        wish = p["proportional_gain"] * f + integral + p["feed_forward"] * reference
-        out = float(min(max(wish, p["lowest_command"]), p["highest_command"]))
-        self.integral = integral + p["anti_windup"] * (out - wish)
-        return out
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_the_controller_is_its_law(precision: str) -> None:
-    """On a first-order plant in the loop, with references that saturate the command."""
-    controller = psa.nanopositioner("P-885.51").parts["controller"]
-    law, x, rows, command = Loop(dict(controller.values)), 0.0, [], []
-    reference = 1.2e-5 * np.repeat([0.0, 1.0, 0.3, 3.0, 0.1], SAMPLES // 5)
-    for r in reference.tolist():
-        rows.append((r, x))
-        command.append(law.step(*rows[-1]))
-        x += 0.02 * (1.5e-6 * command[-1] - x)
-    found = played(controller, precision, np.array(rows))[:, 0]
-    assert max(command) == controller.values["highest_command"]
-    limit = {"double": 1e-9, "single": 1e-4}[precision]
-    assert np.abs(found - np.array(command)).max() <= limit * np.ptp(command)
-
-
 @pytest.mark.parametrize(
     ("name", "precision"),
     slow_but(
@@ -186,21 +131,3 @@ def test_a_controller_acts_at_every_few_steps_of_its_plant() -> None:
     moved = np.flatnonzero(np.diff(command)) + 2  # the number of the call that changes it
     assert len(moved) > 90
     assert not np.any(moved % 4)
-
-
-@pytest.mark.parametrize(
-    ("name", "inside"),
-    [("feed_forward", "wanted"), ("position_controller", "reference"), ("hysteresis_compensator",
-     "command")],
-)  # fmt: skip
-def test_the_command_tunes_a_part_to_a_stack(name: str, inside: str, tmp_path: Path) -> None:
-    arguments = ["export", "c", "--part", name, "--stack", "P-885.51", "--step", "20us"]
-    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path)])
-    assert done.exit_code == 0, done.output
-    header = (tmp_path / f"{name}.h").read_text(encoding="utf-8")
-    assert f"    double {inside};" in header
-    stack = psa.stack_model("P-885.51")
-    told = {"feed_forward": ("k_L", stack.values["k_L"]), "position_controller": (
-        "sample_time", 2e-5), "hysteresis_compensator": ("k_L", stack.values["k_L"])}  # fmt: skip
-    what, value = told[name]
-    assert re.search(rf"{what} = {re.escape(repr(value))} ", header)

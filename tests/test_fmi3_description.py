@@ -5,17 +5,16 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import casadi as ca
-import fmpy
 import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.export.common.variable_table import OPTIONS, variable_table
+from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.description import dependencies, model_description
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.variables import Input, Output, Parameter, State
-from tests.fmu_models import exported, model_named
+from tests.fmu_models import model_named
 
 NAMES = (*STACKS, "every_effect", "single_mass", "flexure")
 
@@ -23,25 +22,6 @@ NAMES = (*STACKS, "every_effect", "single_mass", "flexure")
 @cache
 def xml_of(name: str) -> ET.Element:
     return ET.fromstring(model_description(model_named(name), "m", "{t}", fmi=3))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_variables(name: str) -> None:
-    variables = list(xml_of(name).iterfind("ModelVariables/*"))
-    assert {v.tag for v in variables} == {"Float64"}
-    assert [int(v.attrib["valueReference"]) for v in variables] == [
-        k + 1 for k in range(len(variables))
-    ]
-    independent = [v for v in variables if v.attrib["causality"] == "independent"]
-    assert independent == variables[:1]
-    by_reference = {int(v.attrib["valueReference"]): v.attrib["name"] for v in variables}
-    for v in variables:
-        if v.attrib["name"].startswith("der("):
-            assert v.attrib["name"] == f"der({by_reference[int(v.attrib['derivative'])]})"
-        between = v.attrib["name"] in (*model_named(name).parameter_names, *OPTIONS)
-        between = between or v.attrib["name"].startswith("switch.")
-        assert ("intermediateUpdate" in v.attrib) == (not between and v is not variables[0])
-        assert ("initial" in v.attrib) == (v.attrib["causality"] not in ("input", "independent"))
 
 
 @pytest.mark.parametrize("name", ["P-885.51", "every_effect", "flexure"])
@@ -60,29 +40,6 @@ def test_both_versions_describe_one_model(name: str) -> None:
     for part in ("UnitDefinitions", "LogCategories", "DefaultExperiment"):
         texts = [ET.tostring(r.find(part)) for r in (xml_of(name), other)]  # type: ignore[arg-type]
         assert texts[0] == texts[1]
-
-
-def test_capabilities() -> None:
-    root = xml_of("P-885.51")
-    flags = {tag: dict(root.find(tag).attrib) for tag in ("ModelExchange", "CoSimulation")}  # type: ignore[union-attr]
-    common = {
-        "modelIdentifier": "m",
-        "canGetAndSetFMUState": "true",
-        "canSerializeFMUState": "true",
-        "providesDirectionalDerivatives": "true",
-        "providesAdjointDerivatives": "true",
-        "providesEvaluateDiscreteStates": "true",
-    }
-    assert flags["ModelExchange"] == {**common, "needsCompletedIntegratorStep": "false"}
-    assert flags["CoSimulation"] == {
-        **common,
-        "canHandleVariableCommunicationStepSize": "true",
-        "providesIntermediateUpdate": "true",
-        "canReturnEarlyAfterIntermediateUpdate": "true",
-        "hasEventMode": "true",
-        "maxOutputDerivativeOrder": "1",
-    }
-    assert root.find("ScheduledExecution") is None
 
 
 @cache
@@ -159,17 +116,6 @@ def test_dependencies_are_complete(name: str) -> None:
             moved |= {(u, known) for u, c in zip(unknowns, changed, strict=True) if c}
     assert len(moved) > 2 * len(unknowns)
     assert [pair for pair in sorted(moved) if pair[1] not in listed[pair[0]]] == []
-
-
-def test_the_event_indicator_of_a_stack() -> None:
-    """Voltage reverses where u' = (G v - u) / (R_s C_p) is 0."""
-    found = entries_of("P-885.51")["EventIndicator"]["switch.voltage_reversal"]
-    assert set(found) == {"u", "voltage", "G", "R_s", "C_p"}
-    assert found["u"] == found["voltage"] == "tunable"
-    two = ET.fromstring(model_description(model_named("P-885.51"), "m", "t", ()))
-    assert two.attrib["numberOfEventIndicators"] == "1"
-    three = fmpy.read_model_description(str(exported("P-885.51", 3)))
-    assert three.numberOfEventIndicators == 1
 
 
 def test_kinds_of_dependence() -> None:

@@ -19,12 +19,11 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.ode_model import ode_model
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Parameter, State
 from tests.modelica_runs import simulated
-from tests.tiers import slow, slow_but
+from tests.tiers import slow_but
 
 _X, _U, _P, _T = (ca.SX.sym(name) for name in "xupt")
 
@@ -94,24 +93,6 @@ def test_a_sensors_effect_is_left_out_where_the_fmu_leaves_it_out(tmp_path: Path
         assert chosen.state_names == ("x",)
         assert list(wrong_start_values(archive, chosen)) == []
         assert list(wrong_dependencies(archive, chosen)) == []
-
-
-@slow
-@pytest.mark.usefixtures("code_runs_here")
-def test_a_wired_system_passes_the_check(tmp_path: Path) -> None:
-    """Its switches follow states and held commands, not the inputs."""
-    model = nanopositioner("P-885.51").model()
-    report = check_fmu(export_fmu(model, tmp_path / "m.fmu", fmi=3))
-    assert report.passed, report.failures
-
-
-@slow
-@pytest.mark.usefixtures("code_runs_here")
-def test_without_outputs_the_states_are_compared(tmp_path: Path) -> None:
-    report = check_fmu(export_fmu(_without_outputs(), tmp_path / "m.fmu"), _without_outputs())
-    assert report.compared
-    assert report.passed, report.failures
-    assert sum(row.remark.startswith("largest in level") for row in report.rows) == 6
 
 
 def test_a_model_without_outputs_runs_everywhere(tmp_path: Path) -> None:

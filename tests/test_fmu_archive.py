@@ -1,51 +1,48 @@
-"""What is inside an FMU: description, sources that compile alone, binaries that load anywhere."""
+"""What is inside an FMU: sources that compile alone, binaries that load, terminals, icons, pages.
 
+And what the check says of FMUs that another version of CasADi made.
+"""
+
+import html
+import io
 import re
 import shutil
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
+import casadi as ca
 import fmpy
+import matplotlib.image
+import numpy as np
 import pytest
+from fmpy.validation import validate_fmu
+from lxml import etree  # type: ignore[import-untyped]
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.components import BASE, COMPONENTS
+from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.export.common.markup import time_scale
+from psa_casadi.export.check.check import CheckRow, check_fmu
+from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu
-from psa_casadi.export.fmu.description import model_description
-from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
+from psa_casadi.export.fmu import sources
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
 from psa_casadi.export.fmu.sources import STRICT, write_sources
-from psa_casadi.model.compose import compose
-from psa_casadi.model.model_file import loads
-from psa_casadi.simulation.compiler import run_compiler
-from psa_casadi.units import rate_unit
+from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
 from psa_casadi.variables import Output
-from tests.fmu_models import exported, model_named
+from tests.fmu_models import assert_valid, entries, model_named, rewritten
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
-
-
-def _binary(path: Path) -> bytes:
-    with zipfile.ZipFile(path) as archive:
-        name = next(n for n in archive.namelist() if n.startswith("binaries/"))
-        return archive.read(name)
-
-
-def _xml(path: Path) -> ET.Element:
-    with zipfile.ZipFile(path) as archive:
-        return ET.fromstring(archive.read("modelDescription.xml"))
-
-
-def test_token_follows_the_model() -> None:
-    tokens = {_xml(exported(n)).attrib["guid"] for n in (STACK, "PTBS200", "flexure")}
-    assert len(tokens) == 3
-    assert all(re.fullmatch(r"\{[0-9a-f-]{36}\}", t) for t in tokens)
 
 
 @pytest.mark.skipif(not shutil.which("gcc"), reason="gcc is not installed")
@@ -63,27 +60,6 @@ def test_sources_compile_alone_without_warnings(name: str, tmp_path: Path) -> No
     assert {p.name for p in written} >= {"model.c", "model_config.h", "fmi_data.c", "fmi2.c"}
 
 
-def test_source_list_is_complete() -> None:
-    root = _xml(exported(STACK))
-    with zipfile.ZipFile(exported(STACK)) as archive:
-        sources = {
-            n.removeprefix("sources/") for n in archive.namelist() if n.startswith("sources/")
-        }
-        listed = ET.fromstring(archive.read("sources/buildDescription.xml"))
-    compiled = {n for n in sources if n.endswith(".c")}
-    for interface in ("ModelExchange", "CoSimulation"):
-        assert {f.attrib["name"] for f in root.findall(f"{interface}/SourceFiles/File")} == compiled
-    assert {f.attrib["name"] for f in listed.iter("SourceFile")} == compiled
-
-
-def test_model_is_inside() -> None:
-    with zipfile.ZipFile(exported(STACK)) as archive:
-        inside = loads(archive.read(MODEL_ENTRY).decode())
-    plant = model_named(STACK).plant()
-    assert dict(inside.values) == dict(plant.values)
-    assert inside.output_names == plant.output_names
-
-
 @pytest.mark.usefixtures("without_binary")
 def test_sensor_stays_out_unless_wanted(tmp_path: Path) -> None:
     model = compose((*BASE, EFFECTS["sensor_delay"], EFFECTS["offset_drift"]))
@@ -95,77 +71,6 @@ def test_sensor_stays_out_unless_wanted(tmp_path: Path) -> None:
     whole = {v.name for v in fmpy.read_model_description(str(whole_path)).modelVariables}
     assert names < whole
     assert "measured_displacement" in whole
-
-
-@pytest.mark.parametrize("scale", ["assumed", "given"])
-def test_description_states_the_force_scale(scale: str) -> None:
-    model = model_named(STACK)
-    model = replace(model, provenance=replace(model.provenance, force_scale=scale))
-    said = ET.fromstring(model_description(model, "m", "t", ())).attrib["description"]
-    phrase = {
-        "assumed": "only quantities scaled to displacement",
-        "given": "stiffness from outside",
-    }
-    assert phrase[scale] in said
-    assert ("assumed" in said) == (scale == "assumed")
-
-
-def test_variables_of_a_stack() -> None:
-    variables = {v.attrib["name"]: v for v in _xml(exported(STACK)).iter("ScalarVariable")}
-    tau, x, voltage = (variables[n] for n in ("tau", "x", "voltage"))
-    assert (tau.attrib["causality"], tau.attrib["variability"]) == ("parameter", "tunable")
-    real = tau.find("Real")
-    assert real is not None
-    assert {k: real.attrib[k] for k in ("unit", "displayUnit", "start", "min", "max")} == {
-        "unit": "s", "displayUnit": "ms", "start": "0.0001", "min": "1e-07", "max": "1.0",
-    }  # fmt: skip
-    assert x.attrib["initial"] == "exact"
-    assert "initial" not in voltage.attrib
-    rates = [v for n, v in variables.items() if n.startswith("der(")]
-    assert len(rates) == 7
-    assert all(r.find("Real[@derivative]") is not None for r in rates)
-
-
-def test_display_units_convert() -> None:
-    units = {u.attrib["name"]: u for u in _xml(exported(STACK)).iter("Unit")}
-    shown = units["m"].find("DisplayUnit[@name='um']")
-    assert shown is not None
-    assert float(shown.attrib["factor"]) == 1e6
-    base = units["N/(V.s)"].find("BaseUnit")
-    assert base is not None
-    assert base.attrib == {"m": "-1", "A": "1"}
-
-
-def test_dependencies_of_a_flexure() -> None:
-    """x_f' = v_f; v_f' = (k_c (x - x_f) + c_c (x' - v_f) - c_f v_f - k_f x_f) / m_f."""
-    description = fmpy.read_model_description(str(exported("flexure")))
-    found = {
-        u.variable.name: dict(
-            zip((d.name for d in u.dependencies), u.dependenciesKind, strict=True)
-        )
-        for u in (*description.derivatives, *description.outputs)
-    }
-    assert found["der(x_f)"] == {"v_f": "constant"}
-    states, inputs = ("x_f", "v_f"), ("tip_position", "tip_velocity")
-    parameters = dict.fromkeys(("m_f", "c_f", "k_f", "k_c", "c_c"), "dependent")
-    assert found["der(v_f)"] == dict.fromkeys((*states, *inputs), "tunable") | parameters
-    contact = dict.fromkeys((*states, *inputs), "tunable")
-    assert found["reaction_force"] == contact | dict.fromkeys(("k_c", "c_c"), "dependent")
-    assert found["stage_position"] == {"x_f": "constant"}
-
-
-@pytest.mark.parametrize(
-    ("unit", "rate"),
-    [("m", "m/s"), ("m/s", "m/s2"), ("m/s2", "m/s3"), ("N/V", "N/(V.s)"), ("N/(V.s)", "N/(V.s2)")],
-)
-def test_rate_units(unit: str, rate: str) -> None:
-    assert rate_unit(unit) == rate
-
-
-def test_time_scale_follows_the_model() -> None:
-    assert time_scale(model_named("manipulator")) == pytest.approx(4 * 5e-3, rel=1e-6)
-    assert time_scale(model_named(STACK)) == pytest.approx(4 * 1e-4, rel=1e-6)
-    assert time_scale(model_named("slow_creep")) == pytest.approx(4 * 1e-4, rel=1e-6)
 
 
 def test_impossible_exports_are_refused(tmp_path: Path) -> None:
@@ -186,12 +91,6 @@ def test_impossible_exports_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no state"):
         variable_table(compose([gain]))
     assert not list(tmp_path.iterdir())
-
-
-def test_platforms() -> None:
-    assert [p.name for p in chosen_platforms(["all"])] == list(PLATFORMS)
-    assert len(chosen_platforms(["host", "all", "host"])) == 9
-    assert len({p.folder for p in PLATFORMS.values()}) == 9
 
 
 def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,3 +125,197 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         with pytest.raises(PsaError, match="no compiler"):
             compile_library({"model.c": "int c;"}, "psa", linux)
     assert compile_library(texts, "psa", linux) == others[-1]
+
+
+#: Two models in both versions, the others in one of them in turn.
+TWICE = ("P-885.51", "flexure")
+TRIED = [(name, fmi) for name in TWICE for fmi in (2, 3)]
+TRIED += [
+    (name, 2 + k % 2)
+    for k, name in enumerate((*STACKS, "every_effect", "single_mass")) if name not in TWICE
+]  # fmt: skip
+
+
+@pytest.mark.usefixtures("without_binary")
+@pytest.mark.parametrize(("name", "fmi"), slow_but(TRIED[:4], TRIED))
+def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
+    """What is checked are the description and the list of sources."""
+    path = export_fmu(model_named(name), tmp_path / "m.fmu", name="m", fmi=fmi, include_sensor=True)
+    assert validate_fmu(str(path)) == []
+    description = fmpy.read_model_description(str(path))
+    assert description.fmiVersion == f"{fmi}.0"
+    assert len(description.modelVariables) == len(variable_table(model_named(name)))
+
+
+@pytest.mark.usefixtures("without_binary")
+def test_archive_of_fmi_3(tmp_path: Path) -> None:
+    """Folders are named by FMI 3's platform tuples; the same model gives the same bytes."""
+    paths = [tmp_path / "a.fmu", tmp_path / "b.fmu"]
+    for path in paths:
+        export_fmu(model_named("demo"), path, name="demo", platforms=["all"], fmi=3)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    with zipfile.ZipFile(paths[0]) as archive:
+        names = archive.namelist()
+        assert names == sorted(names)
+        assert {i.date_time for i in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+    binaries = {n.removeprefix("binaries/") for n in names if n.startswith("binaries/")}
+    assert binaries == {
+        "x86_64-linux/demo.so",
+        "aarch64-linux/demo.so",
+        "riscv64-linux/demo.so",
+        "aarch32-linux/demo.so",
+        "x86-linux/demo.so",
+        "x86_64-windows/demo.dll",
+        "x86-windows/demo.dll",
+        "x86_64-darwin/demo.dylib",
+        "aarch64-darwin/demo.dylib",
+    }
+    assert {"sources/buildDescription.xml", "sources/README.txt", "resources/model.json"} < {*names}
+    with pytest.raises(InputError, match="FMI 4 is not known"):
+        export_fmu(model_named("demo"), tmp_path / "c.fmu", fmi=4)
+
+
+XML = "modelDescription.xml"
+NOW = ca.CasadiMeta.version()
+
+
+def _as_another_writes(text: str) -> str:
+    """What differs from CasADi 3.8.0 to 3.8.2, and names of variables, which may come to differ."""
+    return text.replace(f"CasADi {NOW}", "CasADi 3.7.9").replace("a0", "b0") + "/* no version */\n"
+
+
+@pytest.fixture(scope="module")
+def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An FMU whose C another CasADi generated; what is tried here needs no binary."""
+    generate, derivatives = generate_c, c_code
+
+    def generated(*args: Any, **options: Any) -> dict[str, str]:
+        return {n: _as_another_writes(t) for n, t in generate(*args, **options).items()}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sources, "generate_c", generated)
+        patch.setattr(sources, "c_code", lambda *args: _as_another_writes(derivatives(*args)))
+        patch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
+        return export_fmu(model_named(STACK), tmp_path_factory.mktemp("fmu") / "older.fmu")
+
+
+def _reproducible(path: Path) -> CheckRow:
+    return next(row for row in check_fmu(path).rows if row.name == "reproducible")
+
+
+@pytest.mark.usefixtures("code_runs_here")
+def test_an_export_of_another_casadi_is_reproducible(older: Path) -> None:
+    row = _reproducible(older)
+    assert row.passed, row.remark
+    assert "CasADi 3.7.9" in row.remark
+    assert f"CasADi {NOW}" in row.remark
+
+
+#: What is changed in it, and what the row says then.
+CHANGES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+    "equation": ("sources/model.c", lambda t: t.replace(b"b0", b"c0", 1), "the token is"),
+    "version": ("sources/model.c", lambda t: t.replace(b"3.7.9", NOW.encode()), "model.c differs"),
+    "start value": ("sources/fmi_data.c", lambda t: t + b"\n", "fmi_data.c differs"),
+    "solver": ("sources/solver.c", lambda t: t + b"\n", "solver.c differs"),
+    "bound": (XML, lambda t: t.replace(b'min="', b'min="-', 1), f"{XML} differs"),
+}
+
+
+@pytest.mark.usefixtures("code_runs_here")
+@pytest.mark.parametrize("change", slow_but(["equation", "start value"], CHANGES))
+def test_a_change_of_it_is_found(change: str, older: Path, tmp_path: Path) -> None:
+    place, edit, said = CHANGES[change]
+    row = _reproducible(rewritten(older, tmp_path / "changed.fmu", {place: edit}))
+    assert not row.passed
+    assert said in row.remark
+
+
+flexure = compose([COMPONENTS["flexure"]], name="flexure")
+every_effect = compose((*BASE, *EFFECTS.values()), name="every_effect")
+
+
+# Terminals
+
+
+@pytest.mark.parametrize("model", [stack_model(STACK), compose(SIMPLIFIED), flexure, every_effect])
+def test_terminals_are_valid_and_their_variables_exist(model: Model) -> None:
+    text = terminals_and_icons(model)
+    assert_valid(text, "schema", "fmi3", "fmi3TerminalsAndIcons.xsd")
+    known = {*model.input_names, *model.output_names}
+    root = ET.fromstring(text)
+    members = [m.attrib["variableName"] for m in root.iter("TerminalMemberVariable")]
+    assert len(members) >= 3
+    assert len(set(members)) == len(members)
+    assert set(members) <= known
+    icons = {g.attrib["iconBaseName"] for g in root.iter("TerminalGraphicalRepresentation")}
+    assert icons <= set(ICONS)
+
+
+def test_a_stack_and_a_flexure_connect() -> None:
+    """Equal names of members, an input on one side for each output on the other; forces opposed."""
+    stack = stack_model(STACK)
+    near = next(t for t in terminals_of(stack) if t.name == "mechanical")
+    (far,) = terminals_of(flexure)
+    ours, theirs = ({m: (v, k) for v, m, k in t.members} for t in (near, far))
+    assert set(ours) == set(theirs)
+    for member, (variable, kind) in ours.items():
+        other, other_kind = theirs[member]
+        assert (variable in stack.output_names) == (other in flexure.input_names)
+        assert {kind, other_kind} in ({"signal"}, {"inflow", "outflow"})
+
+
+# Icons
+
+
+@pytest.mark.parametrize("name", ICONS)
+def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
+    """Every pixel of the PNG has the colour of the last rectangle of the SVG that covers it."""
+    picture = matplotlib.image.imread(io.BytesIO(png(ICONS[name])), format="png")
+    assert picture.shape == (SIDE, SIDE, 4)
+    expected = np.zeros_like(picture)
+    for r in ET.fromstring(svg(ICONS[name])):
+        left, top, width, height = (int(r.attrib[a]) for a in ("x", "y", "width", "height"))
+        assert 0 <= left < left + width <= SIDE
+        assert 0 <= top < top + height <= SIDE
+        colour = [int(r.attrib["fill"][k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
+        expected[top : top + height, left : left + width] = [*colour, 1.0]
+    seen = expected[..., 3] > 0.0
+    assert np.array_equal(picture[..., 3] > 0.0, seen)
+    assert picture[seen] == pytest.approx(expected[seen], abs=1e-6)
+
+
+# Documentation
+
+
+@pytest.mark.parametrize("model", [stack_model(STACK), flexure, every_effect])
+def test_documentation_is_complete(model: Model) -> None:
+    page = documentation(model)
+    said = html.unescape(re.sub(r"<[^>]*>", "\n", page))
+    for component in model.components:
+        for text in (component.name, component.description, component.equation_text):
+            assert text in said, component.name
+        assert component.source in said
+    for declared in variable_table(model):
+        if declared.kind in ("parameter", "input", "output", "state"):
+            assert f"<td>{declared.name}</td>" in page
+            assert declared.description in said
+    for switch in model.structure.switches:
+        assert f"switch.{switch}" in said
+
+
+def test_documentation_stands_alone() -> None:
+    """Well-formed, nothing loaded from elsewhere, every link leads to a file of the archive."""
+    page = entries(STACK, 3)["documentation/index.html"].decode()
+    etree.fromstring(page.partition("\n")[2].replace('<meta charset="utf-8">', ""))
+    assert not re.search(r"<(script|link|img|iframe)|@import|url\(|https?://(?!www\.w3\.org)", page)
+    links = re.findall(r'href="([^"]*)"', page)
+    assert len(links) == 4
+    assert all(link.removeprefix("../") in entries(STACK, 3) for link in links)
+
+
+def test_documentation_escapes_what_users_write() -> None:
+    model = replace(flexure, name="a<b>", description="x < y & <script>alert(1)</script>")
+    page = documentation(model)
+    assert "<script" not in page
+    assert "x &lt; y &amp; &lt;script&gt;" in page
+    assert "<title>a&lt;b&gt;</title>" in page

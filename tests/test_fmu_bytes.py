@@ -10,14 +10,11 @@ from io import BytesIO
 from pathlib import Path
 
 import lief
-import numpy as np
 import pytest
 
 from psa_casadi.cache import cache_directory
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.platforms import PLATFORMS
-from psa_casadi.export.fmu.sources import STRICT
-from psa_casadi.simulation.compiler import run_compiler, zig_command
 from tests.c_host.build import (
     HEADERS,
     IDENTIFIER,
@@ -25,8 +22,6 @@ from tests.c_host.build import (
     VERSIONS,
     binary,
     everywhere,
-    native,
-    tool,
 )
 from tests.fmu_models import model_named
 from tests.tiers import slow
@@ -119,26 +114,11 @@ def test_no_absolute_path_inside(fmi: int) -> None:
         assert not [path for path in own if path + b"/" in content], name
 
 
-def test_the_search_for_paths_finds_one(tmp_path: Path) -> None:
-    """With debugging information, the same compiler leaves the folder in the binary."""
-    (tmp_path / "a.c").write_text("int f(void) { return 1; }\n")
-    target = ["-target", "x86_64-linux-gnu.2.17"]
-    run_compiler([*zig_command(), *target, "-g", "-c", "a.c", "-o", "a.o"], tmp_path)
-    assert str(tmp_path).encode() in (tmp_path / "a.o").read_bytes()
-
-
 @cache
 def functions(fmi: int) -> frozenset[str]:
     """Return the functions that the headers of the standard declare."""
     text = (HEADERS / f"fmi{fmi}Functions.h").read_text()
     return frozenset(re.findall(rf"^\s*FMI{fmi}_Export\s+\w+TYPE\s+(\w+);", text, re.MULTILINE))
-
-
-def test_the_standard_declares_what_we_count() -> None:
-    assert len(functions(2)) == 44
-    assert len(functions(3)) > 70
-    assert {"fmi2DoStep", "fmi2GetTypesPlatform"} <= functions(2)
-    assert {"fmi3DoStep", "fmi3SetTime", "fmi3GetAdjointDerivative"} <= functions(3)
 
 
 def elf(fmi: int, name: str) -> lief.ELF.Binary:
@@ -223,25 +203,3 @@ def test_macos(name: str, fmi: int) -> None:
     assert library.has_code_signature or name == "x86_64-darwin"
     cpu = {"x86_64-darwin": "X86_64", "aarch64-darwin": "ARM64"}[name]
     assert library.header.cpu_type.name == cpu
-
-
-@pytest.mark.parametrize(("compiler", "fmi"), [("gcc", 3), ("clang", 2)])
-def test_sources_compile_alone(compiler: str, fmi: int, tmp_path: Path) -> None:
-    """With the line of their README, without a warning; the library gives the binary's numbers.
-
-    zig's compiler made the binary; its warnings are seen by `build_scripts.compile_c`.
-    """
-    command = [tool(compiler)]
-    with zipfile.ZipFile(everywhere(fmi).with_suffix(".fmu")) as archive:
-        for entry in archive.infolist():
-            if entry.filename.startswith("sources/"):
-                archive.extract(entry, tmp_path)
-    folder = tmp_path / "sources"
-    lines = (folder / "README.txt").read_text().splitlines()
-    line = next(text.split() for text in lines if text.startswith("    cc "))
-    run_compiler([*command, *line[1:], *STRICT], folder)
-    built = folder / line[line.index("-o") + 1]
-    assert built.name == IDENTIFIER + ".so"
-    expected = native().run(fmi)
-    found = native().run(fmi, built)
-    assert np.max(np.abs(found - expected) / np.max(np.abs(expected), axis=0)) < 1e-12

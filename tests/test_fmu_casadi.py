@@ -6,7 +6,6 @@ With them it solves an optimal control problem on the binary.
 """
 
 import zipfile
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -89,70 +88,4 @@ def test_jacobians_forwards_and_backwards(weight: float, fmi: int, tmp_path: Pat
     assert by_expression(f, model) == pytest.approx(expected, rel=1e-10, abs=0.0)
 
 
-@pytest.mark.xfail(
-    ca.CasadiMeta.version() in ("3.8.0", "3.8.1", "3.8.2"), strict=True,
-    reason="CasADi 3.8 up to 3.8.2 keeps the last of several adjoint seeds of an FMI 3 FMU only",
-)  # fmt: skip
-def test_several_adjoint_seeds_at_once(tmp_path: Path) -> None:
-    model = model_named("P-885.51").plant()
-    f = imported("P-885.51", 3, tmp_path, ad_weight=1.0)
-    expected = by_expression(symbolic(model), model)
-    assert by_expression(f, model) == pytest.approx(expected, rel=1e-10, abs=0.0)
-
-
 STEPS, SIZE = 20, 2e-5
-#: The path to follow: a smooth rise of 8 um in 0.4 ms.
-PATH = 4e-6 * (1.0 - np.cos(np.pi * np.arange(1, STEPS + 1) / STEPS))
-
-
-def _optimal_voltage(f: ca.Function) -> tuple[FloatArray, float]:
-    """Return the voltage (20,) that makes the stack follow PATH, and the rms error [m].
-
-    Backward Euler over 20 steps; states and voltage are unknowns, in nominal units. The cost is the
-    sum of squares of the error in um and of a small price on changes of the voltage; its exact
-    Hessian stands for that of the Lagrangian (Gauss and Newton).
-    """
-    model = model_named("P-885.51").plant()
-    size, p = model.state_nominals(), model.parameter_vector()
-    count, x = len(size), model.state_names.index("x")
-    states = [ca.MX.sym(f"x_{k}", count) for k in range(STEPS)]
-    voltages = ca.MX.sym("v", STEPS)
-    residuals = []
-    for k, (before, after) in enumerate(pairwise([ca.MX.zeros(count), *states])):
-        xdot, _ = f(size * after, ca.vertcat(size[0] * voltages[k], 0.0), p)
-        residuals.append(after - before - SIZE * xdot / size)
-    errors = [1e6 * (size[x] * s[x] - PATH[k]) for k, s in enumerate(states)]
-    unknowns = ca.vertcat(*states, voltages)
-    cost = ca.sumsqr(ca.vertcat(*errors, 1e-2 * ca.diff(voltages)))
-    factor, multipliers = ca.MX.sym("f"), ca.MX.sym("l", count * STEPS)
-    arguments = [unknowns, ca.MX(0, 1), factor, multipliers]
-    hessian = ca.Function("h", arguments, [ca.triu(factor * ca.hessian(cost, unknowns)[0])])
-    solver = ca.nlpsol(
-        "solver", "ipopt", {"x": unknowns, "f": cost, "g": ca.vertcat(*residuals)},
-        {"hess_lag": hessian, "print_time": False,
-         "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10, "max_iter": 300}},
-    )  # fmt: skip
-    free = np.full(count * STEPS, np.inf)
-    solution = solver(
-        x0=np.concatenate([np.zeros(count * STEPS), np.linspace(0.0, 0.5, STEPS)]),
-        lbx=np.concatenate([-free, np.zeros(STEPS)]),
-        ubx=np.concatenate([free, np.ones(STEPS)]),
-        lbg=0.0,
-        ubg=0.0,
-    )
-    assert solver.stats()["success"], solver.stats()["return_status"]
-    found = np.array(solution["x"]).ravel()
-    reached = size[x] * found[: count * STEPS].reshape(STEPS, count)[:, x]
-    return size[0] * found[count * STEPS :], float(np.sqrt(np.mean((reached - PATH) ** 2)))
-
-
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_optimal_control_on_the_fmu_finds_the_answer_of_the_symbolic_model(
-    fmi: int, tmp_path: Path
-) -> None:
-    expected, error = _optimal_voltage(symbolic(model_named("P-885.51").plant()))
-    assert error < 0.01 * 8e-6
-    assert np.ptp(expected) > 30.0
-    found, found_error = _optimal_voltage(imported("P-885.51", fmi, tmp_path, **ONE_SEED))
-    assert found == pytest.approx(expected, abs=1e-6 * np.ptp(expected))
-    assert found_error == pytest.approx(error, rel=1e-6)

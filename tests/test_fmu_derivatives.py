@@ -1,17 +1,14 @@
 """Directional and adjoint derivatives, at a point and through a co-simulation step."""
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_size_t
 from functools import cache
-from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from psa_casadi.export.check.structure import transposed_error
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
@@ -112,23 +109,6 @@ def test_point_derivatives_in_model_exchange_are_exact(name: str) -> None:
     assert _worst(back, exact, scales) < 1e-13
 
 
-def test_time_and_several_seeds_add_up() -> None:
-    name = MODELS[0]
-    kinds = _names(name)
-    unknowns, knowns = kinds["output"], ["time", *kinds["state"], "voltage", "C_p"]
-    random = np.random.default_rng(3)
-    seed, weight = random.normal(size=len(knowns)), random.normal(size=len(unknowns))
-    with Instance3(loaded(name), MODEL_EXCHANGE) as instance:
-        instance.start(_point(name))
-        whole = _jacobian(instance, unknowns, knowns)
-        assert np.all(whole[:, 0] == 0.0)
-        assert instance.directional(unknowns, knowns, list(seed)) == pytest.approx(whole @ seed)
-        assert instance.adjoint(unknowns, knowns, list(weight)) == pytest.approx(weight @ whole)
-        twice = instance.adjoint(["current", "current"], ["u", "u"], [1.0, 2.0])
-        once = instance.directional(["current"], ["u"], [1.0])[0]
-        assert twice == pytest.approx([3.0 * once, 3.0 * once])
-
-
 def test_both_versions_and_interfaces_agree_at_a_point() -> None:
     name = MODELS[0]
     kinds, point = _names(name), _point(name)
@@ -227,66 +207,6 @@ def test_sensitivities_of_steps_multiply() -> None:
     assert _worst(second, both, _scales(states, name)) > 1e-3
 
 
-def test_before_any_step_the_states_are_their_own() -> None:
-    name = MODELS[0]
-    states = _names(name)["state"]
-    with _stepped(name, _point(name), [], 1e-6) as instance:
-        assert np.array_equal(_jacobian(instance, states, states), np.eye(len(states)))
-        assert np.all(_jacobian(instance, states, ["voltage", "C_p"]) == 0.0)
-
-
-def test_what_is_set_after_a_step_does_not_change_its_sensitivity() -> None:
-    name = MODELS[0]
-    states = _names(name)["state"]
-    knowns = [*states, "voltage", "C_p"]
-    with _stepped(name, _point(name), [1e-4, 1e-4], 1e-6) as instance:
-        before = _jacobian(instance, states, knowns)
-        data = instance.serialized()
-        instance.set({"voltage": -5.0, "C_p": 1e-6})
-        assert np.array_equal(_jacobian(instance, states, knowns), before)
-        assert instance.try_step(2e-4, 1e-4).status == OK
-        assert not np.array_equal(_jacobian(instance, states, knowns), before)
-        assert instance.try_restore(data) == OK
-        assert np.array_equal(_jacobian(instance, states, knowns), before)
-        with Instance3(loaded(name)) as other:
-            assert other.try_restore(data) == OK
-            assert np.array_equal(_jacobian(other, states, knowns), before)
-
-
-def test_step_that_ended_early_has_the_sensitivity_up_to_its_end() -> None:
-    name, point = MODELS[0], _point(MODELS[0])
-    states = _names(name)["state"]
-    knowns = [*states, "voltage", "C_p"]
-    watched = Instance3(loaded(name), watcher=lambda _, u: u.time if u.time > 2e-5 else None)
-    with watched as instance:
-        instance.start(point, tolerance=1e-8)
-        done = instance.try_step(0.0, 1e-4)
-        assert done.early
-        found = _jacobian(instance, states, knowns)
-    with _stepped(name, point, [done.time], 1e-8) as instance:
-        assert _worst(found, _jacobian(instance, states, knowns), _scales(knowns, name)) < 1e-6
-
-
-def test_all_states_through_a_step_cost_as_much_as_one() -> None:
-    """The step is made again once for each call, not for each state."""
-    name = MODELS[0]
-    states = _names(name)["state"]
-    with _stepped(name, _point(name), [2e-3], 1e-8) as instance:
-        one, all_ = (_shortest(instance, chosen) for chosen in (states[:1], states))
-    assert len(states) > 4
-    assert all_ < 2.5 * one
-
-
-def _shortest(instance: Instance3, states: Sequence[str]) -> float:
-    """Return the shortest of some times that a derivative of states took [s]."""
-    spent = []
-    for _ in range(9):
-        begun = time.process_time()
-        instance.directional(states, ["C_p"], [1.0])
-        spent.append(time.process_time() - begun)
-    return min(spent)
-
-
 def test_unknown_step_sensitivity_is_refused_with_the_reason() -> None:
     name, one = MODELS[0], c_size_t(1)
     value = (2 * c_double)()
@@ -308,25 +228,3 @@ def test_unknown_step_sensitivity_is_refused_with_the_reason() -> None:
         assert instance.try_step(0.0, 1e-3).status == DISCARD
         assert instance.call("GetAdjointDerivative", *vectors, *rest) == DISCARD
         assert "that step failed" in instance.messages[-1]
-
-
-class _Matrix:
-    """An instance whose directional and adjoint derivatives are given matrices."""
-
-    def __init__(self, forward: list[list[float]], backward: list[list[float]]) -> None:
-        self.forward, self.backward = np.array(forward), np.array(backward)
-
-    def directional(self, unknowns: list[str], knowns: list[str], seed: FloatArray) -> FloatArray:
-        del unknowns, knowns
-        return np.asarray(self.forward @ seed)
-
-    def adjoint(self, unknowns: list[str], knowns: list[str], seed: FloatArray) -> FloatArray:
-        del unknowns, knowns
-        return np.asarray(seed @ self.backward)
-
-
-@pytest.mark.parametrize(("entry", "wrong"), [(3e-17, False), (1e-9, True), (1e-3, True)])
-def test_a_row_of_rounding_is_no_wrong_adjoint(entry: float, wrong: bool) -> None:
-    matrix = _Matrix([[1.0, 2.0], [2e-17, 0.0]], [[1.0, 2.0], [0.0, entry]])
-    found = transposed_error(cast("Any", matrix), ["a", "b"], ["c", "d"], np.ones(2), np.ones(2))
-    assert (found > 1e-10) == wrong  # the limit of `psa check`

@@ -1,9 +1,6 @@
 """The voltage's reversal as an event: located by an importer, harmless where nobody looks."""
 
-import ctypes
-import itertools
-from ctypes import c_bool, c_double, c_size_t
-from typing import Literal
+from ctypes import c_double, c_size_t
 
 import fmpy
 import numpy as np
@@ -12,10 +9,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, OK, Fmu
+from psa_casadi.export.importer.fmu import ERROR, MODEL_EXCHANGE, OK, Fmu
 from tests import fmi3_instances as fmi3
 from tests.fmu_models import exported, model_named
-from tests.tiers import slow, slow_but
+from tests.tiers import slow
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -52,22 +49,6 @@ def test_indicator_is_the_rate_of_the_voltage_in_fmi_2() -> None:
         assert "1 event indicators" in instance.messages[-1]
         assert instance.call("GetEventIndicators", None, c_size_t(1)) == ERROR
         assert instance.call("EnterEventMode") == OK
-
-
-def test_indicator_is_the_rate_of_the_voltage_in_fmi_3() -> None:
-    with fmi3.Instance3(fmi3.loaded(STACK), MODEL_EXCHANGE) as instance:
-        instance.start({"u": 30.0, "voltage": 50.0})
-        z = instance.vector("GetEventIndicators", 1)
-        assert z[0] == pytest.approx(_rate(30.0, 50.0) + _margin(), rel=1e-12)
-        assert instance.get([SWITCH])[0] == z[0]
-        assert instance.try_set({SWITCH: 0.0}) == ERROR
-        instance.require("EnterEventMode")
-        assert instance.update_discrete_states() == [False] * 5
-        instance.require("EnterContinuousTimeMode")
-        nothing = (c_double * 1)()
-        assert instance.call("GetEventIndicators", nothing, c_size_t(0)) == ERROR
-        flags = [c_bool(True), c_bool(True)]
-        instance.require("CompletedIntegratorStep", True, *(ctypes.byref(f) for f in flags))
 
 
 def test_indicator_faces_the_other_way_after_an_event_and_noise_makes_none() -> None:
@@ -132,63 +113,3 @@ def test_importer_locates_reversals_where_they_are(fmi: int) -> None:
     turns = CORNERS[1:-1] + values["R_s"] * values["C_p"] * np.log(2.0)
     assert len(events) == len(turns) == 3
     assert np.abs(events - turns).max() < 0.01 * values["R_s"] * values["C_p"]
-
-
-def _path(times: FloatArray) -> FloatArray:
-    """Return the displacement at times, by tight co-simulation with the input's slope."""
-    grid = np.union1d(times, CORNERS)
-    found = [0.0]
-    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION, tolerance=1e-9) as slave:
-        for begin, end in itertools.pairwise(grid):
-            low, high = np.interp([begin, end], CORNERS, VOLTS)
-            slave.set({"voltage": float(low)})
-            slave.set_rates({"voltage": float((high - low) / (end - begin))})
-            slave.step(float(begin), float(end - begin))
-            found.append(float(slave.get(["displacement"])[0]))
-    return np.interp(times, grid, found)
-
-
-@pytest.mark.parametrize("method", ["Radau", "LSODA", "RK23"])
-def test_loose_solver_without_events_is_right_too(
-    method: Literal["Radau", "LSODA", "RK23"],
-) -> None:
-    tolerance, end = 1e-3, float(CORNERS[-1])
-    times = np.linspace(0.0, end, 201)
-    with Fmu(exported(STACK)) as fmu, fmu.start(MODEL_EXCHANGE) as instance:
-        states = fmu.states()
-
-        def slope(time: float, x: FloatArray) -> FloatArray:
-            return instance.derivatives(
-                time, x, {"voltage": float(np.interp(time, CORNERS, VOLTS))}
-            )
-
-        nominal = np.array([fmu.nominals[n] for n in states])
-        solved = solve_ivp(
-            slope, (0.0, end), np.zeros(len(states)), method=method, t_eval=times,
-            rtol=tolerance, atol=tolerance * nominal, max_step=1e-3,
-        )  # fmt: skip
-        found = []
-        for time, x in zip(times, solved.y.T, strict=True):
-            slope(float(time), x)
-            found.append(float(instance.get(["displacement"])[0]))
-    truth = _path(times)
-    assert np.abs(np.array(found) - truth).max() < 10.0 * tolerance * np.ptp(truth)
-
-
-@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
-def test_fmpy_integrates_a_moving_voltage_at_the_default_tolerance(fmi: int) -> None:
-    """fmpy 0.3.32 moves the input in the root function only; the events bear that."""
-    time = np.linspace(0.0, 0.05, 2001)
-    signal = np.zeros(len(time), dtype=[("time", "f8"), ("voltage", "f8"), ("load_force", "f8")])
-    signal["time"], signal["voltage"] = time, 30.0 * (1.0 - np.cos(2.0 * np.pi * 50.0 * time))
-    found = {
-        kind: fmpy.simulate_fmu(
-            str(exported(STACK, fmi)), fmi_type=kind, input=signal, output=["displacement"],
-            stop_time=0.05, output_interval=5e-5,
-        )
-        for kind in ("CoSimulation", "ModelExchange")
-    }  # fmt: skip
-    path, other = found["ModelExchange"], found["CoSimulation"]
-    assert np.count_nonzero(np.diff(path["time"]) == 0.0) == 4
-    expected = np.interp(path["time"], other["time"], other["displacement"])
-    assert np.abs(path["displacement"] - expected).max() < 0.02 * np.ptp(expected)

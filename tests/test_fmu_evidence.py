@@ -1,41 +1,32 @@
-"""The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them."""
+"""The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them.
+
+And what an FMU says outside of what the records behind its model have shown.
+"""
 
 import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
+from psa_casadi.components.outputs import OUTPUT
+from psa_casadi.effects import EFFECTS
 from psa_casadi.export.check.evidence import repeated
 from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.fmu import evidence
+from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
 from psa_casadi.export.fmu.reference_run import FOLDER
-from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
+from psa_casadi.export.importer.masters import Signals, communicate
+from psa_casadi.variables import Interval
 from tests.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
 from tests.fmu_models import assert_valid
-
-
-def test_the_manifest_tells_the_role_of_every_file_of_evidence() -> None:
-    found = files_inside(evident_fmu())
-    root = ET.fromstring(found[f"{FOLDER}/fmi-ls-manifest.xml"])
-    roles = {}
-    for related in root:
-        source = related.attrib["source"]
-        place = source.removeprefix("../../") if source.startswith("..") else f"{FOLDER}/{source}"
-        assert place in found
-        roles[place] = related.attrib["role"]
-    assert roles[evidence.PAGE] == "report"
-    assert roles[evidence.META_DATA] == "meta-data"
-    assert roles[evidence.VALIDATION] == "experiment/validation"
-    assert roles[evidence.UNCERTAINTY] == "experiment/uncertainty-analysis"
-    assert roles[evidence.START] == roles[f"{evidence.SETS}/mean.ssv"] == "parameter"
-    assert {n for n in found if n.startswith("extra/")} - set(roles) == {
-        f"{FOLDER}/fmi-ls-manifest.xml"
-    }
+from tests.tiers import slow, slow_but
 
 
 def test_experiments_name_files_that_are_there() -> None:
@@ -78,14 +69,6 @@ def test_meta_data_and_page_say_the_same() -> None:
     assert "../documentation/evidence.html" in found["documentation/index.html"].decode()
 
 
-def test_meta_data_say_who_publishes_the_model() -> None:
-    by = psa.Publication(author="A. N. Other", version="2.1", license="CC BY 4.0")
-    root = ET.fromstring(evidence.meta_data(replace(evident_model(), publication=by)))
-    assert {n: root.attrib[n] for n in ("author", "fileversion", "license", "version")} == {
-        "author": "A. N. Other", "fileversion": "2.1", "license": "CC BY 4.0", "version": "1.0.0",
-    }  # fmt: skip
-
-
 def test_parameter_sets_are_as_their_schema_has_them() -> None:
     found = files_inside(evident_fmu())
     sets = [n for n in found if n.endswith(".ssv")]
@@ -124,16 +107,6 @@ def test_what_a_person_says_of_a_record_stays_text() -> None:
     assert f"{name}, sha256" in read
 
 
-def test_a_file_is_no_folder_for_sets(tmp_path: Path) -> None:
-    place = tmp_path / "taken"
-    place.write_text("")
-    line = f"export fmu --stack demo -o {tmp_path / 'm.fmu'} --sets-to {place}"
-    said = CliRunner().invoke(app, line.split())  # ends before anything is compiled
-    assert said.exit_code != 0
-    assert not (tmp_path / "m.fmu").exists()
-    assert "name a folder for the parameter sets" in " ".join(said.output.split())
-
-
 @pytest.mark.slow
 def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) -> None:
     psa.save_model(evident_model(), tmp_path / "m.json")
@@ -151,3 +124,69 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
         assert isinstance(playback, Playback)
         assert playback.output == "measured_displacement"
         assert played_again(fmu, playback).figure < 1e-4
+
+
+_SAID = "From here on the results are extrapolated."
+
+
+def messages(
+    fmi: int, peak: float, duration: float, *, start: float = 0.0, steps: int = 100
+) -> tuple[list[str], np.ndarray]:
+    """Return what an FMU says of a triangle, and the output, in co-simulation."""
+    times = start + np.linspace(0.0, duration, steps + 1)
+    volts = peak * (1.0 - np.abs(np.linspace(-1.0, 1.0, steps + 1)))
+    inputs = Signals(("voltage",), times, volts[:, None])
+    with Fmu(evident_fmu(fmi)) as fmu, fmu.start(CO_SIMULATION, start_time=start) as instance:
+        found = communicate(instance, times, inputs, [OUTPUT])
+        return [m for m in instance.messages if _SAID in m], found[:, 0]
+
+
+@pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
+def test_inside_nothing_is_said(fmi: int) -> None:
+    said, outside = messages(fmi, 75.0, 0.5, start=1e3)
+    assert said == []
+    assert np.all(outside == 0.0)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
+    said, outside = messages(fmi, 120.0, 0.6)
+    (line,) = said
+    assert line.startswith("voltage is 7")
+    seen = evident_model().evidence
+    assert seen is not None
+    high = seen.seen.voltage.high
+    assert f"from {seen.seen.voltage.low:.6g} to {high:.6g}." in line
+    beyond = (120.0 - high) / (high - seen.seen.voltage.low) - 0.01
+    assert np.max(outside) == pytest.approx(beyond, abs=2e-3)
+    assert outside[0] == outside[-1] == 0.0
+
+
+@slow
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
+    said, outside = messages(fmi, 75.0, 0.01)
+    assert len(said) == 1
+    assert said[0].startswith("The rate per second of voltage is 1")
+    assert np.max(outside) > 1.0
+    said, outside = messages(fmi, 75.0, 0.8)
+    assert len(said) == 1
+    assert said[0].startswith("The time since the start is 0.64")
+    assert np.all(outside == 0.0)
+
+
+def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
+    model = evident_model()
+    assert model.evidence is not None
+    seen = replace(model.evidence.seen, temperature=Interval(290.0, 300.0))
+    told = replace(model.evidence, seen=seen)
+    assert "seen_temperature_low" not in with_validity(replace(model, evidence=told)).values
+    warm = replace(model.with_effect(EFFECTS["temperature"]), evidence=told)
+    watched = with_validity(warm)
+    column = watched.output_names.index(OUTPUT)
+    x = [q.start for q in watched.structure.states]
+    for kelvins, outside in ((295.0, 0.0), (300.05, 0.0), (310.0, 0.99), (285.0, 0.49)):
+        u = [kelvins if n == "temperature" else 0.0 for n in watched.input_names]
+        y = watched.structure.f(0.0, x, u, watched.parameter_vector())[1]
+        assert float(y[column]) == pytest.approx(outside, abs=1e-12)
+    assert seen_inputs(watched)[watched.input_names.index("temperature")] == (290.0, 300.0, np.inf)

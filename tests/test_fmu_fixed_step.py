@@ -9,13 +9,11 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
-from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, played_inputs
+from psa_casadi.export.fixed_step.probe import VOLTAGES
 from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, STRICT
@@ -67,14 +65,6 @@ def simulated(every: int = 1, hold: str = "linear") -> FloatArray:
 def test_communication_steps_are_one_step_or_several(every: int) -> None:
     """FMI 2 passes on the slope of the inputs."""
     assert error(played(2, every), simulated(every)) <= 5e-5
-
-
-@slow
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_held_inputs_hold(fmi: int) -> None:
-    found = played(fmi, 5, held=True)
-    assert error(found, simulated(5, "zero")) <= 2e-4
-    assert error(found, simulated(5)) > 1e-2
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
@@ -169,22 +159,6 @@ def test_what_has_no_fixed_step_is_refused(
     assert not (tmp_path / "fixed.fmu").exists()
 
 
-@slow
-def test_the_command_wants_both_options_or_neither(tmp_path: Path) -> None:
-    base = ["export", "fmu", "--stack", "P-885.51", "-o", str(tmp_path / "fixed.fmu")]
-    for options in (["--solver", "fixed"], ["--step", "10us"]):
-        done = CliRunner().invoke(app, [*base, *options])
-        assert done.exit_code != 0
-        assert not (tmp_path / "fixed.fmu").exists()
-    done = CliRunner().invoke(app, [*base, "--solver", "fixed", "--step", "10us"])
-    assert done.exit_code == 0, done.output
-    assert "step: 1e-05 s, 1 substep, double precision" in done.output
-    with zipfile.ZipFile(tmp_path / "fixed.fmu") as archive:
-        told = json.loads(archive.read(FIXED_ENTRY))
-    assert set(told["errors"]) == set(VOLTAGES)
-    assert all(f"{error:.1e}" in done.output for error in told["errors"].values())
-
-
 @cache
 def archived(fmi: int) -> bytes:
     """Return the file of an FMU of a stack with a fixed step."""
@@ -242,27 +216,3 @@ def test_the_check_notices_smaller_errors_than_there_are(tmp_path: Path) -> None
         write_archive(tmp_path / "c.fmu", {**entries, FIXED_ENTRY: nothing})
         with pytest.raises(psa.InputError, match=r"fixed_step\.json.*xport the FMU again"):
             psa.check_fmu(tmp_path / "c.fmu")
-
-
-@slow
-def test_the_check_of_another_part_with_a_fixed_step(tmp_path: Path) -> None:
-    path = psa.export_fmu(psa.part_model("flexure_stage"), tmp_path / "flexure.fmu", step=STEP)
-    report = psa.check_fmu(path)
-    assert report.passed, report.failures
-
-
-@slow
-def test_an_importer_that_holds_inputs_is_told_its_own_errors(tmp_path: Path) -> None:
-    """FMI 3.0 has no way to move them: what a jump within a step leaves is twice as much there."""
-    moved, held = (told(written(fmi, tmp_path)) for fmi in (2, 3))
-    assert held["jumps"] > 1.5 * moved["jumps"]
-    assert held["sine"] > 5.0 * moved["sine"]
-    u = played_inputs(stack("P-885.51").plant(), VOLTAGES["jumps"][1](np.linspace(0, 1, STEPS + 1)))
-    times = STEP * np.arange(STEPS + 1, dtype=np.float64)
-    signals = Signals(("voltage",), times, u[:, :1], held=True)
-    found = co_simulate(exported(3), times, signals, ("displacement",))[:, 0]
-    model = stack("P-885.51").plant()
-    true = psa.simulate(model, times, u[:, 0], as_exported=True, rtol=1e-9, hold="zero")
-    assert error(found, np.asarray(true.outputs["displacement"])) == pytest.approx(
-        held["jumps"], rel=0.06
-    )

@@ -2,27 +2,18 @@
 
 import time
 from ctypes import c_bool
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from fmpy import simulate_fmu
 
-from psa_casadi.component import Component, Equations
-from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.check.agreement import truth_of
-from psa_casadi.export.check.structure import settled_start_error
-from psa_casadi.export.common.variable_table import START_VOLTAGE, variable_table
+from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
 from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
-from psa_casadi.reference import simulate as reference
-from psa_casadi.simulation.simulate import settled_at, simulate
+from psa_casadi.simulation.simulate import settled_at
 from psa_casadi.simulation.start import start_state
-from psa_casadi.variables import Parameter, State
 from tests.fmi3_instances import Instance3
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow
@@ -102,42 +93,6 @@ def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage:
             assert instance.directional(["displacement"], [START_VOLTAGE], [1.0])[0] == 0.0
 
 
-def test_it_stays_there_and_is_where_the_papers_equations_lead() -> None:
-    """The reference rises from 0 V to 60 V in 1 s and waits for 20 ms."""
-    model, t = model_named(STACK).plant(), np.array([0.0, 1.0, 1.02])
-    true = reference(
-        model.values, lambda s: 60.0 * min(s, 1.0), t, load_force=lambda _: 0.0,
-        breakpoints=[0.0, 1.0, 1.02], rtol=1e-9,
-    ).displacement[-1]  # fmt: skip
-    with Fmu(exported(STACK)) as fmu:
-        with fmu.start(CO_SIMULATION, values={START_VOLTAGE: 60.0}) as slave:
-            begun = slave.get(["displacement"])[0]
-            slave.step(0.0, 0.02)
-            stayed = slave.get(["displacement"])[0]
-        with fmu.start(CO_SIMULATION) as slave:
-            slave.set({"voltage": 60.0})
-            slave.step(0.0, 0.02)
-            stepped = slave.get(["displacement"])[0]
-    assert abs(begun - true) < 2e-4 * true
-    assert abs(stayed - begun) < 1e-9 * true
-    assert abs(stepped - true) > 5e-3 * true  # a step overshoots, which hysteresis remembers
-
-
-@pytest.mark.parametrize(
-    ("fmi", "how"),
-    [(2, {"fmi_type": "CoSimulation"}), (3, {"fmi_type": "ModelExchange", "solver": "CVode"})],
-)
-def test_fmpy_sets_it(fmi: int, how: dict[str, str]) -> None:
-    held = settled_at(model_named(STACK).plant(), 60.0)
-    true = simulate(held, [0.0, 1e-3], [60.0, 60.0]).displacement
-    found = simulate_fmu(
-        str(exported(STACK, fmi)), stop_time=1e-3, output=["displacement"],
-        start_values={START_VOLTAGE: 60.0}, **how,
-    )["displacement"]  # fmt: skip
-    assert np.max(np.abs(found - true[0])) < 1e-8 * true[0]
-    assert len(found) > 2
-
-
 @BOTH
 def test_what_is_set_by_itself_stays_whatever_the_order(fmi: int) -> None:
     """States and the voltage; parameters and other inputs count as they are at the end."""
@@ -205,17 +160,6 @@ def test_a_voltage_without_a_settled_state_is_an_error_soon(voltage: float) -> N
         assert time.perf_counter() - begin < 5.0
 
 
-def test_a_fixed_step_begins_there_too() -> None:
-    model = model_named(STACK).plant()
-    with temporary_folder() as folder:
-        fmu = Fmu(export_fmu(model, folder / "fixed.fmu", step=1e-5))
-    with fmu, fmu.start(CO_SIMULATION, values={START_VOLTAGE: 60.0}) as slave:
-        assert apart(fmu, slave, settled(model, 60.0) | {"voltage": 60.0}) < 1e-8
-        begun = slave.get(["displacement"])[0]
-        slave.step(0.0, 1e-3)
-        assert slave.get(["displacement"])[0] == pytest.approx(begun, rel=1e-9)
-
-
 @slow
 def test_memories_that_relax_and_bent_effects_settle_as_in_the_model() -> None:
     model = model_named(STACK).plant()
@@ -228,33 +172,3 @@ def test_memories_that_relax_and_bent_effects_settle_as_in_the_model() -> None:
         for voltage in (60.0, 100.0):
             with fmu.start(CO_SIMULATION, values={START_VOLTAGE: voltage}) as slave:
                 assert apart(fmu, slave, settled(model, voltage)) < 1e-6
-
-
-def test_only_a_model_with_a_voltage_that_does_not_sample_has_it() -> None:
-    def has(model: Model) -> bool:
-        return START_VOLTAGE in (v.name for v in variable_table(model))
-
-    assert has(model_named(STACK))
-    assert not has(model_named("flexure"))
-    counter = Component(
-        name="counter", description="counts its samples", source="this test",
-        parameters=(Parameter("T_s", 1e-3, "s", (1e-6, 1.0), "sample period"),),
-        sampled=(State("samples", "1", "samples taken", nominal=1.0),), sample_period="T_s",
-        equations=lambda s: Equations(next={"samples": s.samples + 1.0}),
-    )  # fmt: skip
-    assert not has(model_named(STACK).with_components((*BASE, counter)))
-    assert START_VOLTAGE in documentation(model_named(STACK))
-    assert START_VOLTAGE not in documentation(model_named("flexure"))
-
-
-def test_the_check_notices_another_settled_start() -> None:
-    model = model_named(STACK).plant()
-    truth = truth_of(model, 2)
-    assert truth.settled_starts is not None
-    force, size = truth.settled_starts["f_H"]
-    assert abs(force) > 0.01 * size
-    with Fmu(exported(STACK)) as fmu:
-        assert settled_start_error(fmu, truth) < 1e-8
-        assert settled_start_error(fmu, replace(truth, start_voltage=61.0)) > 1e-3
-        stays = {**truth.settled_starts, "f_H": (0.0, size)}
-        assert settled_start_error(fmu, replace(truth, settled_starts=stays)) > 1e-3

@@ -1,5 +1,6 @@
 """Composition, values, and MODEL.json."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,13 +10,11 @@ import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.components.stack import LINEAR_FORCE
+from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file import dumps, load_model, loads, save_model
-from psa_casadi.model.stacks import STACKS
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Interval, Output, Parameter, Provenance, State
@@ -50,12 +49,6 @@ def test_a_loop_of_balances_is_named() -> None:
     assert "tip_force -> tip_force;" in message(lambda: compose((*BASE, own)))
 
 
-def test_what_a_component_reads_must_be_there() -> None:
-    text = message(lambda: compose((LINEAR_FORCE,)))
-    assert "'linear_force'" in text
-    assert "'u'" in text
-
-
 def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
     state = State("z", "m", "a state", 1.0)
     bare = component(
@@ -76,13 +69,6 @@ def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
 def test_a_name_belongs_to_one_component(name: str) -> None:
     twice = component(lambda _: Equations(), parameters=(gain_of(name),))
     assert f"Two components declare '{name}'" in message(lambda: compose((*BASE, twice)))
-
-
-def test_names_of_balances_and_time_are_taken() -> None:
-    taken = component(lambda _: Equations(), parameters=(gain_of("time"), gain_of("tip_force")))
-    text = message(lambda: compose((*BASE, taken)))
-    assert "declares 'time'" in text
-    assert "declares 'tip_force'" in text
 
 
 def test_every_bad_value_is_named_at_once() -> None:
@@ -110,20 +96,6 @@ def test_effects_come_and_go_without_a_trace() -> None:
     back = extended.without(["slow_creep", "offset_drift"])
     assert back.structure is base.structure
     assert back.values == base.values
-
-
-def test_the_plant_has_no_sensor() -> None:
-    model = compose((*BASE, *EFFECTS.values()), {"creep_gain": 0.02})
-    plant = model.plant()
-    assert {c.belongs_to for c in plant.components} == {"plant", "drive"}
-    assert "measured_displacement" not in plant.output_names
-    assert not {"sensor_delay", "drift_rate"} & set(plant.parameter_names)
-    assert plant.values["creep_gain"] == 0.02
-    point = model.state_nominals()
-    kept = [model.state_names.index(n) for n in plant.state_names]
-    whole = model.structure.f(1.0, point, [50.0, 10.0, 293.15], model.parameter_vector())
-    part = plant.structure.f(1.0, point[kept], [50.0, 10.0], plant.parameter_vector())
-    assert np.array_equal(np.array(whole[0])[kept], np.array(part[0]))
 
 
 @pytest.mark.parametrize("name", slow_but([n for n in SETS if n != "all"], SETS))
@@ -169,11 +141,43 @@ def test_model_file_round_trip_is_exact(components: tuple[Component, ...], tmp_p
     assert dumps(read) == path.read_text(encoding="utf-8") == dumps(model)
 
 
-@pytest.mark.parametrize("name", sorted(STACKS))
-def test_named_stacks_round_trip(name: str) -> None:
-    model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()}, name=name)
-    assert loads(dumps(model)).values == model.values
-    assert set(model.values) == set(STACKS[name].values)
+def changed(change: Callable[[dict[str, Any]], object]) -> str:
+    content = json.loads(dumps(identified()))
+    change(content)
+    return message(lambda: loads(json.dumps(content), "m.json"))
+
+
+def test_each_mistake_in_a_file_is_named() -> None:
+    parameters = "parameters"
+    cases: dict[str, Callable[[dict[str, Any]], object]] = {
+        "its format is 'x/2', expected 'psa_casadi.model/1'": lambda c: c.update(format="x/2"),
+        "'components' is missing": lambda c: c.pop("components"),
+        "unknown name 'engine' in components": lambda c: c["components"].append("engine"),
+        "unknown name [1] in effects": lambda c: c["effects"].append([1]),
+        "unknown name 'slow_creep' in components": lambda c: c["components"].append("slow_creep"),
+        "Two components declare 'k_L'": lambda c: c["components"].append("linear_force"),
+        "'parameters' is missing": lambda c: c.pop(parameters),
+        "parameter 'k_L' [N/V] has no value": lambda c: c[parameters].pop("k_L"),
+        "'tau' is 'fast'": lambda c: c[parameters]["tau"].update(value="fast"),
+        "'m_P' is True": lambda c: c[parameters]["m_P"].update(value=True),
+        "'tau' is given in 'ms'; convert it to 's'": lambda c: c[parameters]["tau"].update(
+            unit="ms"
+        ),
+        "'n' is 17 1, outside its bounds": lambda c: c[parameters]["n"].update(value=17),
+        "NaN is no number": lambda c: c[parameters]["n"].update(value=float("nan")),
+        "unknown parameters ['warp']": lambda c: c[parameters].update(warp={"value": 1}),
+        "interval of 'n' is [1]": lambda c: c[parameters]["n"].update(interval=[1]),
+        "'identified_from' must list": lambda c: c.update(identified_from=[{"record": "a"}]),
+        "'notes' is 'one'": lambda c: c.update(notes="one"),
+        "'name' is 3": lambda c: c.update(name=3),
+        "'u'": lambda c: c["components"].remove("drive") or [
+            c[parameters].pop(n) for n in ("G", "R_s", "C_p", "u_rated")
+        ],
+    }  # fmt: skip
+    for expected, change in cases.items():
+        text = changed(change)
+        assert expected in text, text
+        assert all(line.startswith("m.json") for line in text.splitlines())
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"x"', "null"])
@@ -186,14 +190,3 @@ def test_a_file_that_cannot_be_read_says_so(tmp_path: Path) -> None:
     assert "cannot be read" in message(lambda: load_model(path))
     path.write_bytes(b"\xff\xfe\x00")
     assert "cannot be read" in message(lambda: load_model(path))
-
-
-def test_a_component_that_is_no_stack_composes_alone() -> None:
-    model = compose((COMPONENTS["flexure"],), name="flexure")
-    assert model.output_names == ("reaction_force", "stage_position")
-    rate, outputs = model.structure.f(0.0, [1e-6, 0.0], [3e-6, 0.0], model.parameter_vector())
-    force = model.values["k_c"] * 2e-6
-    assert float(outputs[0]) == pytest.approx(-force, rel=1e-12)
-    assert float(rate[1]) * model.values["m_f"] == pytest.approx(
-        force - model.values["k_f"] * 1e-6, rel=1e-12
-    )

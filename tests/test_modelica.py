@@ -1,22 +1,30 @@
+"""The Modelica package: its text, its refusals, the acausal stack in a circuit."""
+
 import difflib
 import re
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.component import Component, Equations
-from psa_casadi.components import BASE
+from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.modelica.package import class_names, export_modelica, modelica_text
+from psa_casadi.export.modelica.package import export_modelica, modelica_text, reciprocal
 from psa_casadi.model.compose import compose
 from psa_casadi.model.ode_model import ode_model
-from psa_casadi.model.parts import part_model
-from psa_casadi.model.stacks import stack_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output, Parameter, State
+from tests.modelica_runs import load, model_named, simulated, text_of
+from tests.modelica_stub import STUB
+from tests.tiers import slow_but
 
 _GOLDEN = Path(__file__).parent / "golden" / "P-885.51.mo"
 _ACCEPT = "psa export modelica --stack P-885.51 -o tests/golden/P-885.51.mo"
@@ -47,51 +55,6 @@ def test_every_balance_and_state_has_one_equation_and_is_declared_once() -> None
         assert equations.count(f"der({name}) =") == 1, name
     for parameter in model.structure.parameters:
         assert f'parameter Real {parameter.name}(unit="{parameter.unit}"' in declared
-
-
-def test_declarations_carry_units_bounds_starts_and_usual_sizes() -> None:
-    text = modelica_text(stack_model("P-885.51"))
-    assert (
-        'parameter Real C_p(unit="F", displayUnit="uF", min=1e-10, max=0.01) = 1.5e-06'
-        ' "capacitance of the stack";'
-    ) in text
-    assert 'input Real voltage(unit="V", start=0.0, nominal=120.0) ' in text
-    assert (
-        'Real x(unit="m", displayUnit="um", start=0.0, fixed=true, nominal=2.1e-05)'
-        ' "displacement of the output mass";'
-    ) in text
-    assert "Yang and Zhu 2015, eqs. 4 and 5" in text
-
-
-def test_equations_are_short_and_speak_the_models_words() -> None:
-    text = modelica_text(stack_model("P-885.51"))
-    for line in (
-        "drive_current = (drive_voltage - u)/R_s; // drive",
-        "free_force = k_L*u + f_H; // linear_force, bouc_wen",
-        "der(v_y) = (wafer_force - transmitted_force)/m_P;",
-        "velocity = der(x);",
-    ):
-        assert f"    {line}\n" in text
-
-
-def test_the_sensor_stays_out_unless_it_is_wanted() -> None:
-    model = stack_model("P-885.51").with_effect(EFFECTS["sensor_lag"])
-    assert "sensor_lag" not in modelica_text(model)
-    assert "sensor_lag_time" in modelica_text(model, include_sensor=True)
-
-
-def test_the_same_model_gives_the_same_text() -> None:
-    first = modelica_text(compose((*BASE, *EFFECTS.values())))
-    assert modelica_text(compose((*BASE, *EFFECTS.values()))) == first
-
-
-def test_classes_are_those_in_the_text() -> None:
-    model = stack_model("P-885.51").plant()
-    text = modelica_text(model)
-    assert class_names(model) == ("Signal", "Acausal", "Examples.Sine", "Examples.Wired")
-    for name in class_names(model):
-        assert f"model {name.rpartition('.')[2]} " in text
-        assert f"end {name.rpartition('.')[2]};" in text
 
 
 def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> Component:
@@ -161,24 +124,6 @@ def test_the_command_writes_the_package_and_says_what_is_in_it(tmp_path: Path) -
     assert path.read_text(encoding="utf-8") == modelica_text(stack_model("P-885.51"))
 
 
-def test_the_command_refuses_an_impossible_name(tmp_path: Path) -> None:
-    arguments = ["export", "modelica", "--stack", "P-885.51", "--name", "end"]
-    result = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "x.mo")])
-    assert result.exit_code == 2
-    assert "'end' cannot name a Modelica package" in result.output
-
-
-def test_a_stack_has_a_stacks_icon_and_everything_else_a_plain_one() -> None:
-    stack, amplifier = (
-        modelica_text(m) for m in (stack_model("P-885.51"), part_model("voltage_amplifier"))
-    )
-    assert "extends Icons.Stack;" in stack
-    assert "Icons.Block" not in stack
-    assert "extends Icons.Block;" in amplifier
-    assert "partial model Block" in amplifier
-    assert "Stack" not in amplifier.replace("PiezoStack", "")
-
-
 @pytest.mark.parametrize(("start", "rests"), [(0.0, True), (2.0, True), (1.0, False)])
 def test_the_text_says_whether_the_states_rest_at_the_start(start: float, rests: bool) -> None:
     """x' = x (2 - x) rests at 0 and at 2."""
@@ -188,3 +133,134 @@ def test_the_text_says_whether_the_states_rest_at_the_start(start: float, rests:
     text = modelica_text(model)
     assert ("states start at rest." in text) == rests
     assert ("states start at their start values" in text) != rests
+
+
+FloatArray = NDArray[np.float64]
+
+_WIRED = "PiezoStack.Examples.Wired"
+
+
+def _value(text: str, part: str, name: str) -> float:
+    """Return what the example gives a parameter of one of its parts."""
+    example = text.split("model Wired")[1]
+    found = example.split(f" {part}(")[1].split(f"{name}=")[1]
+    return float(found.split(",")[0].split(")")[0])
+
+
+def _by_hand(p: dict[str, float], text: str, t: FloatArray) -> FloatArray:
+    """Return displacement, mass position and current, from equations written out here.
+
+    The load's spring and damper pull at the stack's output, the bonding layers at the wafers.
+    """
+    amplitude, frequency = _value(text, "source", "V"), _value(text, "source", "f")
+    c, d = _value(text, "springDamper", "c"), _value(text, "springDamper", "d")
+    m = _value(text, "mass", "m")
+
+    def current(time: float, u: float) -> float:
+        source = amplitude * (1.0 - np.cos(2.0 * np.pi * frequency * time))
+        return float(source - u) / p["R_s"]
+
+    def rates(time: float, state: FloatArray) -> list[float]:
+        u, f_H, f_out, y, v_y, x, v_x, s, v = state
+        rate = current(time, u) / p["C_p"]
+        sign = rate / np.hypot(rate, p["hold_rate"])
+        power = (abs(f_H) / p["h_ref"]) ** p["n"]
+        bend = p["beta"] * rate * sign * np.sign(f_H) * power + p["gamma"] * rate * power
+        pull = p["c_B"] * (v_x - v_y) + p["k_B"] * (x - y)
+        load = c * (s - x) + d * (v - v_x)
+        return [
+            rate,
+            p["A"] * rate - bend + p["delta"] * u * sign,
+            (p["k_L"] * u + f_H - f_out) / p["tau"],
+            v_y,
+            (f_out + pull - p["c_P"] * v_y - p["k_P"] * y) / p["m_P"],
+            v_x,
+            (load - pull) / p["m_B"],
+            v,
+            -load / m,
+        ]
+
+    size = np.array([100.0, 100.0, 1e3, 1e-5, 1e-2, 1e-5, 1e-2, 1e-5, 1e-2])
+    span = (0.0, float(t[-1]))
+    found = solve_ivp(rates, span, np.zeros(9), "Radau", t, rtol=1e-10, atol=1e-12 * size)
+    drawn = np.array([current(time, u) for time, u in zip(t, found.y[0], strict=True)])
+    return np.array([found.y[5], found.y[7], drawn])
+
+
+@pytest.mark.parametrize("name", slow_but(["P-885.51"], ["P-885.51", "WYDS0808020"]))
+def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
+    model = stack_model(name)
+    text = modelica_text(model)
+    span = float(text.split("model Wired")[1].split("StopTime=")[1].split(",")[0])
+    got = simulated(STUB + text, _WIRED, span, rtol=1e-10)
+    t = got["time"]
+    expected = _by_hand(dict(model.values), text, t)
+    for values, name_of_it in zip(
+        expected, ("stack.displacement", "mass.s", "stack.current"), strict=True
+    ):
+        assert np.abs(got[name_of_it] - values).max() < 1e-6 * np.ptp(values), name_of_it
+
+
+@pytest.mark.parametrize(
+    "name",
+    slow_but(["P-885.51", "slow_creep", "every_effect"], [*STACKS, *EFFECTS, "every_effect"]),
+)
+def test_every_wired_example_is_a_balanced_system(name: str) -> None:
+    model = load(STUB + text_of(name), _WIRED)
+    structure = model.structure()
+    assert structure.is_balanced
+    assert structure.is_matched
+
+
+def test_the_reaction_is_there_whatever_the_gain_of_the_model() -> None:
+    assert "final parameter Real reciprocal_gain" in text_of("P-885.51")
+    model = model_named("reciprocal_coupling")
+    assert model.values["reciprocal_gain"] == 0.25
+    signal, acausal = modelica_text(model).split("  model Acausal")
+    assert "max=1.2) = 0.25" in signal
+    assert "max=1.2) = 1.0" in acausal
+    assert "reciprocal_gain = 1, action and reaction" in acausal
+
+
+def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
+    """The stage between a spring to the ground and a position that is given."""
+    text = modelica_text(compose([COMPONENTS["flexure"]], name="flexure"), name="Stage")
+    bench = """
+    model Mover
+      Modelica.Mechanics.Translational.Interfaces.Flange_b flange_b;
+      Real s(start=0, fixed=true);
+    equation
+      der(s) = 1e-4;
+      flange_b.s = s;
+    end Mover;
+    model Bench
+      Stage.Acausal stage;
+      Mover mover;
+    equation
+      connect(mover.flange_b, stage.flange_a);
+    end Bench;
+    """
+    got = simulated(STUB + text + bench, "Bench", 0.05, rtol=1e-10)
+    contact = 5e7 * (got["mover.s"] - got["stage.x_f"]) + 500.0 * (1e-4 - got["stage.v_f"])
+    np.testing.assert_allclose(got["stage.flange_a.f"], contact, rtol=1e-6, atol=1e-9)
+    # slow motion: contact and flexure are springs in series, but for the damper's drag
+    drag = 50.0 * got["stage.v_f"][-1]
+    assert contact[-1] == pytest.approx(5e6 * got["stage.x_f"][-1] + drag, rel=1e-3)
+
+
+def test_scaled_forces_give_the_free_stroke_of_the_cascade() -> None:
+    """What the documentation of `Acausal` says about its stroke."""
+    model = stack_model("P-885.51")
+    p = model.values
+    scale = (p["k_P"] + p["k_B"]) / p["k_B"]
+    assert f"{1 / scale:.4g} times that of the cascade" in modelica_text(model)
+    forces = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
+    scaled = reciprocal(model.with_values({n: scale * p[n] for n in forces}))
+    t = np.linspace(0.0, 1.0, 101)
+    u = np.column_stack([60.0 * np.minimum(2 * t, 1.0), np.zeros(101)])
+    ends = [
+        run(m, t, u, np.zeros(len(m.state_names)), rtol=1e-9).x[-1, m.state_names.index("x")]
+        for m in (model, scaled, reciprocal(model))
+    ]
+    assert ends[1] == pytest.approx(ends[0], rel=1e-6)
+    assert ends[2] == pytest.approx(ends[0] / scale, rel=1e-6)

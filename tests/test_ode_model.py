@@ -61,12 +61,6 @@ def test_the_oscillator_runs_in_a_modelica_compiler() -> None:
     assert load(text, "VanDerPol.Examples.Free") is not None
 
 
-@pytest.mark.usefixtures("code_runs_here")
-def test_the_oscillators_fmu_passes_the_check() -> None:
-    failed = [row for row in psa.check_fmu(_oscillator(2), van_der_pol()).rows if not row.passed]
-    assert not failed
-
-
 def _heated() -> psa.Model:
     """A rod that a current heats, in a room whose temperature swings by the day of 60 s."""
     T, T2 = ca.MX.sym("T"), ca.MX.sym("T2")
@@ -117,16 +111,6 @@ def test_inputs_outputs_parameters_and_time_against_scipy(tmp_path: Path) -> Non
     assert (described["T"].start, described["lag"].start) == ("1.0", "4.0")
 
 
-def test_the_same_equations_in_modelica() -> None:
-    text = modelica_text(_heated(), name="Rod")
-    found = simulated(text + "model H Rod.Signal rod(current=2.0); end H;", "H", 30.0)
-    expected = solve_ivp(
-        lambda t, z: _heated_rates(t, z, 2.0), (0.0, 30.0), [1.0, 0.0], method="DOP853",
-        rtol=1e-12, atol=1e-12, t_eval=found["time"],
-    ).y[0]  # fmt: skip
-    assert found["rod.heat"] == pytest.approx(2.0 * expected, abs=1e-5)
-
-
 def test_a_function_of_casadi_is_an_ode_too() -> None:
     x, u, k = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("k")
     rates = ca.vertcat(x[1], u - k * x[0])
@@ -157,12 +141,6 @@ def test_a_kink_that_is_named_is_met_with_care_and_is_an_event_of_the_fmu() -> N
     assert fine < min(0.5 * rough, 1e-4)
     assert [v.name for v in variable_table(aware) if v.kind == "indicator"] == ["switch.kink"]
     assert not [v for v in variable_table(blind) if v.kind == "indicator"]
-
-
-def test_a_model_of_ones_own_is_not_saved_and_says_why(tmp_path: Path) -> None:
-    with pytest.raises(psa.InputError, match=r"'van_der_pol' cannot be saved.*export.*as an FMU"):
-        psa.save_model(van_der_pol(), tmp_path / "model.json")
-    assert not list(tmp_path.iterdir())
 
 
 X, K = ca.SX.sym("x"), ca.SX.sym("k")
@@ -229,9 +207,3 @@ def test_what_is_wrong_is_said_in_a_sentence(what: str) -> None:
     for problem in caught.value.problems:
         assert problem.endswith(".")
         assert len(problem) > 30
-
-
-def test_all_mistakes_are_told_at_once() -> None:
-    with pytest.raises(psa.InputError) as caught:
-        psa.ode_model({"x": X, "p": K, "ode": K * X}, name="1st", states=["a b"])
-    assert len(caught.value.problems) == 3

@@ -11,9 +11,7 @@ from psa_casadi.design.online.recursive_least_squares import OnlineIdentificatio
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.simulation.stepper import run
 from tests.modelica_runs import simulated
 from tests.online_numpy import TRACKED, NumpyIdentification
 from tests.tiers import slow_but
@@ -63,20 +61,6 @@ def test_standstill_teaches_nothing_and_winds_nothing_up() -> None:
     assert after.uncertainty == before.uncertainty
 
 
-def test_uncertainty_stays_below_its_start_however_poor_the_voltage() -> None:
-    """A voltage that creeps excites one direction only; without a bound P would explode."""
-    values = dict(identifier_for(stack_model(STACK), PERIOD, noise=NOISE, memory=0.01).values)
-    values["standstill_rate"] = 0.0
-    online, draw = OnlineIdentification(values), np.random.default_rng(2)
-    u = np.cumsum(np.full(8000, 2e-3))
-    for voltage, error in zip(u.tolist(), draw.normal(size=u.size).tolist(), strict=True):
-        online.step(voltage, 1.4e-7 * voltage + 1e-8 * error)
-    found = online.estimate
-    assert max(found.uncertainty.values()) <= 1.0 + 1e-12
-    assert min(found.uncertainty.values()) > 0.0
-    assert all(np.isfinite(v) for v in found.parameters.values())
-
-
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
     model = identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
@@ -94,17 +78,6 @@ def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
             found = online.estimate.parameters
             expected = [*(found[name] for name in TRACKED), force]
             assert instance.get(names) == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-def test_model_simulates_as_the_stream_and_is_kept_in_a_file() -> None:
-    model = identifier_for(off_values(stack_model(STACK), 0.1, 1), PERIOD, noise=NOISE)
-    assert dict(loads(dumps(model)).values) == dict(model.values)
-    d, online = record(), OnlineIdentification(model.values)
-    inputs = np.column_stack([d.voltage, d.displacement])[:120]
-    steps = run(model, d.time[:120], inputs, np.zeros(len(model.state_names)), rtol=1e-6)
-    force = [online.step(u, x) for u, x in inputs.tolist()]
-    at = model.output_names.index("hysteresis_force")
-    assert steps.y[:, at] == pytest.approx(np.array(force), rel=1e-8, abs=1e-9)
 
 
 def test_modelica_block_gives_what_the_stream_gives() -> None:

@@ -5,19 +5,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model import own_effects as place
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.own_effects import declaration_hash, known_effects, own_effects
-from psa_casadi.records.record import Record
 
 RIPPLE = """
 import casadi as ca
@@ -70,26 +65,6 @@ def extended(ripple: Component) -> psa.Model:
     return psa.stack_model("P-885.51").with_effect(ripple, {"ripple": 5e-8})
 
 
-def recorded(model: psa.Model) -> Record:
-    """Loops of several amplitudes on the model, with 3 nm of noise."""
-    t = np.linspace(0.0, 2.999, 3000, dtype=np.float64)
-    v = (
-        50.0
-        * (1.0 - np.cos(2.0 * np.pi * t))
-        * np.interp(t, [0.0, 1.0, 2.0, 3.0], [1, 0.6, 0.9, 0.3])
-    )
-    x = psa.simulate(model, t, v).displacement
-    noise = 3e-9 * np.random.default_rng(3).standard_normal(len(t))
-    return Record(name="loops", time=t, voltage=v, displacement=x + noise)
-
-
-def test_a_search_names_it_beside_those_of_the_package(ripple: Component) -> None:
-    table = [ripple, EFFECTS["sensor_lag"], EFFECTS["slow_creep"], EFFECTS["sensor_nonlinearity"]]
-    d = diagnose([recorded(extended(ripple))], effects=table)
-    assert [c.effect for c in d.causes] == ["encoder_ripple"]
-    assert d.model.values["ripple"] == pytest.approx(5e-8, rel=0.1)
-
-
 def test_the_file_names_the_module_and_reading_it_needs_that(ripple: Component) -> None:
     text = dumps(extended(ripple))
     assert '"module": "gratings"' in text
@@ -112,19 +87,6 @@ def test_a_declaration_that_has_changed_is_refused(ripple: Component, tmp_path: 
     other = own_effects("gratings")["encoder_ripple"]
     with pytest.raises(psa.InputError, match="declared in another way"):
         loads(text, effects=[other])
-
-
-def test_the_command_line_takes_a_module(ripple: Component, tmp_path: Path) -> None:
-    psa.save_model(extended(ripple), "model.json")
-    t = 1e-3 * np.arange(50.0)
-    psa.write_record("volts.csv", {"time [s]": t, "voltage [V]": 1e3 * t})
-    arguments = ["simulate", "--model", "model.json", "--input", "volts.csv", "-o", "out.csv"]
-    refused = CliRunner().invoke(app, arguments)
-    assert refused.exit_code == 2
-    assert "--effects gratings" in refused.output
-    done = CliRunner().invoke(app, [*arguments, "--effects", "gratings"])
-    assert done.exit_code == 0, done.output
-    assert (tmp_path / "out.csv").is_file()
 
 
 @pytest.mark.slow

@@ -1,24 +1,34 @@
-"""The parts around a stack, against formulas, the reference and plain recursions."""
+"""The parts around a stack, against formulas, the reference and plain recursions.
+
+And each as FMU 2 and 3 and in Modelica, by Python and by name.
+"""
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from typer.testing import CliRunner
 
 from psa_casadi import reference
+from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import PARTS, compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import nominal_value
 from tests.benchmarks.nonlinearity import Controller, simulate_positioner
+from tests.modelica_runs import simulated
 from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
@@ -52,31 +62,6 @@ def _two_periods(frequency: float) -> tuple[FloatArray, FloatArray, NDArray[np.b
     """Return times, a sine from 0 to 1 that starts at rest, and which samples are the second."""
     t = np.linspace(0.0, 2.0 / frequency, 801)
     return t, 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * t)), t >= 1.0 / frequency
-
-
-@pytest.mark.parametrize("name", PARTS)
-def test_a_part_goes_through_its_file(name: str) -> None:
-    model = part_model(name)
-    again = loads(dumps(model))
-    assert (again.values, again.name) == (model.values, model.name)
-    assert again.components == model.components
-
-
-def test_a_part_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(InputError, match="voltage_amplifier"):
-        part_model("voltage")
-    with pytest.raises(InputError, match="no parameter 'speed'"):
-        part_model("voltage_amplifier", speed=1.0)
-
-
-def test_the_compensator_knows_the_force_that_the_reference_has() -> None:
-    """Estimated force against f_H of the plain reference, which is driven by the same voltage."""
-    t, wave, _ = _two_periods(20.0)
-    compensator = compensator_for(stack_model(STACK))
-    found = _driven(compensator, t, command=80.0 * wave)
-    plant = reference.simulate(VALUES, _smooth(t, found["compensated_command"]), t, rtol=1e-8)
-    size = np.ptp(plant.states["f_H"])
-    assert np.abs(found["hysteresis_force"] - plant.states["f_H"]).max() < 2e-5 * size
 
 
 def test_the_compensator_makes_the_reference_linear() -> None:
@@ -117,11 +102,6 @@ def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gai
         errors.append(np.abs(found["stack_f_out"] - ideal)[last].max() / np.ptp(ideal))
     assert errors[0] < 1e-3
     assert errors[1] > 1e-2
-
-
-def test_a_compensator_needs_a_stack() -> None:
-    with pytest.raises(InputError, match="has no drive, linear_force, bouc_wen"):
-        compensator_for(part_model("flexure_stage"))
 
 
 def test_the_voltage_amplifier_has_bandwidth_range_and_slew_rate() -> None:
@@ -171,17 +151,6 @@ def test_the_charge_amplifier_sets_voltage_below_its_corner_and_charge_above() -
         assert abs(1e3 * (in_phase + 1j * quadrature) - expected) < 2e-3 * abs(expected)
 
 
-def test_a_charge_drive_does_not_linearise_this_model() -> None:
-    """The model's hysteresis is between voltage and force, its capacitance is linear."""
-    t, wave, last = _two_periods(10.0)
-    by_charge = _driven(_charge_drive(), t, amplifier_command=8.0 * wave)["stack_displacement"]
-    by_voltage = _driven(stack_model(STACK).plant(), t, voltage=80.0 * wave)["displacement"]
-    with_charge, with_voltage = (
-        _line_deviation(wave[last], d[last]) for d in (by_charge, by_voltage)
-    )
-    assert with_charge > 0.9 * with_voltage > 0.02
-
-
 def _closed_on(model: Model, reference_m: Callable[[float], float], count: int) -> FloatArray:
     """Return the commands of a controller whose plant is a fixed gain of 1 um/V, by the model."""
     names = model.state_names, model.sampled_names
@@ -217,18 +186,6 @@ def test_the_controller_is_the_recursion_of_a_textbook() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_anti_windup_shortens_the_way_back() -> None:
-    """After 2 ms out of reach the position is back at once; without it, later."""
-    late = {}
-    for share in (0.0, 1.0):
-        model = part_model("position_controller", anti_windup=share, integral_gain=3e8,
-                           proportional_gain=1e5)  # fmt: skip
-        commands = _closed_on(model, lambda t: 50e-6 if t < 2e-3 else 5e-6, 200)
-        late[share] = int(np.flatnonzero(commands[40:] < 11.9)[0])
-    assert late[1.0] <= 1
-    assert late[0.0] > 10
-
-
 def test_the_plain_loop_has_the_reference_s_stack() -> None:
     """With a stage that does not push back, the benchmark's stack moves as the reference's does."""
     system = nanopositioner(compensated=False)
@@ -243,3 +200,60 @@ def test_the_plain_loop_has_the_reference_s_stack() -> None:
     plant = reference.simulate(VALUES, voltage, found.time, rtol=1e-8)
     assert np.ptp(plant.displacement) > 5e-6
     np.testing.assert_allclose(found.tip, plant.displacement, atol=1e-4 * np.ptp(found.tip))
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: part_model("voltage"), "voltage_amplifier"),
+        (lambda: part_model("voltage_amplifier", speed=1.0), "no parameter 'speed'"),
+        (lambda: compensator_for(part_model("flexure_stage")), "no drive, linear_force, bouc_wen"),
+    ],
+)
+def test_what_is_no_part_of_a_stack_is_refused(made: Callable[[], Model], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        made()
+
+
+@slow
+@pytest.mark.usefixtures("code_runs_here")
+@pytest.mark.parametrize(("name", "fmi"), [(n, 2 + k % 2) for k, n in enumerate(PARTS)])
+def test_a_part_passes_the_check_as_an_fmu(name: str, fmi: int, tmp_path: Path) -> None:
+    path = export_fmu(part_model(name), tmp_path / f"{name}.fmu", fmi=fmi)
+    report = check_fmu(path, part_model(name))
+    assert report.passed, report
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_is_the_same_in_modelica(name: str) -> None:
+    """The first input is a sine of half its usual size, the others rest; all outputs."""
+    model = part_model(name)
+    text = modelica_text(model, name="Part")
+    first, *others = model.structure.inputs
+    peak = 0.5 * nominal_value(first.nominal, model.values)
+    span, omega = 2e-3, 2.0 * math.pi * 1e3
+    rest = "".join(f", {i.name}={i.start!r}" for i in others)
+    harness = (
+        f"model Harness Part.Signal part({first.name}={peak!r}*(1 - cos({omega!r}*time)){rest});"
+        " end Harness;"
+    )
+    got = simulated(text + harness, "Harness", span)
+    t = np.linspace(0.0, span, 4001)
+    u = np.tile([i.start for i in model.structure.inputs], (len(t), 1))
+    u[:, 0] = peak * (1.0 - np.cos(omega * t))
+    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
+    names = (*model.state_names, *model.output_names)
+    between = slice(40, None, 100)  # between two sample instants, where rumoca has points
+    for variable, wanted in zip(names, np.hstack([steps.x, steps.y]).T, strict=True):
+        at = np.interp(t[between], got["time"], got[f"part.{variable}"])
+        error = np.abs(at - wanted[between]).max()
+        assert error < 1e-4 * max(np.ptp(wanted), 1e-12), variable
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_is_exported_by_its_name(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "part.mo"
+    result = CliRunner().invoke(app, ["export", "modelica", "--part", name, "-o", str(path)])
+    assert result.exit_code == 0, result.stderr
+    assert path.read_text(encoding="utf-8") == modelica_text(part_model(name))
+    assert f"inside: {', '.join(PARTS[name].components)}" in result.stdout

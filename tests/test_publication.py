@@ -15,10 +15,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.export.ssp.archive import export_ssp
 from psa_casadi.model.model_file import dumps, loads, save_model
-from psa_casadi.model.system import System
 from psa_casadi.variables import Publication
 from tests.fmu_models import assert_valid, entries, exported, model_named, rewritten
 from tests.tiers import slow_but
@@ -97,31 +94,3 @@ def test_a_licence_that_was_lost_is_found(tmp_path: Path) -> None:
     unsaid = {"modelDescription.xml": lambda xml: re.sub(rb' license="[^"]*"', b"", xml)}
     with Archive(rewritten(exported("flexure", 2), path, unsaid)) as archive:
         assert list(missing_notices(archive)) == ["the description states no license"]
-
-
-def test_a_modelica_package_states_them() -> None:
-    text = modelica_text(replace(model_named("flexure"), publication=SAID))
-    assert ', version="1.2", uses(' in text
-    assert "author: A. Author; version: 1.2; copyright: (c) 2026 A. Author &amp; sons" in text
-
-
-@pytest.mark.usefixtures("without_binary")
-def test_a_system_and_its_parts_state_them(tmp_path: Path) -> None:
-    """A part that states its own keeps it."""
-    own = replace(model_named("flexure"), publication=Publication(author="another"))
-    system = System("pair", {"one": own, "two": model_named("flexure")}, (),
-                    {"push": "one.tip_position"}, {"out": "two.stage_position"})  # fmt: skip
-    path = export_ssp(system, tmp_path / "pair.ssp", publication=SAID)
-    with zipfile.ZipFile(path) as archive:
-        ssd = archive.read("SystemStructure.ssd").decode()
-        authors = {}
-        for name in ("one", "two"):
-            (tmp_path / name).write_bytes(archive.read(f"resources/{name}.fmu"))
-            with zipfile.ZipFile(tmp_path / name) as part:
-                root = ET.fromstring(part.read("modelDescription.xml"))
-                authors[name] = root.attrib["author"]
-    assert_valid(ssd, "ssp", "schema", "SystemStructureDescription.xsd")
-    found = ET.fromstring(ssd).attrib
-    names = ("author", "fileversion", "copyright", "license")
-    assert [found[n] for n in names] == list(SAID.stated.values())
-    assert authors == {"one": "another", "two": SAID.author}

@@ -2,25 +2,17 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, time_grid
-from psa_casadi.records.split import whole
+from psa_casadi.records import time_grid
 from psa_casadi.simulation.simulate import simulate
-from tests.benchmarks.verification_cases import two_masses as two_linear_masses
 from tests.plants.base import Run, simulate_base
-from tests.plants.reciprocal_coupling import matrices, two_masses
+from tests.plants.reciprocal_coupling import two_masses
 from tests.plants.stack import Stack
 from tests.random_models import random_model, random_point
 from tests.stack_models import LINEAR, PAPER_STACKS, jacobian, stack
-
-FloatArray = NDArray[np.float64]
 
 EFFECT = EFFECTS["reciprocal_coupling"]
 FASTEST = 1e-7
@@ -92,30 +84,6 @@ def test_a_step_is_that_of_two_masses_with_action_and_reaction(name: str) -> Non
     assert np.abs(truth - ratio * run.displacement).max() > 2e-3 * size
 
 
-def test_the_two_plants_agree_on_voltage_and_load() -> None:
-    """The benchmark's own two masses against the tests', without hysteresis."""
-    s = plant("PTBS200", **LINEAR)
-    time = time_grid(1e-3, 1e-6)
-    voltage = np.where(time > 2e-4, 100.0, 0.0)
-    load = 400.0 * np.sin(3e4 * time)
-    p = {key: figure.value for key, figure in STACKS["PTBS200"].values.items()}
-    ours = two_masses(simulate_base(s, time, voltage, 16), load)
-    assert np.ptp(ours) > 3e-6
-    np.testing.assert_allclose(
-        two_linear_masses(p, time, voltage, load), ours, rtol=0, atol=2e-5 * np.ptp(ours)
-    )
-
-
-def test_the_tests_plant_is_newtonian() -> None:
-    """Its matrices are symmetric and its poles those of the symmetric eigenvalue problem."""
-    mass, damping, stiffness = matrices(plant("PTBS200"))
-    for matrix in (mass, damping, stiffness):
-        assert np.array_equal(matrix, matrix.T)
-        assert np.all(np.linalg.eigvalsh(matrix) > 0.0)
-    # a rigid shift of both masses strains the wafers only
-    assert np.allclose(stiffness @ [1.0, 1.0], [plant("PTBS200").k_p, 0.0])
-
-
 @pytest.mark.parametrize("gain", [0.0, 0.5, 1.0])
 def test_the_static_gain_is_what_the_equations_say(gain: float) -> None:
     """x/u = k_L (1 + (1-g) k_P/k_B) / (k_P (1 - g + g^2)): series compliance at 0, 1/k_P at 1."""
@@ -142,17 +110,6 @@ def test_the_blocked_force_holds_the_output_at_zero(name: str, gain: float) -> N
     assert np.abs(held.displacement).max() < 1e-4 * np.ptp(free.displacement)
     same = held.outputs["blocked_force"]
     np.testing.assert_allclose(same, force, rtol=0, atol=1e-4 * np.ptp(force))
-
-
-def test_the_blocked_force_at_rest_is_stiffness_times_free_stroke() -> None:
-    model = reciprocal("P-885.51", 1.0, **LINEAR)
-    p = model.values
-    time = time_grid(4e-3, 2e-6)
-    run = simulate(model, time, np.where(time > 0.0, 100.0, 0.0), from_rest_at_zero=True)
-    series = p["k_P"] * p["k_B"] / (p["k_P"] + p["k_B"])
-    assert run.outputs["blocked_force"][-1] == pytest.approx(
-        series * run.displacement[-1], rel=1e-5
-    )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -192,35 +149,3 @@ def test_energy_is_only_lost_in_the_dampers() -> None:
         assert free[-1] < 0.9 * free[0]
     assert grown[1.0] < 1e-8
     assert grown[0.0] > 1e-3
-
-
-@pytest.mark.parametrize("truth", [0.0, 1.0])
-def test_data_can_ask_for_it(truth: float) -> None:
-    """Where masses and stiffnesses are known, voltage and load tell the gain to a few percent."""
-    run = driven("PTBS200", 1.5e-3, 1500)
-    load = 300.0 * np.sin(np.clip(4e4 * (run.times - 1e-3), 0.0, None))
-    if truth == 1.0:
-        x = two_masses(run, load)
-    else:
-        x = simulate(
-            stack("PTBS200"), run.times, run.command, load_force=load, from_rest_at_zero=True
-        ).displacement
-    sigma = 1e-3 * float(np.ptp(x))
-    noisy = x + sigma * np.random.default_rng(4).standard_normal(len(x))
-    record = Record(
-        name="pushed", time=run.times, voltage=run.command, displacement=noisy, load_force=load
-    )
-    free = ["k_L", "tau", "c_P", "c_B", "reciprocal_gain"]
-    starts = [reciprocal("PTBS200", g) for g in (0.1, 0.9)]
-    fits = [fit(s, [whole(record)], free, sigma=[sigma], evaluations=80) for s in starts]
-    found = min(fits, key=lambda f: f.cost)
-    assert found.rms == pytest.approx(sigma, rel=0.05)
-    assert found.model.values["reciprocal_gain"] == pytest.approx(truth, abs=0.03)
-    assert found.model.values["k_L"] == pytest.approx(stack("PTBS200").values["k_L"], rel=0.02)
-
-
-def test_one_mass_has_nothing_to_be_reciprocal_with() -> None:
-    with pytest.raises(InputError) as caught:
-        compose((*SIMPLIFIED, EFFECT))
-    assert "'reciprocal_coupling' cannot be composed: no symbol named 'c_B'" in str(caught.value)
-    assert compose((*BASE, EFFECT)).values["reciprocal_gain"] == 0.0

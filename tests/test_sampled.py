@@ -1,17 +1,33 @@
-"""Sampled states: their declaration, and simulation against an independent recursion."""
+"""Sampled states: their declaration, simulation, FMUs and Modelica, against plain recursions."""
 
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 
+import fmpy
 import numpy as np
 import pytest
+import rumoca
 
-from psa_casadi.component import Component, Equations
+from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.errors import InputError
-from psa_casadi.model.compose import compose
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.simulation.start import start_state
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.importer.fmu import (
+    CO_SIMULATION,
+    DISCARD,
+    ERROR,
+    MODEL_EXCHANGE,
+    Fmu,
+    FmuError,
+    Instance,
+)
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
+from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Parameter, State
+from psa_casadi.variables import Input, Output, Parameter, State
+from tests.modelica_runs import load
+from tests.sampled_fmus import exported
 from tests.sampled_models import (
     ALONE,
     CONTROLLER,
@@ -23,6 +39,7 @@ from tests.sampled_models import (
     grid,
     loop,
 )
+from tests.tiers import slow_but
 
 #: Times whose steps divide the period, do not divide it, exceed it, and start between instants.
 GRIDS = {
@@ -72,25 +89,6 @@ def test_a_model_of_sampled_states_only() -> None:
         rows.append([integral, command])
     assert steps.x.shape == (41, 0)
     assert np.abs(steps.z - np.array(rows)).max() < 1e-14
-
-
-def test_another_period_is_another_clock() -> None:
-    times = np.linspace(0.0, 0.01, 101)
-    slow = run(loop().with_values({"T_s": 2e-3}), times, inputs(times, 0.0), np.zeros(1))
-    changes = times[1:][np.diff(slow.z[:, 1]) != 0.0]
-    assert changes == pytest.approx([2e-3, 4e-3, 6e-3, 8e-3, 1e-2])
-
-
-def test_functions_take_the_sampled_states() -> None:
-    s = loop().structure
-    p = loop().parameter_vector()
-    xdot, y = s.f(0.0, 0.5, [0.1, 1.0], p, [0.2, 0.7])
-    assert float(xdot) == pytest.approx((2.0 * 0.8 - 0.5) / 4e-3)
-    assert np.array(y).ravel() == pytest.approx([0.5, 0.7])
-    assert np.array(s.g(0.0, 0.5, [0.1, 1.0], p, [0.2, 0.7])).ravel() == pytest.approx(
-        [0.2 + 150.0 * 1e-3 * 0.5, 0.2 + 0.6 * 0.5]
-    )
-    assert stack_model("P-885.51").structure.f.n_in() == 4
 
 
 def test_balances_in_next_are_those_before_the_instant() -> None:
@@ -146,20 +144,272 @@ def test_every_mistake_of_a_declaration_is_named() -> None:
         compose((PLANT, ALONE))
 
 
-def test_the_start_at_rest_holds_the_sampled_states_at_their_starts() -> None:
-    held = replace(CONTROLLER, sampled=(
-        CONTROLLER.sampled[0], replace(CONTROLLER.sampled[1], start=0.7)))  # fmt: skip
-    start = start_state(compose((PLANT, held)), [0.2, 5.0])
-    assert start.x == pytest.approx([2.0 * 0.9])
-
-
 def test_sensitivities_are_refused() -> None:
     times = grid(4, 1.0)
     with pytest.raises(InputError, match="Sensitivities of a model with sampled states"):
         run(loop(), times, inputs(times, 0.0), np.zeros(1), unknowns=["k_p"], output="shown")
 
 
-def test_wrong_starts_are_refused() -> None:
-    times = grid(4, 1.0)
-    with pytest.raises(InputError, match="array z0 has the shape"):
-        run(loop(), times, inputs(times, 0.0), np.zeros(1), z0=np.zeros(1))
+VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
+
+
+@VERSIONS
+def test_starts_of_sampled_states(fmi: int) -> None:
+    with Fmu(exported("controller", fmi)) as fmu:
+        with fmu.open(CO_SIMULATION) as slave:
+            slave.setup(values={"integral": 0.4, "command": 5.0}, start_time=0.5 * PERIOD)
+            assert slave.get(["integral", "command", "voltage"]) == pytest.approx([0.4, 5.0, 5.0])
+            with pytest.raises(FmuError, match="can be set only before the first step"):
+                slave.set({"integral": 1.0})
+            with pytest.raises(FmuError, match="'T_s' cannot be set to 0: it must be at least"):
+                slave.set({"T_s": 0.0})
+        with fmu.open(CO_SIMULATION) as slave:
+            slave.setup(values={"integral": 0.4, "command": 5.0})
+            assert slave.get(["integral", "command"]) == pytest.approx([0.4, 0.4])
+
+
+@VERSIONS
+def test_derivatives_hold_the_sampled_states(fmi: int) -> None:
+    knowns = ["reference", "command"]
+    with Fmu(exported("loop", fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
+        slave.set({"reference": 1.0})
+        rates = [slave.directional(["voltage", "der(position)"], [k], [1.0]) for k in knowns]
+        assert np.array(rates) == pytest.approx(np.array([[0.0, 0.0], [1.0, 500.0]]))
+        slave.step(0.0, 0.5 * PERIOD)
+        with pytest.raises(FmuError, match="sample instant fell into it") as refused:
+            slave.directional(["position"], ["position"], [1.0])
+        assert refused.value.status == DISCARD
+        slave.step(0.5 * PERIOD, 0.25 * PERIOD)
+        through = slave.directional(["position"], ["position"], [1.0])
+        assert through[0] == pytest.approx(np.exp(-0.25 * PERIOD / 4e-3), rel=1e-6)
+
+
+@VERSIONS
+def test_description(fmi: int) -> None:
+    described = fmpy.read_model_description(str(exported("loop", fmi)))
+    found = {v.name: v for v in described.modelVariables}
+    for name in ("integral", "command"):
+        v = found[name]
+        assert (v.causality, v.variability, v.initial) == ("local", "discrete", "exact")
+        assert (v.unit, float(v.start)) == ("V", 0.0)
+    listed = {e.variable.name: {d.name for d in e.dependencies} for e in described.outputs}
+    through = {"integral", "command"}
+    known = {"position", "reference", "k_p"}
+    assert listed == {"shown": {"position"}, "voltage": known}
+    rates = {e.variable.name: {d.name for d in e.dependencies} for e in described.derivatives}
+    assert rates == {"der(position)": {"disturbance", "gain", "lag"} | known}
+    initial = {e.variable.name: {d.name for d in e.dependencies} for e in described.initialUnknowns}
+    assert initial["voltage"] == known | through
+
+
+@pytest.mark.usefixtures("code_runs_here")
+@pytest.mark.parametrize(("name", "fmi"), slow_but([("loop", 3)], [("loop", 3), ("controller", 2)]))
+def test_check_passes(name: str, fmi: int) -> None:
+    model = loop() if name == "loop" else controller()
+    report = check_fmu(exported(name, fmi), model)
+    assert report.compared
+    assert report.failures == ()
+
+
+def test_illegal_values_leave_an_error() -> None:
+    """A sample that is not finite is a step that failed, with a sentence."""
+    with Fmu(exported("controller", 2)) as fmu, fmu.start(CO_SIMULATION) as slave:
+        slave.set({"reference": 1e308, "position": -1e308})
+        with pytest.raises(FmuError, match="sampled states cannot be evaluated") as failed:
+            slave.step(0.0, PERIOD)
+        assert failed.value.status in (DISCARD, ERROR)
+
+
+SLOPE = 30.0
+OUTPUTS = ("shown", "voltage")
+
+#: Communication steps in periods: they divide it, are it, do not divide it, exceed it.
+STEPS = pytest.mark.parametrize("step", [0.25, 1.0, 0.7, 2.5])
+
+
+def reference(slope: float) -> Signals:
+    """Return no disturbance, and a reference that starts at 1 m and rises."""
+    values = np.array([[0.0, 1.0], [0.0, 1.0 + slope]])
+    return Signals(("disturbance", "reference"), np.array([0.0, 1.0]), values)
+
+
+def error(found: FloatArray, times: FloatArray, slope: float) -> float:
+    truth = expected(times, 1.0, slope)
+    return float(np.abs(found - np.column_stack([truth.position, truth.voltage])).max())
+
+
+@VERSIONS
+@STEPS
+@pytest.mark.parametrize("start", [0.0, 3.0, 0.4])
+def test_co_simulation(fmi: int, step: float, start: float) -> None:
+    slope = SLOPE if fmi == 2 else 0.0  # FMI 3.0 has no rates of inputs
+    times = grid(round(30 / step), step, start)
+    with Fmu(exported("loop", fmi)) as fmu:
+        found = co_simulate(fmu, times, reference(slope), OUTPUTS, tolerance=1e-10)
+    assert error(found, times, slope) < 1e-9
+
+
+@VERSIONS
+@STEPS
+@pytest.mark.parametrize("start", [0.0, 0.4])
+def test_model_exchange(fmi: int, step: float, start: float) -> None:
+    times = grid(round(30 / step), step, start)
+    with Fmu(exported("loop", fmi)) as fmu:
+        found = integrate(fmu, times, reference(SLOPE), OUTPUTS, tolerance=1e-11)
+    assert error(found, times, SLOPE) < 1e-9
+
+
+@VERSIONS
+@pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
+def test_fmpy_simulates_both_interfaces(fmi: int, kind: str) -> None:
+    inputs = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], dtype=[
+        ("time", float), ("disturbance", float), ("reference", float)])  # fmt: skip
+    result = fmpy.simulate_fmu(
+        str(exported("loop", fmi)), stop_time=0.03, fmi_type=kind, relative_tolerance=1e-9,
+        output_interval=0.7e-3, step_size=0.7e-3, input=inputs, output=list(OUTPUTS),
+    )  # fmt: skip
+    last = {float(row["time"]): row for row in result}  # after the events of a time
+    times = np.array(sorted(last))
+    found = np.array([[last[float(t)][n] for n in OUTPUTS] for t in times])
+    assert len(times) > 40
+    assert error(found, times, 0.0) < 1e-6
+
+
+@VERSIONS
+def test_rollback_between_instants(fmi: int) -> None:
+    """A state taken between two instants replays the same bits, in another instance too."""
+    with Fmu(exported("loop", fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
+        slave.set({"reference": 1.0})
+        slave.step(0.0, 1.5 * PERIOD)
+        snapshot = slave.save()
+        data = slave.serialize(snapshot)
+        first = _replay(slave)
+        assert len({row[2] for row in first}) > 3  # instants fell into it
+        slave.restore(snapshot)
+        assert _replay(slave) == first
+        slave.drop(snapshot)
+        with fmu.open(CO_SIMULATION) as other:
+            copy = other.deserialize(data)
+            other.restore(copy)
+            other.drop(copy)
+            assert _replay(other) == first
+
+
+def _replay(instance: Instance) -> list[tuple[float, ...]]:
+    rows = []
+    for k in range(8):
+        instance.step((1.5 + 0.7 * k) * PERIOD, 0.7 * PERIOD)
+        rows.append(tuple(instance.get([*OUTPUTS, "command"])))
+    return rows
+
+
+@VERSIONS
+def test_time_events_of_model_exchange(fmi: int) -> None:
+    with Fmu(exported("loop", fmi)) as fmu, fmu.open(MODEL_EXCHANGE) as instance:
+        instance.setup(start_time=0.4 * PERIOD)
+        instance.update_discrete_states()
+        assert instance.next_event_time == PERIOD
+        instance.require("EnterContinuousTimeMode")
+        instance.set({"reference": 1.0})
+        instance.require("SetTime", 0.7 * PERIOD)
+        instance.require("EnterEventMode")  # of the importer, not an instant
+        instance.update_discrete_states()
+        assert instance.next_event_time == PERIOD
+        assert instance.get(["command"])[0] == 0.0
+        instance.require("EnterContinuousTimeMode")
+        instance.require("SetTime", PERIOD)
+        assert instance.get(["command"])[0] == 0.0
+        instance.require("EnterEventMode")
+        assert instance.update_discrete_states() == [False] * 4 + [True]
+        assert instance.next_event_time == 2 * PERIOD
+        assert instance.get(["command"])[0] == pytest.approx(0.6)
+        instance.set({"reference": 2.0})  # an iteration over the event
+        instance.update_discrete_states()
+        assert instance.get(["voltage"])[0] == pytest.approx(1.2)
+        instance.require("EnterContinuousTimeMode")
+        instance.set({"reference": 3.0})
+        assert instance.get(["voltage"])[0] == pytest.approx(1.2)
+        instance.set({"T_s": 0.3 * PERIOD})
+        instance.require("EnterEventMode")
+        instance.update_discrete_states()
+        assert instance.next_event_time == pytest.approx(1.2 * PERIOD)
+
+
+COUNT = 121
+
+
+def simulated(model: Model, inputs: str, names: tuple[str, ...]) -> Mapping[str, FloatArray]:
+    """Return variables of `Signal` on the grid of quarters of a period, at instants after them."""
+    harness = f"model Harness PiezoStack.Signal it({inputs}); end Harness;"
+    config = rumoca.SimConfig(solver="bdf", rtol=1e-11, atol=1e-16, dt=PERIOD / 4)
+    span = PERIOD * (COUNT - 1) / 4
+    result = load(modelica_text(model) + harness, "Harness").simulate(t=(0.0, span), config=config)
+    times = np.asarray(result.time)
+    rows = [np.flatnonzero(np.abs(times - t) < 1e-6 * PERIOD)[-1] for t in grid(COUNT, 0.25)]
+    return {n: np.asarray(result[f"it.{n}"])[rows] for n in names}
+
+
+def test_rumoca_follows_the_exact_recursion() -> None:
+    names = ("position", "voltage", "integral", "command")
+    found = simulated(loop(), "disturbance=0, reference=1.0 + 30.0*time", names)
+    truth = expected(grid(COUNT, 0.25), 1.0, 30.0)
+    columns = (truth.position, truth.voltage, truth.z[:, 0], truth.z[:, 1])
+    for name, column in zip(names, columns, strict=True):
+        assert np.abs(found[name] - column).max() < 1e-8, name
+
+
+def _shared() -> Model:
+    """Return a model whose next values share a long part, and read a balance that they move."""
+
+    def equations(s: Symbols) -> Equations:
+        part = _long_part(s)
+        return Equations(
+            add={"displacement": s.first + s.level},
+            der={"level": (s.push - s.level) / 5e-3},
+            next={
+                "first": 0.3 * part + 0.1 * s.displacement,
+                "second": 0.2 * part * part - 0.5 * s.second,
+            },
+            out={"shown": s.displacement},
+        )
+
+    return compose(
+        [
+            Component(
+                name="shared",
+                description="next values that share a part",
+                source="none",
+                parameters=(Parameter("T_s", PERIOD, "s", (1e-6, 1.0), "sample period"),),
+                states=(State("level", "m", "level", nominal=1.0),),
+                sampled=(
+                    State("first", "m", "first", nominal=1.0, start=0.2),
+                    State("second", "m", "second", nominal=1.0),
+                ),
+                sample_period="T_s",
+                inputs=(Input("push", "m", "push", nominal=1.0),),
+                outputs=(Output("shown", "m", "displacement"),),
+                equations=equations,
+            )
+        ]
+    )
+
+
+def _long_part(s: Symbols) -> Expression:
+    x, z, w = s.level, s.first, s.second
+    return (x - z) / (1.0 + (x + 2.0 * z) ** 2 + 0.3 * w**2) + 0.1 * z
+
+
+def test_shared_parts_and_balances_have_their_values_before_the_instant() -> None:
+    model = _shared()
+    text = modelica_text(model)
+    clause = text.partition("when sample(0, T_s) then")[2].partition("end when;")[0]
+    assert re.search(r"shared_part = .*pre\(first\)", clause)
+    assert "discrete Real shared_part(start=0.0, fixed=true)" in text
+    assert "displacement" not in clause
+    found = simulated(model, "push=1.0 - 30.0*time", ("first", "second", "shown"))
+    times = grid(COUNT, 0.25)
+    steps = run(model, times, (1.0 - 30.0 * times)[:, None], np.zeros(1), rtol=1e-12)
+    for name, column in (("first", steps.z[:, 0]), ("second", steps.z[:, 1])):
+        assert np.abs(found[name] - column).max() < 1e-8, name
+    assert np.abs(found["shown"] - steps.y[:, 0]).max() < 1e-8
+    assert np.ptp(steps.z[:, 0]) > 0.1

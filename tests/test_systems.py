@@ -23,8 +23,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output
-from tests.benchmarks import nonlinearity
-from tests.benchmarks.nonlinearity import picture, simulate_positioner
+from tests.benchmarks.nonlinearity import simulate_positioner
 from tests.modelica_runs import simulated
 from tests.tiers import slow
 
@@ -68,14 +67,6 @@ def test_a_connected_model_has_the_equations_of_its_parts() -> None:
             np.testing.assert_allclose(np.array(found).ravel(), wanted, rtol=1e-13)
 
 
-def test_an_input_without_wire_and_name_rests_at_its_start() -> None:
-    stage = part_model("flexure_stage")
-    model = connect({"gain": _gain("gain"), "stage": stage}, (), name="m", inputs={})
-    assert model.input_names == ()
-    out = model.structure.f(0.0, [0.0, 0.0], [], model.parameter_vector())[1]
-    assert float(out[model.output_names.index("gain_out")]) == 0.5
-
-
 def test_every_mistake_in_the_wires_is_told_at_once() -> None:
     parts = {"a": _gain("a"), "b": _gain("b"), "c": _gain("c", unit="m")}
     wires = (("a.out", "b.into"), ("b.out", "b.into"), ("c.out", "a.into"), ("a.there", "c.into"),
@@ -107,14 +98,6 @@ def test_sampled_parts_of_different_periods_are_refused() -> None:
         InputError, match=r"one_sample_time = 0\.0001 s, two_sample_time = 0\.0002 s"
     ):
         connect(parts, (), name="m")
-
-
-def test_sampled_parts_share_the_period_of_the_first() -> None:
-    one = part_model("position_controller", sample_time=1e-4)
-    model = connect({"one": one, "two": one}, (), name="m")
-    assert "one_sample_time" in model.parameter_names
-    assert "two_sample_time" not in model.parameter_names
-    assert len(model.sampled_names) == 10
 
 
 def _reference(t: float) -> float:
@@ -156,29 +139,6 @@ def test_the_tuned_loop_keeps_its_margins(stack: str) -> None:
     assert found[1.6].crossover > found[1.4].crossover > 50.0
 
 
-def test_the_gain_margin_is_where_the_loop_becomes_unstable() -> None:
-    """Just below the margin the closed loop settles, just above it grows (simulated)."""
-    system = nanopositioner()
-    plant = positioner_plant().model()
-    controller = system.parts["controller"]
-    margin = margins_of(plant, controller, "stage_position").gain
-    late = {}
-    for factor in (0.93, 1.07):
-        p = controller.values
-        louder = controller.with_values({
-            name: margin * factor * p[name] for name in ("proportional_gain", "integral_gain")
-        } | {"feed_forward": 0.0})  # fmt: skip
-        parts = {**system.parts, "controller": louder}
-        model = connect(parts, system.wires, name="m", inputs=system.inputs)
-        t = np.arange(0.0, 0.02, 5e-5)
-        u = np.full((len(t), 1), 1e-8)
-        x = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-7).y
-        position = x[:, model.output_names.index("flexure_stage_position")]
-        late[factor] = np.ptp(position[-80:]) / np.ptp(position[40:120])
-    assert late[0.93] < 0.7
-    assert late[1.07] > 1.5
-
-
 def test_a_plant_that_cannot_be_tuned_is_refused() -> None:
     stack = stack_model("P-885.51").plant()
     with pytest.raises(InputError) as caught:
@@ -210,21 +170,3 @@ def test_the_closed_loop_is_the_same_as_fmu_and_in_modelica(tmp_path: Path) -> N
     got = simulated(text + harness, "Harness", span)
     at = np.interp(t, got["time"], got["positioner.stage_position"])
     np.testing.assert_allclose(at, wanted, atol=1e-5 * 5e-6)
-
-
-def test_the_benchmark_shows_what_the_compensator_is_worth(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """At 100 Hz, to be quick: open loop with and without; its tables and its picture."""
-    monkeypatch.setattr(nonlinearity, "FREQUENCY", 100.0)
-    with_it, without = (
-        nonlinearity.simulate_case("sine", closed=False, compensated=c, periods=1)
-        for c in (True, False)
-    )
-    assert without.nonlinearity > 0.03
-    assert with_it.nonlinearity < 0.1 * without.nonlinearity
-    assert with_it.tracking < without.tracking
-    shown = nonlinearity.tables([with_it, without])
-    assert [len(t.table.rows) for t in shown] == [2, 1, 2]
-    assert len(picture([with_it, without]).axes) == 3
-    nonlinearity.linear_run.cache_clear()

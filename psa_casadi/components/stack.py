@@ -5,7 +5,6 @@ from psa_casadi.scales import (
     charge_scale,
     current_scale,
     force_scale,
-    stop_scale,
     stroke_scale,
     velocity_scale,
     voltage_scale,
@@ -17,7 +16,8 @@ from psa_casadi.shapes import (
     signed_power,
     spectrum_force,
     spectrum_parameters,
-    stop_rate,
+    stop_rates,
+    stop_states,
 )
 from psa_casadi.variables import Input, Output, Parameter, State, Values
 
@@ -298,26 +298,11 @@ _COUNTS = (5, 3, 3)
 
 def _memory_spectrum(s: Symbols) -> Equations:
     """The hysteresis as a spectrum of elements: what stands in the place of Bouc-Wen's."""
-    elements = [getattr(s, f"z_{i + 1}") for i in range(len(_THRESHOLDS))]
+    elements, rates = stop_rates(s, "z_", [threshold * s.u_rated for threshold in _THRESHOLDS])
     return Equations(
-        der={
-            f"z_{i + 1}": stop_rate(s, z, threshold * s.u_rated)
-            for i, (z, threshold) in enumerate(zip(elements, _THRESHOLDS, strict=True))
-        },
+        der=rates,
         add={"free_force": s.k_L * spectrum_force(s, "", elements, _COUNTS)},
         switches={"voltage_reversal": s.voltage_rate},
-    )
-
-
-def _state(index: int) -> State:
-    return State(
-        f"z_{index}",
-        "V",
-        f"stop element {index}, threshold {_THRESHOLDS[index - 1]:g} of the rated voltage",
-        stop_scale,
-        memory=True,
-        settles=False,
-        whole=voltage_scale,
     )
 
 
@@ -338,6 +323,6 @@ MEMORY_SPECTRUM = Component(
         *spectrum_parameters("", _COUNTS, (-0.03,)),
         HOLD_RATE,
     ),
-    states=tuple(_state(i + 1) for i in range(len(_THRESHOLDS))),
+    states=stop_states("z_", [f"{r:g} of the rated voltage" for r in _THRESHOLDS]),
     equations=_memory_spectrum,
 )

@@ -12,6 +12,8 @@ from psa_casadi.shapes import (
     spectrum_force,
     spectrum_parameters,
     stop_rate,
+    stop_rates,
+    stop_states,
 )
 from psa_casadi.variables import Parameter, State, Values
 
@@ -129,28 +131,10 @@ _WEIGHTS = tuple(spectrum_parameters("memory_", _COUNTS, (_ORDINARY, 0.5 * _ORDI
 
 def _hysteresis_memory(s: Symbols) -> Equations:
     """Hysteresis memory: the error depends on past reversals; minor loops nest differently."""
-    elements = [getattr(s, f"z_m{i + 1}") for i in range(len(_RATIOS))]
     first = s.memory_threshold * s.u_rated
+    elements, rates = stop_rates(s, "z_m", [ratio * first for ratio in _RATIOS])
     total = spectrum_force(s, "memory_", elements, _COUNTS)
-    return Equations(
-        der={
-            f"z_m{i + 1}": stop_rate(s, z, ratio * first)
-            for i, (z, ratio) in enumerate(zip(elements, _RATIOS, strict=True))
-        },
-        add={"free_force": s.k_L * s.memory_gain * total},
-    )
-
-
-def _state(index: int) -> State:
-    return State(
-        f"z_m{index}",
-        "V",
-        f"stop element {index}, threshold {_RATIOS[index - 1]:g} times the first",
-        stop_scale,
-        memory=True,
-        settles=False,
-        whole=voltage_scale,
-    )
+    return Equations(der=rates, add={"free_force": s.k_L * s.memory_gain * total})
 
 
 HYSTERESIS_MEMORY = Component(
@@ -184,7 +168,7 @@ HYSTERESIS_MEMORY = Component(
         ),
         *_WEIGHTS,
     ),
-    states=tuple(_state(i + 1) for i in range(len(_RATIOS))),
+    states=stop_states("z_m", [f"{ratio:g} times the first" for ratio in _RATIOS]),
     equations=_hysteresis_memory,
     probe={"memory_threshold": (0.015, 0.12)},
     remedy=Remedy("undo_hysteresis", "reversal"),

@@ -11,7 +11,7 @@ import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.scales import reading_scale, static_stiffness, stroke_scale, voltage_scale
-from psa_casadi.shapes import stop_rate
+from psa_casadi.shapes import stop_rate, stop_rates
 from psa_casadi.variables import Parameter, State, Values
 
 #: Terms of a curve and of one for each direction or over time; play and stop elements; relaxations.
@@ -72,17 +72,14 @@ def _direction(s: Symbols) -> Equations:
 
 def _memory(s: Symbols) -> Equations:
     span, q = s.patch_high - s.patch_low, _place(s, s.u)
-    stops = [getattr(s, f"z_p{k + 1}") for k in range(ELEMENTS)]
+    stops, rates = stop_rates(s, "z_p", [radius(k) * span for k in range(ELEMENTS)])
     weights = _weights(s, 3 * ELEMENTS)
     each = zip(*(weights[k * ELEMENTS : (k + 1) * ELEMENTS] for k in range(3)), strict=True)
     total = 0.0
     for (plain, square, cube), z in zip(each, stops, strict=True):
         p = q - z / span
         total += plain * z / span + square * p**2 + cube * p**3
-    return Equations(
-        der={f"z_p{k + 1}": stop_rate(s, z, radius(k) * span) for k, z in enumerate(stops)},
-        add={"free_force": static_stiffness(s) * s.patch_gain * total},
-    )
+    return Equations(der=rates, add={"free_force": static_stiffness(s) * s.patch_gain * total})
 
 
 def _relaxation(s: Symbols) -> Equations:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -106,6 +107,12 @@ class Model(Celled):
                 f" ({', '.join(self.sampled_names)}); leave its sampled components out."
             )
         return {"t": s.time, "x": s.x, "u": s.u, "p": s.p, "ode": s.xdot, "y": s.y}
+
+    def at_start(self) -> list[Any]:
+        """Return the arguments of `structure.f` at the start: time, x, u, p, z if there is one."""
+        s = self.structure
+        x, u, z = ([v.start for v in group] for group in (s.states, s.inputs, s.sampled))
+        return [0.0, x, u, self.parameter_vector(), *([z] if s.sampled else [])]
 
     def parameter_vector(self) -> npt.NDArray[np.float64]:
         """Return the values as a vector, shape (np,)."""

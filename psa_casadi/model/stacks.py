@@ -136,19 +136,10 @@ WYDS0808020 = Stack(
         " the text has WYDS882 without its zeros, most likely 08 x 08 x 020 mm)"
     ),
     values={
-        "G": _given(1.0, "definition: the voltage is the one that the amplifier puts out"),
-        "R_s": _assumed(8.0, "R_s C_p = 13 us gives the paper's voltage rise of under 30 us."),
-        "C_p": _given(1.6e-6, f"{PAPER}, section 4.2: 1.6 uF"),
-        "u_rated": _given(200.0, f"{PAPER}, section 4.2: 200 V"),
-        "k_L": _assumed(10.1, "The paper's 18 um at 200 V through the assumed stiffness."),
-        **_hysteresis(10.1, 200.0),
+        **PTBS200.values,
         "tau": _assumed(2e-4, "The slowest pole: the step takes about a millisecond."),
-        "m_P": _assumed(4e-3, "0.4 of the 10 g of ceramic moves with the free end."),
         "c_P": _assumed(5500.0, "Damping ratio 2: the paper calls the stack overdamped."),
-        "k_P": _assumed(4.8e8, "Four times k_B, so that the bonding layers set the stiffness."),
-        "m_B": _assumed(7e-3, "The other share of the ceramic and an end piece of about 1 g."),
         "c_B": _assumed(5500.0, "Damping ratio 3: the paper calls the stack overdamped."),
-        "k_B": _assumed(1.2e8, "8 x 8 x 20 mm at 38 GPa; blocking force 2.2 kN."),
     },
 )
 

@@ -53,8 +53,8 @@ def plan_of(
     sources = _sources(parts, wires, problems)
     plan = Plan(
         sources,
-        _inputs(parts, inputs, sources, problems),
-        _outputs(parts, outputs, problems),
+        _named(parts, "input", inputs, sources, problems),
+        _named(parts, "output", outputs, {}, problems),
         _period(parts, problems),
     )
     problems.raise_if_any()
@@ -103,7 +103,7 @@ def _port(parts: Mapping[str, Model], text: str, kind: str, problems: Problems) 
         )
         return None
     model = parts[name]
-    known = model.output_names if kind == "output" else model.input_names
+    known = [v.name for v in _variables(model, kind)]
     if variable not in known:
         listed = ", ".join(known) or "none"
         problems.add(f"'{text}' is no {kind}; the {kind}s of '{name}' are: {listed}.")
@@ -120,50 +120,34 @@ def _same(one: str, other: str) -> bool:
     )
 
 
+def _variables(model: Model, kind: str) -> tuple[Input | Output, ...]:
+    return model.structure.inputs if kind == "input" else model.structure.outputs
+
+
 def _unit(parts: Mapping[str, Model], port: Port, kind: str) -> str:
-    s = parts[port[0]].structure
-    every: tuple[Input | Output, ...] = s.inputs if kind == "input" else s.outputs
-    return next(v.unit for v in every if v.name == port[1])
+    return next(v.unit for v in _variables(parts[port[0]], kind) if v.name == port[1])
 
 
-def _inputs(
+def _named(
     parts: Mapping[str, Model],
-    inputs: Mapping[str, str] | None,
+    kind: str,
+    given: Mapping[str, str] | None,
     sources: Mapping[Port, Port],
     problems: Problems,
 ) -> dict[Port, str]:
-    """Return the names outside of the inputs that have one."""
-    if inputs is None:
-        every = [(part, n) for part, model in parts.items() for n in model.input_names]
+    """Return the names outside of the inputs or outputs that have one; one name each."""
+    if given is None:
+        every = [(part, v.name) for part, model in parts.items() for v in _variables(model, kind)]
         return {port: "_".join(port) for port in every if port not in sources}
     found: dict[Port, str] = {}
-    for name, text in inputs.items():
-        port = _port(parts, text, "input", problems)
+    for name, text in given.items():
+        port = _port(parts, text, kind, problems)
         if port is None:
             continue
         other = port_text(sources[port]) if port in sources else found.get(port)
         if other is not None:
-            problems.add(f"The input '{text}' has two sources, '{other}' and '{name}';"
-                         " leave one out.")  # fmt: skip
-        found[port] = name
-    return found
-
-
-def _outputs(
-    parts: Mapping[str, Model], outputs: Mapping[str, str] | None, problems: Problems
-) -> dict[Port, str]:
-    """Return the names outside of the outputs that have one; one name each."""
-    if outputs is None:
-        every = [(part, n) for part, model in parts.items() for n in model.output_names]
-        return {port: "_".join(port) for port in every}
-    found: dict[Port, str] = {}
-    for name, text in outputs.items():
-        port = _port(parts, text, "output", problems)
-        if port is None:
-            continue
-        if port in found:
-            problems.add(f"The output '{text}' is named twice outside, '{found[port]}' and"
-                         f" '{name}'; leave one out.")  # fmt: skip
+            what = "has two sources," if kind == "input" else "is named twice outside,"
+            problems.add(f"The {kind} '{text}' {what} '{other}' and '{name}'; leave one out.")
         found[port] = name
     return found
 
@@ -230,7 +214,7 @@ class _Wiring:
         whole: Expression = self._wired(name, [every], ())[0]
         nx, nz = len(s.states), len(s.sampled)
         outputs = {o.name: self.output((name, o.name), ()) for o in s.outputs}
-        values = _Named(
+        values = Equations(
             der={f"{name}_{v.name}": whole[i] for i, v in enumerate(s.states)},
             next={f"{name}_{v.name}": whole[nx + i] for i, v in enumerate(s.sampled)},
             switches={f"{name}_{n}": whole[nx + nz + i] for i, n in enumerate(s.switches)},
@@ -269,7 +253,7 @@ class _Wiring:
         replaced: list[Expression] = ca.substitute(expressions, symbols, feeding)
         return replaced
 
-    def _equations(self, values: "_Named") -> Callable[[Symbols], Equations]:
+    def _equations(self, values: Equations) -> Callable[[Symbols], Equations]:
         """Return the function that gives a part's equations in the symbols of the system."""
         places = [(self.time, "time")]
         if self.plan.period is not None:
@@ -300,16 +284,6 @@ class _Wiring:
             )
 
         return equations
-
-
-@dataclass(frozen=True)
-class _Named:
-    """A part's equations by the names they have in the system, still in symbols of the parts."""
-
-    der: Mapping[str, Expression]
-    next: Mapping[str, Expression]
-    switches: Mapping[str, Expression]
-    out: Mapping[str, Expression]
 
 
 def _declared(

@@ -198,10 +198,8 @@ def _nothing(plan: CodePlan) -> list[str]:
 def _start(plan: CodePlan) -> list[tuple[str, str]]:
     """Return the fields of the state and what they start with."""
     s, literal = plan.model.structure, plan.precision.literal
-    start = [0.0, [q.start for q in s.states], [q.start for q in s.inputs]]
-    start += [plan.model.parameter_vector(), *([[q.start for q in s.sampled]] if s.sampled else [])]
     at_start = ca.Function("start", s.arguments, [plan.expression.port_start, s.znext])
-    ports, sampled = (np.array(q).ravel().tolist() for q in at_start(*start))
+    ports, sampled = (np.array(q).ravel().tolist() for q in at_start(*plan.model.at_start()))
     names = [f"port_of_{q}" for q in plan.expression.port_names]
     fields = [(q.name, literal(q.start)) for q in s.states]
     if plan.precision.single:

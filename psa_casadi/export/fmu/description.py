@@ -29,6 +29,7 @@ from psa_casadi.export.common.variable_table import (
     starts_at_voltage,
     variable_table,
 )
+from psa_casadi.export.fixed_step.export import FixedStep
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.units import parse_unit
 
@@ -147,6 +148,11 @@ _FLAGS = {
         "maxOutputDerivativeOrder": "1",
     },
 }
+#: What an FMU with a fixed step does not claim. FMI 2 has no word for multiples of a step.
+_NOT_FIXED = {
+    2: ("canHandleVariableCommunicationStepSize",),
+    3: ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"),
+}
 _CONTINUOUS = {"variability": "continuous"}
 #: Causality, variability and initial of each kind of variable; the same words in both versions.
 _CAUSALITY = {
@@ -159,15 +165,22 @@ _CAUSALITY = {
     "option": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
     "indicator": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
     "sampled": {"causality": "local", "variability": "discrete", "initial": "exact"},
+    "constant": {"causality": "local", "variability": "constant", "initial": "exact"},
 }
 
 
 def model_description(
-    model: Model, identifier: str, token: str, sources: Sequence[str] = (), fmi: int = 2
+    model: Model,
+    identifier: str,
+    token: str,
+    sources: Sequence[str] = (),
+    fmi: int = 2,
+    fixed: FixedStep | None = None,
 ) -> str:
     """Return the XML text of a version of FMI; `token` is the GUID or instantiation token.
 
-    `sources` are the C files in the folder sources. FMI 3.0 lists them in another file.
+    `sources` are the C files in the folder sources. FMI 3.0 lists them in another file. With a
+    `fixed` step there is no model exchange, and parameters are constants.
     """
     second, table = fmi == 2, variable_table(model)
     root = ET.Element(
@@ -176,7 +189,7 @@ def model_description(
             "fmiVersion": f"{fmi}.0",
             "modelName": model.name,
             "guid" if second else "instantiationToken": token,
-            "description": describe(model),
+            "description": describe(model) + (_step_words(fixed) if fixed else ""),
             **published(model),
             "generationTool": generation_tool(),
             "variableNamingConvention": "structured",
@@ -184,8 +197,13 @@ def model_description(
     )
     if second:
         root.set("numberOfEventIndicators", str(len(model.structure.switches)))
-    for tag in ("ModelExchange", "CoSimulation"):
-        interface = ET.SubElement(root, tag, {"modelIdentifier": identifier, **_FLAGS[fmi, tag]})
+    for tag in ("CoSimulation",) if fixed else ("ModelExchange", "CoSimulation"):
+        flags = {"modelIdentifier": identifier, **_FLAGS[fmi, tag]}
+        if fixed:
+            flags = {name: flag for name, flag in flags.items() if name not in _NOT_FIXED[fmi]}
+        if fixed and not second:
+            flags["fixedInternalStepSize"] = number(fixed.plan.step)
+        interface = ET.SubElement(root, tag, flags)
         files = ET.SubElement(interface, "SourceFiles") if second else interface
         for name in sorted(sources) if second else ():
             ET.SubElement(files, "File", {"name": name})
@@ -196,12 +214,24 @@ def model_description(
         ET.SubElement(categories, "Category", {"name": name, "description": meaning})
     span = default_span(model)
     experiment = {"startTime": "0", "stopTime": number(span), "tolerance": "1e-05"}
-    ET.SubElement(root, "DefaultExperiment", {**experiment, "stepSize": number(span / 1000.0)})
+    size = span / 1000.0
+    if fixed:
+        size = max(1, round(size / fixed.plan.step)) * fixed.plan.step
+    ET.SubElement(root, "DefaultExperiment", {**experiment, "stepSize": number(size)})
     variables = ET.SubElement(root, "ModelVariables")
     for reference, variable in enumerate(table, start=1):
-        _variable(variables, reference, variable, second=second)
-    _structure(ET.SubElement(root, "ModelStructure"), model, table, second=second)
+        _variable(variables, reference, variable, second=second, fixed=fixed is not None)
+    structure = ET.SubElement(root, "ModelStructure")
+    _structure(structure, model, table, second=second, fixed=fixed is not None)
     return xml_text(root)
+
+
+def _step_words(fixed: FixedStep) -> str:
+    worst = fixed.worst
+    return (
+        f" Co-simulation by a fixed step of {fixed.plan.step:g} s, of which a communication step is"
+        f" a multiple; largest error {worst.error:.1e} of the range ({worst.voltage})."
+    )
 
 
 def _units(root: ET.Element, table: Iterable[Variable]) -> None:
@@ -243,12 +273,15 @@ def _types(root: ET.Element, table: Iterable[Variable], *, second: bool) -> None
             ET.SubElement(definitions, "Float64Type", {"name": name, **declared})
 
 
-def _variable(parent: ET.Element, reference: int, it: Variable, *, second: bool) -> None:
+def _variable(
+    parent: ET.Element, reference: int, it: Variable, *, second: bool, fixed: bool
+) -> None:
+    constant = fixed and it.kind == "parameter"
     head = {
         "name": it.name,
         "valueReference": str(reference),
         "description": it.description,
-        **_CAUSALITY[it.kind],
+        **_CAUSALITY["constant" if constant else it.kind],
     }
     low, high = it.bounds or (-math.inf, math.inf)
     stated = {
@@ -260,7 +293,7 @@ def _variable(parent: ET.Element, reference: int, it: Variable, *, second: bool)
         "nominal": None if it.nominal is None else number(abs(it.nominal)),
         "start": None if it.start is None else number(it.start),
     }
-    if not second and it.kind in ("state", "derivative", "input", "output"):
+    if not (second or fixed) and it.kind in ("state", "derivative", "input", "output"):
         stated["intermediateUpdate"] = "true"
     if it.kind == "derivative":
         stated["derivative"] = str(it.index + 2)
@@ -272,7 +305,7 @@ def _variable(parent: ET.Element, reference: int, it: Variable, *, second: bool)
 
 
 def _structure(
-    parent: ET.Element, model: Model, table: Sequence[Variable], *, second: bool
+    parent: ET.Element, model: Model, table: Sequence[Variable], *, second: bool, fixed: bool
 ) -> None:
     """Append the unknowns by what they are, in the order of the standard.
 
@@ -290,14 +323,18 @@ def _structure(
             "Output": outputs,
             "ContinuousStateDerivative": rates,
             "InitialUnknown": initial,
-            "EventIndicator": indicators,
+            "EventIndicator": [] if fixed else indicators,
         }
     for tag, unknowns in groups.items():
         element = ET.SubElement(parent, tag) if second and unknowns else parent
         initially = unknowns is initial
         for unknown in unknowns:
             listed = at_start[unknown] if initially else without_sampled(found[unknown])
-            known = sorted((places[key], kind) for key, kind in listed.items())
+            known = sorted(
+                (places[key], kind)
+                for key, kind in listed.items()
+                if not (fixed and key[0] == "parameter")
+            )
             attributes = {
                 "index" if second else "valueReference": str(places[unknown]),
                 "dependencies": " ".join(str(place) for place, _ in known),

@@ -4,7 +4,6 @@ Sources: SSP Traceability 1.0 (SRMD and its place in an FMU), FMI-LS-REF 1.0.0-b
 1.0 (parameter values).
 """
 
-import html
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,10 +12,12 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.characters import check_text
 from psa_casadi.components.outputs import OUTPUT, VALIDITY, VALIDITY_WITH_TEMPERATURE
 from psa_casadi.errors import InputError
-from psa_casadi.export.common.markup import generation_tool, number, page, table_of, xml_text
+from psa_casadi.export.common.markup import generation_tool, number, xml_text
 from psa_casadi.export.common.parameter_sets import parameter_set, posterior_sets
+from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fmu.reference_run import (
     CSV,
     EXP,
@@ -82,12 +83,8 @@ def seen_duration(model: Model) -> float:
 NOT_HELD_OUT = "no sample was held out; `psa diagnose` holds some out and judges the model on them"
 
 
-@dataclass(frozen=True)
-class Said:
-    """One thing that is said: a keyword for machines, and the text."""
-
-    keyword: str
-    text: str
+#: One thing that is said: a keyword for machines, and the text.
+Said = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -99,9 +96,12 @@ class Chapter:
     said: tuple[Said, ...]
 
 
-def chapters(model: Model, evidence: Evidence) -> tuple[Chapter, ...]:
+def chapters(model: Model) -> tuple[Chapter, ...]:
     """Return what is known of a model's origin, errors, range and uncertainty."""
-    origin = Said("found by", f"{evidence.by}, psa_casadi {model.provenance.package_version}")
+    evidence = model.evidence
+    if evidence is None:
+        return ()
+    origin = ("found by", f"{evidence.by}, psa_casadi {model.provenance.package_version}")
     parts: tuple[tuple[str, str, Iterable[Said]], ...] = (
         ("origin", "Where it comes from", (origin, *_records(evidence.runs))),
         ("error", "What it errs by", _errors(evidence)),
@@ -125,27 +125,25 @@ def _records(runs: Iterable[RecordRun]) -> Iterator[Said]:
         if r.held_out_m is not None:
             count = sum(stop - first for first, stop in r.held_out)
             errors += f", {micrometres(r.held_out_m)} rms over {count} held-out ones"
-        yield Said(
-            "record", f"{r.record}, sha256 {r.sha256}: {r.samples} samples{blocks}; {errors}"
-        )
+        yield ("record", f"{r.record}, sha256 {r.sha256}: {r.samples} samples{blocks}; {errors}")
 
 
 def _errors(evidence: Evidence) -> Iterator[Said]:
-    yield Said("fitted error", f"{micrometres(evidence.fitted_m)} rms over the samples of the fit")
+    yield ("fitted error", f"{micrometres(evidence.fitted_m)} rms over the samples of the fit")
     held = evidence.held_out
     if held is None:
-        yield Said("held-out error", NOT_HELD_OUT)
+        yield ("held-out error", NOT_HELD_OUT)
     else:
         low, high = held.interval_m.low, held.interval_m.high
         over = f"{held.records} records" if held.records else "blocks of the records"
-        yield Said(
+        yield (
             "held-out error",
             f"{micrometres(held.rms_m)} rms, 95 % interval {micrometres(low)} to"
             f" {micrometres(high)} (jackknife over {over}); {held.nrmse_percent:.3g} % of the"
             f" range; at most {micrometres(held.max_m)}",
         )
     if evidence.outside:
-        yield Said(
+        yield (
             "counted with",
             f"{', '.join(evidence.outside)}: of sensor or environment, which an exported plant"
             " leaves out",
@@ -153,18 +151,18 @@ def _errors(evidence: Evidence) -> Iterator[Said]:
 
 
 def _budget(evidence: Evidence) -> Iterator[Said]:
-    yield from (Said("unnamed correction inside", text) for text in evidence.unnamed)
+    yield from (("unnamed correction inside", text) for text in evidence.unnamed)
     b = evidence.budget
     if b is None:
         return
-    yield Said("base", f"{micrometres(b.base_m)} rms above the noise, without the causes")
-    yield Said("noise", f"{micrometres(b.noise_m)} rms")
+    yield ("base", f"{micrometres(b.base_m)} rms above the noise, without the causes")
+    yield ("noise", f"{micrometres(b.noise_m)} rms")
     for effect in b.causes:
-        yield Said("effect", f"{effect.what}: {_share(effect.share, effect.interval)}")
+        yield ("effect", f"{effect.what}: {_share(effect.share, effect.interval)}")
     if b.unnamed is not None:
         share = _share(b.unnamed.share, b.unnamed.interval)
-        yield Said("unnamed correction outside", f"{b.unnamed.what}: {share}; the model lacks it")
-    yield Said(
+        yield ("unnamed correction outside", f"{b.unnamed.what}: {share}; the model lacks it")
+    yield (
         "remains", f"{micrometres(b.remains_m)} rms above the noise, {b.remains_percent:.3g} % of"
         " the range"
     )  # fmt: skip
@@ -178,11 +176,11 @@ def _share(share: float, interval: object) -> str:
 
 def _seen(evidence: Evidence) -> Iterator[Said]:
     seen = evidence.seen
-    yield Said("voltage", f"{seen.voltage.low:.6g} to {seen.voltage.high:.6g} V")
-    yield Said("rate of voltage", f"up to {seen.rate:.4g} V/s")
-    yield Said("duration", f"up to {seen.duration:.4g} s from the start of a run")
+    yield ("voltage", f"{seen.voltage.low:.6g} to {seen.voltage.high:.6g} V")
+    yield ("rate of voltage", f"up to {seen.rate:.4g} V/s")
+    yield ("duration", f"up to {seen.duration:.4g} s from the start of a run")
     warm = seen.temperature
-    yield Said(
+    yield (
         "temperature",
         "not recorded" if warm is None else f"{warm.low:.6g} to {warm.high:.6g} K",
     )
@@ -193,11 +191,11 @@ def _sure(model: Model, c: Covariance) -> Iterator[Said]:
     for k, name in enumerate(c.names):
         unit = model.parameter(name).unit
         value = f"{model.values[name]:.6g}{'' if unit == '1' else f' {unit}'}"
-        yield Said(name, f"{value}, standard error {c.matrix[k][k] ** 0.5:.3g}")
+        yield (name, f"{value}, standard error {c.matrix[k][k] ** 0.5:.3g}")
     if c.names:
-        yield Said("covariance of", " ".join(c.names))
+        yield ("covariance of", " ".join(c.names))
         for name, row in zip(c.names, c.matrix, strict=True):
-            yield Said(f"covariance.{name}", " ".join(number(v) for v in row))
+            yield (f"covariance.{name}", " ".join(number(v) for v in row))
 
 
 FloatArray = npt.NDArray[np.float64]
@@ -212,14 +210,6 @@ MEASURED, START = f"{FOLDER}/validation_measured.csv", f"{FOLDER}/validation.ssv
 
 _SRMD = "http://ssp-standard.org/SSPTraceability1/SimulationResourceMetaData"
 _STC = "http://ssp-standard.org/SSPTraceability1/SSPTraceabilityCommon"
-_PAGE_NOTE = """\
-These are statements of the model file about records that are not in this archive. With a record at
-hand, `psa check --evidence --record FILE` plays it through this FMU and tells what holds."""
-
-_PAGE_FILES = f"""\
-<code>{VALIDATION}</code> lists the run to repeat: the first part of a record, its inputs, what the
-model says of it, and what was measured. Parameter sets within the uncertainty, where the export
-made them, lie in <code>{SETS}</code>: the mean, pairs of sigma points, random samples."""
 
 
 @dataclass(frozen=True)
@@ -272,13 +262,19 @@ def set_files(model: Model, samples: int) -> dict[str, str]:
 
 def evidence_page(model: Model) -> str:
     """Return the page on a model's evidence."""
-    parts = [f"<h1>{html.escape(model.name)}: evidence</h1>", f"<p>{_PAGE_NOTE}</p>"]
-    for chapter in chapters(model, model.evidence) if model.evidence else ():
-        said = [(s.keyword, s.text) for s in chapter.said if not s.keyword.startswith("covariance")]
-        parts += [f"<h2>{html.escape(chapter.title)}</h2>", table_of(("", ""), said)]
-    parts += ["<h2>In this archive</h2>", f"<p>{_PAGE_FILES}</p>"]
-    parts.append('<p><a href="index.html">The model</a></p>')
-    return page(f"{model.name}: evidence", parts, "The page on the evidence")
+    listed = [
+        {
+            "title": chapter.title,
+            "shown": [s for s in chapter.said if not s[0].startswith("covariance")],
+        }
+        for chapter in chapters(model)
+    ]
+    text = filled(
+        "evidence.html", title=f"{model.name}: evidence", chapters=listed, validation=VALIDATION,
+        sets=SETS,
+    )  # fmt: skip
+    check_text(text, "The page on the evidence")
+    return text
 
 
 def meta_data(model: Model) -> str:
@@ -293,14 +289,12 @@ def meta_data(model: Model) -> str:
         f"{{{_SRMD}}}SimulationResourceMetaData",
         {**attributes, "generationTool": generation_tool()},
     )
-    for chapter in chapters(model, model.evidence) if model.evidence else ():
+    for chapter in chapters(model):
         kind = {"type": f"psa_casadi.{chapter.name}"}
         element = ET.SubElement(root, f"{{{_STC}}}Classification", kind)
-        for said in chapter.said:
-            entry = ET.SubElement(
-                element, f"{{{_STC}}}ClassificationEntry", {"keyword": said.keyword}
-            )
-            entry.text = said.text
+        for keyword, text in chapter.said:
+            entry = ET.SubElement(element, f"{{{_STC}}}ClassificationEntry", {"keyword": keyword})
+            entry.text = text
     return xml_text(root)
 
 

@@ -19,10 +19,9 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Expression
-from psa_casadi.export.common.markup import number, xml_text
+from psa_casadi.export.common.markup import xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
 from psa_casadi.export.common.variable_table import (
-    OPTIONS,
     Variable,
     starts_at_voltage,
     variable_table,
@@ -260,34 +259,6 @@ def fixed_sources(texts: Mapping[str, str], fixed: FixedStep) -> dict[str, str]:
     return {**texts, _HEADER: head + define + rest if end else "", _SOURCE: texts[_SOURCE] + code}
 
 
-def fixed_description(xml: str, fixed: FixedStep) -> str:
-    """Return the description of an ordinary FMU as that of one with a fixed step."""
-    root = ET.fromstring(xml)
-    step = fixed.plan.step
-    root.set(
-        "description",
-        f"{root.get('description')} Co-simulation by a fixed step of {step:g} s, of which a"
-        f" communication step is a multiple; largest error {fixed.worst.error:.1e} of the range"
-        f" ({fixed.worst.voltage}).",
-    )
-    third = root.get("fmiVersion") == "3.0"
-    exchange, stepping = root.find("ModelExchange"), root.find("CoSimulation")
-    experiment = root.find("DefaultExperiment")
-    if exchange is not None:
-        root.remove(exchange)
-    if stepping is not None and third:
-        for name in ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"):
-            stepping.attrib.pop(name, None)
-        stepping.set("fixedInternalStepSize", number(step))
-    elif stepping is not None:  # FMI 2 has no word for multiples of a step
-        stepping.attrib.pop("canHandleVariableCommunicationStepSize", None)
-    if experiment is not None:
-        steps = max(1, round(float(experiment.get("stepSize", "0")) / step))
-        experiment.set("stepSize", number(steps * step))
-    _constants(root, third=third)
-    return xml_text(root)
-
-
 def fixed_entry(fixed: FixedStep) -> bytes:
     """Return the text of `FIXED_ENTRY`; errors have two digits, as they have elsewhere."""
     errors = {e.voltage: float(f"{e.error:.1e}") for e in fixed.errors}
@@ -323,34 +294,6 @@ def fixed_step_of(directory: Path) -> float | None:
         return None
 
 
-def _constants(root: ET.Element, *, third: bool) -> None:
-    """Make constants of the parameters, on which nothing depends then."""
-    variables = root.find("ModelVariables")
-    structure = root.find("ModelStructure")
-    if variables is None or structure is None:
-        return
-    gone = set()
-    for place, variable in enumerate(variables, start=1):
-        if third:
-            variable.attrib.pop("intermediateUpdate", None)
-        if variable.get("causality") == "parameter" and variable.get("name") not in OPTIONS:
-            variable.set("causality", "local")
-            variable.set("variability", "constant")
-            variable.set("initial", "exact")
-            gone.add(str(variable.get("valueReference")) if third else str(place))
-    for indicator in structure.findall("EventIndicator"):
-        structure.remove(indicator)
-    for unknown in structure.iter():
-        if "dependencies" not in unknown.attrib:
-            continue
-        known = unknown.attrib["dependencies"].split()
-        kinds = unknown.attrib.get("dependenciesKind", "").split()
-        kept = [k for k, name in enumerate(known) if name not in gone]
-        unknown.set("dependencies", " ".join(known[k] for k in kept))
-        if kinds:
-            unknown.set("dependenciesKind", " ".join(kinds[k] for k in kept))
-
-
 def exported_texts(
     model: Model,
     identifier: str,
@@ -375,8 +318,8 @@ def exported_texts(
     for name, text in sorted(bare.items()):
         digest.update(name.encode("utf-8") + b"\0" + text.encode("utf-8") + b"\0")
     token = "{" + str(uuid.UUID(bytes=digest.digest()[:16])) + "}"
-    xml = model_description(model, identifier, token, names, fmi)
-    return token, sources(token), fixed_description(xml, fixed) if fixed else xml
+    xml = model_description(model, identifier, token, names, fmi, fixed)
+    return token, sources(token), xml
 
 
 def write_sources(

@@ -265,10 +265,7 @@ def about(model: Model) -> list[str]:
 
 def _starts(model: Model) -> str:
     """Say whether the states rest where they start; an input starts at its own value."""
-    s = model.structure
-    groups = [[v.start for v in group] for group in (s.states, s.inputs)]
-    held = [[v.start for v in s.sampled]] if s.sampled else []
-    rates = s.f(0.0, *groups, model.parameter_vector(), *held)[0]
+    rates = model.structure.f(*model.at_start())[0]
     if all(float(rate) == 0.0 for rate in rates.elements()):
         return "states start at rest."
     return "states start at their start values, from where they move even if the inputs do not."
