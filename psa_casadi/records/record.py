@@ -35,6 +35,11 @@ class Located:
     reported: NDArray[np.bool_]
     place: str = "line"
 
+    def part(self, where: slice) -> "Located":
+        """Return some of the values."""
+        own = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
+        return replace(self, **own)
+
     def complain(self, at: NDArray[np.bool_], sentence: str, problems: Problems) -> None:
         """Add `sentence` for every sample that `at` marks.
 

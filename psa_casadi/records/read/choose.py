@@ -387,7 +387,7 @@ def rises(table: Table, index: int) -> bool:
         is_array = isinstance(cells, np.ndarray)
         texts = [] if is_array else [str(cell) for cell in cells]
         sign = decimal_sign(texts)
-        times = np.asarray(cells) if is_array else numbers_in(texts, sign, "s").values
+        times = np.asarray(cells) if is_array else numbers_in(texts, sign, "s")[0]
     if times.size < 2 or times.dtype.kind not in "biuf":
         return False
     steps = np.diff(times)
@@ -424,7 +424,7 @@ def _usual_length(table: Table, index: int) -> str:
     """Return the unit in which numbers are a stroke that a stack may have: 1 nm to 1 mm."""
     cells = table.glance[index]
     if not isinstance(cells, np.ndarray):
-        cells = numbers_in(cells, decimal_sign(cells), "").values
+        cells = numbers_in(cells, decimal_sign(cells), "")[0]
     finite = cells[np.isfinite(cells)] if cells.dtype.kind in "biuf" else np.zeros(0)
     span = float(np.ptp(finite)) if finite.size else 0.0
     return "m" if 1e-9 <= span < 1e-3 else "nm" if span > 3e3 else "um"

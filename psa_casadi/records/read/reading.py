@@ -146,7 +146,7 @@ def _channels(
 def _numbers(cells: Cells) -> FloatArray:
     if isinstance(cells, np.ndarray):
         return cells.astype(np.float64)
-    return numbers_in(cells, decimal_sign(cells), "").values
+    return numbers_in(cells, decimal_sign(cells), "")[0]
 
 
 _NAME = re.compile(r"[a-z]\w*(?:\.\w+)* \[(?P<unit>[^\[\]]+)\]", re.IGNORECASE)

@@ -428,7 +428,7 @@ def _with_unit(text: str, cells: Cells) -> str:
         own = unit_in(filled)
         if own:
             return f"{text.strip()} [{own}]"
-        filled = numbers_in(filled[:9], decimal_sign(filled[:9]), "s").values
+        filled = numbers_in(filled[:9], decimal_sign(filled[:9]), "s")[0]
     own = unit_of_times(filled[:9]) if name and name.column == "time" else None
     return f"{text.strip()} [{own}]" if own else text
 
