@@ -23,8 +23,8 @@ _ENTRY = re.compile(r"#\s*(?P<key>[A-Z_]+[0-9]*)\s*=\s*(?P<value>.*?)\s*")
 _MOST_LINES = 500
 #: How a head states the time between samples, or their rate, with a unit before or behind it.
 _STEP = re.compile(
-    r"""\W*(?P<name>[\w ]*?(?:(?P<rate>rate|freq\w*|\bfs)|interval|period|increment|\bx ?incr?|\bdt|\bts|
-        step|delta[_ ]?[xt]|sample[_ ]?time|sampling[_ ]?time))\s*
+    r"""\W*(?P<name>[\w ]*?(?:(?P<rate>rate|freq\w*|\bfs)|interval|period|increment|\bx ?incr?|
+        \bdt|\bts|step|delta[_ ]?[xt]|sample[_ ]?time|sampling[_ ]?time))\s*
         [\[(]?(?P<before>[A-Za-zµ/]+)?[\])]?[\s:=,;"']+(?P<number>[\d.,]+(?:[eE][+-]?\d+)?)"?
         [\s,;"\[(]*(?P<unit>[A-Za-zµ]+(?:/s|PS)?)?.*""",
     re.I | re.X,
