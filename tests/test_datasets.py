@@ -16,7 +16,7 @@ from psa_casadi import datasets
 from psa_casadi.cli.datasets import datasets as command
 from psa_casadi.cli.failures import guarded
 from psa_casadi.datasets import DATASETS, Dataset
-from psa_casadi.datasets.conversions.columns import Columns
+from psa_casadi.datasets.devices import Columns
 from psa_casadi.datasets.fetching import DATA_VARIABLE
 from psa_casadi.errors import InputError, PsaError
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from psa_casadi.datasets import DATASETS
-from psa_casadi.datasets.conversions.one_axis import OneAxis, linear_response
+from psa_casadi.datasets.devices import OneAxis, linear_response
 
 FloatArray = npt.NDArray[np.float64]
 
