@@ -270,7 +270,7 @@ MICROMANIPULATOR_RESTS = _dataset(
 )
 
 
-_FOLDER_steering_mirror = (
+_MIRROR_FOLDER = (
     "https://raw.githubusercontent.com/merijnfloren/fsm-benchmark-data/"
     "539a12fef384b086a8562b500498b2fa3899ef70/data/"
 )
@@ -304,7 +304,7 @@ _TRAINING = {
     "axis_2_300mV.csv": "d426292410bf6a9e51c2c526a9511a0919705f702caa06cfd4285dd5affdc87d",
     "axis_3_300mV.csv": "8c8cf8b11ad0a411238d38eb5e9d75e33620610a2f9203b7cf37d617fbdcb745",
 }
-_TEST_steering_mirror = {
+_MIRROR_TEST = {
     "axis_1_100mV_test_1.csv": "509d16d22f73c294e5941db22587bf36cdf77d4db287d3638af9f627710a4fc9",
     "axis_1_100mV_test_2.csv": "2cc2c71b2380d0e113478a3cd8b2349b7aa949b05bc5e20342761c96002bb925",
     "axis_1_100mV_test_3.csv": "b26c922f6bd14a6690daa04caf6fdacda8b5a63d25a9da58b027e566287002af",
@@ -336,7 +336,7 @@ _TEST_steering_mirror = {
 
 
 def _original(name: str) -> Original:
-    return Original(name, f"{_FOLDER_steering_mirror}{name}", _ORIGINALS[name])
+    return Original(name, f"{_MIRROR_FOLDER}{name}", _ORIGINALS[name])
 
 
 def _pair(level: int, part: str) -> tuple[Original, Original]:
@@ -360,15 +360,13 @@ def _test(axis: int, level: int, signal: int) -> DatasetFile:
         name,
         f"axis {axis + 1} and its own actuator, test signal {signal + 1}, {level} mV rms,"
         " two periods",
-        _TEST_steering_mirror[name],
+        _MIRROR_TEST[name],
         (*_pair(level, "train"), *_pair(level, "test")),
         OneAxis(axis, SIGNS[axis], experiment=signal, periods=2, sample_rate=_RATE),
     )
 
 
-def _dataset_steering_mirror(
-    name: str, description: str, files: tuple[DatasetFile, ...]
-) -> Dataset:
+def _mirror(name: str, description: str, files: tuple[DatasetFile, ...]) -> Dataset:
     return Dataset(
         name=name,
         description=description,
@@ -384,14 +382,14 @@ def _dataset_steering_mirror(
     )
 
 
-STEERING_MIRROR = _dataset_steering_mirror(
+STEERING_MIRROR = _mirror(
     "steering_mirror",
     "a satellite's mirror on three piezo actuators, each axis with its own one: random-phase"
     " multisines up to 3 kHz, 6.4 kHz, steady state, three levels",
     tuple(_training(axis, level) for level in LEVELS for axis in range(3)),
 )
 
-STEERING_MIRROR_TEST = _dataset_steering_mirror(
+STEERING_MIRROR_TEST = _mirror(
     "steering_mirror_test",
     "the same mirror: the test signals of the benchmark, to judge a model by",
     tuple(_test(a, level, k) for level in LEVELS for a in range(3) for k in range(3)),

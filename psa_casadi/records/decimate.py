@@ -1,6 +1,7 @@
 """Block averages of a record, taken only as far as they lose nothing that a fit could use."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ def _uniform(time: FloatArray) -> bool:
 def _averages(record: Record, q: int) -> Record:
     """Return the record of block averages over q samples."""
     time = _means(record.time, q)
-    columns = {name: _means(values, q) for name, values in record.recorded.items()}
+    columns: dict[str, Any] = {n: _means(values, q) for n, values in record.recorded.items()}
     if record.displacement is not None:
         columns["displacement"] = _valid_means(record, time, q)
     return replace(record, time=time, **columns)
