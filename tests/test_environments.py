@@ -76,7 +76,7 @@ def test_output_that_cannot_be_written(case: str) -> None:
 
 @posix
 def test_letters_that_the_terminal_lacks_do_not_end_a_command() -> None:
-    code = "from psa_casadi.cli.surroundings import prepare; prepare()"
+    code = "from psa_casadi.cli.failures import prepare; prepare()"
     done = shell(
         f"""'{sys.executable}' -c '{code}; print("5 \\u00b5m, \\udcff.csv")'""",
         PYTHONIOENCODING="ascii", **ASCII,
@@ -88,7 +88,7 @@ def test_letters_that_the_terminal_lacks_do_not_end_a_command() -> None:
 @pytest.mark.parametrize("end", ["", "os._exit(0)", "os.kill(os.getpid(), 15)"])
 def test_temporary_files_of_other_packages_go_too(end: str, tmp_path: Path) -> None:
     """With the command that made them, or with the next."""
-    code = "import os, tempfile; from psa_casadi.cli.surroundings import prepare; prepare()"
+    code = "import os, tempfile; from psa_casadi.cli.failures import prepare; prepare()"
     for last in (end, ""):
         script = f"{code}; print(tempfile.mkdtemp(), os.environ['TMPDIR']); {last}"
         done = shell(f"'{sys.executable}' -uc '{script}'".replace("['", '["').replace("']", '"]'),

@@ -23,12 +23,11 @@ from psa_casadi.cli.export_c import c
 from psa_casadi.cli.export_fmu import fmu
 from psa_casadi.cli.export_modelica import modelica
 from psa_casadi.cli.export_ssp import ssp
-from psa_casadi.cli.failures import guarded
+from psa_casadi.cli.failures import guarded, prepare
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.sample import sample
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
-from psa_casadi.cli.surroundings import prepare
 from psa_casadi.cli.web import web
 from psa_casadi.command_line import typed
 from psa_casadi.version import __version__
