@@ -27,7 +27,6 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record
-from psa_casadi.report.page.document import Document
 from psa_casadi.report.words.tables import Table
 from psa_casadi.variables import Parameter
 from tests.record_files import HEADER, ROWS, write
@@ -111,13 +110,6 @@ def test_the_name_of_a_file_may_be_any_bytes(tmp_path: Path) -> None:
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/rig\xe9\x01.csv"))
     record = read_record(write(path, HEADER, *ROWS))
     assert record.name == "rig\ufffd\ufffd"
-
-
-def test_a_page_shows_a_mark_for_what_html_cannot_carry() -> None:
-    page = Document("a\0b", ()).text()
-    assert "\0" not in page
-    assert "<title>a\ufffdb</title>" in page
-    assert plain(CARRIED) == CARRIED
 
 
 def test_what_a_terminal_would_obey_is_spelled_out() -> None:

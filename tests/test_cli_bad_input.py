@@ -1,7 +1,4 @@
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +7,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from psa_casadi.cli.app import app
-from psa_casadi.components import BASE, COMPONENTS
+from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps
@@ -89,32 +86,6 @@ def test_a_record_with_a_mistake(tmp_path: Path, case: str) -> None:
         assert expected in said
 
 
-def test_a_record_that_is_not_there(tmp_path: Path) -> None:
-    absent, out = tmp_path / "absent.csv", tmp_path / "m.json"
-    for command in ("identify", "diagnose"):
-        said = refused(command, absent, "-o", out, outputs=tmp_path)
-        assert "there is no such file" in said
-        assert "is a directory" in refused(command, tmp_path, "-o", out, outputs=tmp_path)
-    assert "--output" in refused("simulate", "--input", absent, outputs=tmp_path)
-    assert "records" in refused("diagnose", "-o", out, outputs=tmp_path).lower()
-
-
-def test_the_same_record_twice(tmp_path: Path) -> None:
-    good = write(tmp_path / "good.csv", HEADER, *ROWS)
-    copy = write(tmp_path / "copy.csv", HEADER, *ROWS)
-    out = tmp_path / "m.json"
-    for command in (
-        ("identify", good, good, "-o", out),
-        ("identify", good, copy, "-o", out),
-        ("diagnose", good, copy, "-o", out),
-        ("diagnose", good, "--holdout", copy, "-o", out),
-        ("diagnose", good, "--holdout", good, "-o", out),
-    ):
-        said = refused(*command, outputs=tmp_path)
-        assert "holds the same data as" in said
-        assert "good.csv" in said
-
-
 def _edited(change: Callable[[dict[str, Any]], object]) -> str:
     content = json.loads(MODEL)
     change(content)
@@ -160,30 +131,6 @@ def test_a_model_file_with_a_mistake(tmp_path: Path, case: str) -> None:
         assert str(model) in said
 
 
-def test_a_model_from_nowhere_or_of_something_else(tmp_path: Path) -> None:
-    good = write(tmp_path / "good.csv", HEADER, *ROWS)
-    stage = compose([COMPONENTS["flexure"]], name="flexure")
-    other = write(tmp_path / "flexure.json", dumps(stage))
-    nowhere = tmp_path / "nowhere.json"
-    out = tmp_path / "y.csv"
-    said = refused("simulate", "--model", nowhere, "--input", good, "-o", out, outputs=tmp_path)
-    assert "nowhere.json cannot be read" in said
-    said = refused("simulate", "--model", other, "--input", good, "-o", out, outputs=tmp_path)
-    assert "is no stack" in said
-
-
-def test_everything_wrong_with_a_command_is_told_at_once(tmp_path: Path) -> None:
-    bad = write(tmp_path / "bad.csv", HEADER, *rows_with(4, "0.004,abc,1"))
-    said = refused(
-        "diagnose", bad, "--holdout", tmp_path / "absent.csv", "--model", tmp_path / "no.json",
-        "-o", tmp_path / "missing" / "m.json", "--json", tmp_path, "--stiffness", "-3",
-        outputs=tmp_path,
-    )  # fmt: skip
-    assert "6 problems" in said
-    for part in ("'abc'", "absent.csv", "no.json", "create it first", "is a directory", "-3 N/m"):
-        assert part in said
-
-
 def test_outputs_that_collide(tmp_path: Path) -> None:
     good = write(tmp_path / "good.csv", HEADER, *ROWS)
     same = tmp_path / "same"
@@ -192,43 +139,6 @@ def test_outputs_that_collide(tmp_path: Path) -> None:
     said = refused("identify", good, "-o", good, outputs=tmp_path)
     assert "would overwrite an input" in said
     assert good.read_text(encoding="utf-8").startswith(HEADER)
-
-
-def test_the_papers_method_takes_no_model(tmp_path: Path) -> None:
-    good = write(tmp_path / "good.csv", HEADER, *ROWS)
-    model = write(tmp_path / "model.json", MODEL)
-    said = refused(
-        "identify", good, "--method", "paper", "--model", model, "-o", tmp_path / "m.json",
-        outputs=tmp_path,
-    )  # fmt: skip
-    assert "--method paper starts from no model" in said
-
-
-def test_impossible_exports_say_so(tmp_path: Path) -> None:
-    model = write(tmp_path / "model.json", MODEL)
-    fmu = ("export", "fmu", "--model", model, "-o", tmp_path / "x.fmu")
-    assert "'vax' is not known" in refused(*fmu, "--platforms", "vax", outputs=tmp_path)
-    assert "cannot name an FMU" in refused(*fmu, "--name", "1st", outputs=tmp_path)
-    assert "--fmi" in refused(*fmu, "--fmi", "7", outputs=tmp_path)
-
-
-def test_fmus_that_are_none(tmp_path: Path) -> None:
-    text = tmp_path / "text.fmu"
-    text.write_text("not a zip")
-    assert "cannot be read as an FMU" in refused("check", text, outputs=tmp_path)
-    assert "no such file" in refused("check", tmp_path / "absent.fmu", outputs=tmp_path)
-    assert "is a directory" in refused("check", tmp_path, outputs=tmp_path)
-
-
-def test_an_effect_that_does_not_exist_is_answered_with_what_is_close(tmp_path: Path) -> None:
-    assert "did you mean slow_creep" in refused("effects", "slow_crep", outputs=tmp_path)
-    assert "current_limit" in refused("effects", "xyzzy", outputs=tmp_path)
-
-
-def test_a_demo_where_a_file_stands(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("here")
-    assert "cannot be created" in refused("demo", tmp_path / "file", outputs=tmp_path)
-    assert "cannot be created" in refused("demo", tmp_path / "file" / "sub", outputs=tmp_path)
 
 
 def test_a_fault_of_the_package_ends_with_1_and_a_short_message(
@@ -247,22 +157,6 @@ def test_a_fault_of_the_package_ends_with_1_and_a_short_message(
     assert len(said.splitlines()) == 1
     monkeypatch.setenv("PSA_CASADI_DEBUG", "1")
     assert isinstance(psa("identify", good, "-o", out).exception, ZeroDivisionError)
-
-
-def test_the_command_itself_prints_no_traceback(tmp_path: Path) -> None:
-    environment = {k: v for k, v in os.environ.items() if k != "PSA_CASADI_DEBUG"}
-    done = subprocess.run(
-        [sys.executable, "-m", "psa_casadi.cli", "identify", tmp_path / "absent.csv",
-         "-o", tmp_path / "m.json"],
-        capture_output=True, text=True, check=False, env=environment,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr == (
-        f"Error: {tmp_path / 'absent.csv'}: there is no such file; check the name and the"
-        " directory it is in.\n"
-    )
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

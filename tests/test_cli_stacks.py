@@ -4,11 +4,9 @@ import re
 from pathlib import Path
 
 import fmpy
-import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-import psa_casadi
 from psa_casadi.cli.app import app
 from psa_casadi.cli.screen import show_table
 from psa_casadi.effects import EFFECTS
@@ -16,10 +14,9 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification import identify
 from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.records import read_record, sine, time_grid, write_record
+from psa_casadi.records import sine, time_grid, write_record
 from psa_casadi.report.page import playground_page
 from psa_casadi.report.words.tables import Table, effects_table
-from psa_casadi.simulation.simulate import simulate_record
 from tests.record_files import HEADER, ROWS, write
 from tests.report_cases import identification
 from tests.test_schemas import valid
@@ -54,28 +51,6 @@ def test_every_figure_of_a_stack_is_shown_with_its_source(name: str) -> None:
         assert (" assumed " in lines[0][:source]) == figure.assumed
 
 
-def test_stacks_are_listed() -> None:
-    listed = psa("stacks").stdout
-    for name, stack in STACKS.items():
-        line = re.search(rf"^{re.escape(name)} .*$", listed, re.MULTILINE)
-        assert line is not None
-        assert f"{len(stack.assumed)} of 19" in line[0]
-    assert psa("stacks", "--quiet").stdout.split() == list(STACKS)
-    assert psa("stacks", "demo", "--quiet").stdout == "demo\n"
-
-
-def test_simulate_takes_a_stack(planned: Path, tmp_path: Path) -> None:
-    out = tmp_path / "motion.csv"
-    done = psa("simulate", "--stack", "P-885.51", "--input", planned, "-o", out)
-    assert done.exit_code == 0, done.output
-    record = read_record(planned, need_displacement=False)
-    expected = simulate_record(stack_model("P-885.51"), record).displacement
-    found = read_record(out).displacement
-    assert found is not None
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-18)
-    assert 10e-6 < np.ptp(found) < 13e-6
-
-
 @slow
 def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> None:
     fmu = tmp_path / "p.fmu"
@@ -89,18 +64,6 @@ def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> No
     content = valid("check", (tmp_path / "check.json").read_text())
     assert (content["passed"], content["compared"]) == (True, True)
     assert "equations" in {row["name"] for row in content["rows"]}
-
-
-@slow
-def test_model_files_and_fmus_are_also_named_by_text(tmp_path: Path) -> None:
-    path, fmu = str(tmp_path / "model.json"), str(tmp_path / "stack.fmu")
-    psa_casadi.save_model(stack_model("PTBS200"), path)
-    model = psa_casadi.load_model(path)
-    assert model.values == stack_model("PTBS200").values
-    assert "16 of its 19 figures are assumed" in model.provenance.notes[0]
-    assert psa_casadi.export_fmu(model, fmu) == Path(fmu)
-    report = psa_casadi.check_fmu(fmu, model)
-    assert (report.path, report.passed) == (Path(fmu), True)
 
 
 def test_a_wrong_choice_of_model_is_one_sentence(planned: Path, tmp_path: Path) -> None:
@@ -156,15 +119,6 @@ def test_an_identification_needs_no_file(tmp_path: Path, monkeypatch: pytest.Mon
     assert "written" not in shown.stdout
     assert max(map(len, shown.stdout.splitlines())) <= 80
     assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
-
-
-def test_one_model_at_most_and_one_directory(tmp_path: Path) -> None:
-    record = write(tmp_path / "a.csv", HEADER, *ROWS)
-    both = psa("diagnose", record, "--stack", "demo", "--model", tmp_path / "m.json")
-    assert "--model and --stack are both given; leave one of them out." in both.output
-    two = psa("demo", tmp_path / "a", "-o", tmp_path / "b")
-    assert two.exit_code == 2
-    assert "name two directories" in two.output
 
 
 @pytest.mark.parametrize("width", [1, 8, 20, 26, 30, 80])

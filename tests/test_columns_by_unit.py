@@ -13,11 +13,9 @@ from scipy.io import savemat
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.columns import (
-    columns_known,
     parse_columns,
     stated_unit,
     understood,
-    units_row,
 )
 
 N = 20
@@ -178,12 +176,6 @@ def test_excels_first_line_says_what_separates_the_cells(
     assert f"line {len(head) + 6}, column 'time': found 'oops'" in refused(path)
 
 
-def test_numbers_alone_below_excels_line_are_counted(tmp_path: Path) -> None:
-    path = table(tmp_path / "a.csv", "sep=;", mark=";", point=",")
-    assert suggestion(path) == "time=1:s,voltage=2:V,displacement=3:um"
-    assert_is(read_record(path, columns="time=1:s,voltage=2:V,displacement=3:um"))
-
-
 def structures(*items: Mapping[str, Any]) -> Any:
     """Return several MATLAB structures of the same fields, as SciPy writes them."""
     found = np.empty((1, len(items)), dtype=[(key, object) for key in items[0]])
@@ -229,16 +221,6 @@ def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
     assert suggestion(path) == both  # the two clocks are the same
 
 
-def test_the_elements_of_other_structures_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "a.mat"
-    signals = structures({"label": "U", "values": V}, {"label": "x", "values": X})
-    savemat(path, {"log": {"time": T, "signals": signals}})
-    record = read_record(
-        path, columns="voltage=log.signals.1.values,displacement=log.signals.2.values:um"
-    )
-    assert_is(record)
-
-
 @pytest.mark.parametrize(
     ("cell", "column", "unit"),
     [
@@ -261,11 +243,3 @@ def test_the_unit_of_a_cell(cell: str, column: str | None, unit: str | None) -> 
     found = understood(cell)
     assert (None if found is None else found.column) == column
     assert stated_unit(cell) == unit
-
-
-def test_rows_of_units_and_of_names() -> None:
-    assert units_row(["s", "V", "-"]) == ["s", "V", ""]
-    assert units_row(["s", "V", "-1"]) is None
-    assert columns_known(["Clock (s)", "Bridge (V)"]) == 2
-    assert columns_known(["Clock (s)", "0.1", "Bridge (V)"]) == 0
-    assert columns_known(["ms", "mV", "nm"]) == 0

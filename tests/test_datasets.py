@@ -121,18 +121,6 @@ def test_a_record_may_be_made_of_several_originals(
     assert "From first.dat, second.dat: both halves of the table." in text
 
 
-def test_what_was_downloaded_is_kept_and_what_was_spoilt_is_made_again(
-    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
-) -> None:
-    publish(served, TABLE)
-    (path,) = datasets.paths("small")
-    whole = path.read_bytes()
-    (tmp_path / "published" / "table.dat").unlink()
-    assert datasets.paths("small") == [path]
-    path.write_bytes(whole[:-9])
-    assert datasets.paths("small")[0].read_bytes() == whole
-
-
 def test_another_file_than_the_published_one_is_refused(
     served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
 ) -> None:
@@ -173,14 +161,6 @@ def test_a_folder_is_taken_as_it_is_or_refused(
         datasets.originals("small")
     (path.parent / "table.dat").write_bytes(TABLE)
     assert list(datasets.originals("small")) == ["table.dat"]
-
-
-def test_the_measured_records_are_the_published_ones(
-    measured_data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(DATA_VARIABLE, str(measured_data))
-    sine, loops = datasets.micromanipulator()
-    assert (sine.name, sine.n, loops.name, loops.n) == ("sine_1hz", 7927, "minor_loops", 3600)
 
 
 @pytest.mark.parametrize("dataset", DATASETS.values(), ids=lambda d: d.name)

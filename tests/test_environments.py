@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,6 @@ from psa_casadi.model.model_file import dumps
 from psa_casadi.scratch import PREFIX
 from psa_casadi.simulation import compiler
 from tests.record_files import HEADER, ROWS, write
-from tests.tiers import slow
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
 MODEL = dumps(compose(BASE))
@@ -234,27 +232,6 @@ def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
         fill()
     assert (tmp_path / "x.fmu").read_text() == "old"
     assert os.listdir(tmp_path) == ["x.fmu"]
-
-
-@slow
-@posix
-def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(
-    record: Path, tmp_path: Path
-) -> None:
-    where = {"CC": "nothing-of-this-name", "PSA_CASADI_CACHE": str(tmp_path / "cache")}
-    done = shell(f"psa identify '{record}' -q -o '{tmp_path}/m.json'", **where)
-    assert done.returncode == 1
-    assert done.stderr.startswith("Failed: The C compiler nothing-of-this-name cannot be started")
-
-
-@posix
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("prlimit") is None, reason="no prlimit")
-def test_a_command_with_too_little_memory_says_so(record: Path, tmp_path: Path) -> None:
-    done = shell(f"ulimit -v 150000; psa identify '{record}' -q -o '{tmp_path}/m.json'")
-    assert done.returncode == 1
-    assert "there is too little memory" in done.stderr
-    assert FAULT not in done.stderr
 
 
 @posix

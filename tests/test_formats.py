@@ -1,7 +1,6 @@
 """Records in other formats and spellings than a plain CSV file."""
 
 import hashlib
-import time as clock
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,10 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.records import Record, read_record, read_records, write_record
+from psa_casadi.records import Record, read_record, read_records
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.columns import Source, parse_columns
+from psa_casadi.records.read.columns import parse_columns
 from tests.record_files import HEADER, ROWS, write
-from tests.tiers import slow, slow_but
 
 N = 24
 T = np.arange(N) / 8.0
@@ -112,20 +110,6 @@ def test_structures_matrices_lying_vectors_and_names_with_units(
     np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + Y)
 
 
-def test_missing_displacements_of_other_formats_are_masked(tmp_path: Path) -> None:
-    y = Y.copy()
-    y[[3, 7]] = np.nan
-    record = read_record(
-        mat(tmp_path / "a.mat", {"t": T, "u": U, "y": y}),
-        columns="time=t,voltage=u,displacement=y:m",
-    )
-    assert list(np.flatnonzero(~record.mask)) == [3, 7]
-    holes = [None if k in (2, 5) else float(v) for k, v in enumerate(Y)]
-    columns = {"time [s]": T, "voltage [V]": U, "displacement [um]": holes}
-    record = read_record(table(tmp_path / "a.parquet", columns))
-    assert list(np.flatnonzero(~record.mask)) == [2, 5]
-
-
 def test_parquet_columns_are_named_as_in_a_csv_header(tmp_path: Path) -> None:
     columns = {
         "remark": ["ok"] * N,
@@ -198,18 +182,6 @@ def test_mistakes_of_the_columns_option(text: str, expected: str) -> None:
     assert expected in problem
 
 
-def test_the_columns_option_is_read_whole(tmp_path: Path) -> None:
-    found = parse_columns(" time = t:ms , load-force=f[kN],displacement=log.y.2")
-    assert found == {
-        "time": Source("t", "ms"),
-        "load_force": Source("f", "kN"),
-        "displacement": Source("log.y.2", None),
-    }
-    with pytest.raises(InputError) as caught:
-        read_records([tmp_path / "a.csv"], columns="a=b,voltage=u:s,=,c")
-    assert len(caught.value.problems) == 4
-
-
 def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     t, y = T.copy(), Y.copy()
     t[5], y[9] = t[3], np.inf
@@ -264,18 +236,6 @@ def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
     assert "the column 'time' is missing (found: nothing)" in problems_of(empty)[0]
 
 
-@pytest.mark.parametrize("version", slow_but(["5", "7"], ["5", "7", "7.3"]))
-def test_a_damaged_matlab_file_is_told_in_sentences(tmp_path: Path, version: str) -> None:
-    whole = mat(tmp_path / "a.mat", {"t": T, "u": U, "y": Y}, version).read_bytes()
-    draw = np.random.default_rng(1)
-    for stop in draw.integers(1, len(whole), 8):  # a process each
-        cut = tmp_path / "cut.mat"
-        cut.write_bytes(whole[:stop])
-        with pytest.raises(InputError) as caught:
-            read_record(cut, columns=COLUMNS)
-        assert str(cut) in str(caught.value)
-
-
 def test_a_missing_optional_package_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -321,44 +281,3 @@ def test_decimal_commas_are_read(tmp_path: Path, delimiter: str, encoding: str) 
     quoted = [row.replace(";", '";"').replace("\t", '"\t"') for row in rows]
     again = read_record(write(tmp_path / "c.csv", header, *(f'"{row}"' for row in quoted)))
     assert_is(again, expected.time, expected.voltage, expected.displacement)
-
-
-def test_quoted_decimal_commas_between_commas_are_read(tmp_path: Path) -> None:
-    rows = [",".join(f'"{cell.replace(".", ",")}"' for cell in row.split(",")) for row in ROWS]
-    record = read_record(write(tmp_path / "a.csv", HEADER, *rows))
-    plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
-    assert plain.displacement is not None
-    assert_is(record, plain.time, plain.voltage, plain.displacement)
-
-
-@pytest.mark.parametrize("unit", ["um", "counts"])
-@pytest.mark.parametrize("low", [-150.0, 0.0])
-@pytest.mark.parametrize("temperature", ["degC", "K", "°C"])
-def test_half_an_hour_at_10_hz_one_sided_and_bipolar(
-    tmp_path: Path, unit: str, low: float, temperature: str
-) -> None:
-    t = np.arange(18000) / 10.0
-    u = low + (150.0 - low) * 0.5 * (1 - np.cos(2 * np.pi * t / 60.0))
-    y = np.round(u / 3.0)
-    kelvin = temperature == "K"
-    degrees = (293.15 if kelvin else 20.0) + t / 1800.0
-    path = tmp_path / "slow.csv"
-    columns = {"time [s]": t, "voltage [V]": u, f"displacement [{unit}]": y}
-    write_record(path, columns | {f"temperature [{temperature}]": degrees})
-    record = read_record(path, need_excitation=True)
-    assert (record.n, record.displacement_unit) == (18000, "counts" if unit == "counts" else "m")
-    assert record.sample_time == pytest.approx(0.1)
-    assert record.voltage.min() == pytest.approx(low)
-    assert_is(record, t, u, y if unit == "counts" else y / 1e6)
-    np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + t / 1800.0, rtol=1e-14)
-
-
-@slow
-def test_a_million_rows_with_decimal_commas_are_read_quickly(tmp_path: Path) -> None:
-    rows = [
-        f"{k / 10000:.4f};{k % 1000 / 10};{k % 1000 / 100}".replace(".", ",") for k in range(10**6)
-    ]
-    path = write(tmp_path / "long.csv", HEADER.replace(",", ";"), *rows)
-    started = clock.process_time()
-    assert read_record(path).n == 10**6
-    assert clock.process_time() - started < 6.0

@@ -13,7 +13,6 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import read_record, write_record
 from psa_casadi.simulation.history import memory_after, settled_at
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
@@ -62,10 +61,6 @@ def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
     # the record begins in motion: the fast states start there, as `start_state` has it
     found = simulate(model, t, voltage, memory=memory).displacement
     assert np.abs(found - whole)[50:].max() < 1e-4 * np.ptp(whole)
-
-
-def test_no_history_is_the_relaxed_start() -> None:
-    assert set(memory_after(STACK, [], at=0.0).values()) == {0.0}
 
 
 @slow
@@ -122,33 +117,3 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, [*command, "--history", "120"])
     assert refused.exit_code == 2
     assert "--start-voltage" in refused.output
-
-
-@pytest.mark.parametrize(
-    ("turns", "options", "said"),
-    [
-        ([np.nan], {}, "not finite"),
-        ([10.0], {"sweep": 0.0}, "above 0"),
-        ([10.0], {"rest": -1.0}, "0 or more"),
-    ],
-)
-def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        memory_after(STACK, turns, at=5.0, **options)
-
-
-def test_the_command_takes_a_history(tmp_path: Path) -> None:
-    t, voltage = _falling()
-    given, out = tmp_path / "v.csv", tmp_path / "out.csv"
-    write_record(given, {"time [s]": t, "voltage [V]": voltage})
-    command = ["simulate", "--stack", "P-885.51", "--input", str(given), "-o", str(out)]
-    done = CliRunner().invoke(app, [*command, "--history", "120,0,120", "--rest", "3"])
-    assert done.exit_code == 0, done.output
-    memory = memory_after(STACK, [120.0, 0.0, 120.0], at=120.0, rest=3.0)
-    expected = simulate(STACK, t, voltage, memory=memory).displacement
-    written = read_record(out).displacement
-    assert written is not None
-    np.testing.assert_allclose(written, expected, rtol=0, atol=1e-9)
-    refused = CliRunner().invoke(app, [*command, "--history", "high"])
-    assert refused.exit_code == 2
-    assert "--history is 'high'" in refused.output

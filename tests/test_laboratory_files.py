@@ -207,20 +207,6 @@ def test_two_cells_for_one_column_are_not_guessed(tmp_path: Path) -> None:
     assert_read(path, "displacement=position_um:um")
 
 
-def test_an_own_name_goes_before_another(tmp_path: Path) -> None:
-    path = tmp_path / "r.csv"
-    lines = ["time [s],voltage [V],displacement [um],x [um]", *(f"{r},0" for r in rows())]
-    path.write_text("\n".join(lines) + "\n")
-    assert_read(path)
-
-
-def test_a_unit_that_does_not_fit_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "r.csv"
-    path.write_bytes(text("Time (V),Voltage (V),Position (um)"))
-    with pytest.raises(InputError, match="does not measure time"):
-        read_record(path)
-
-
 @pytest.mark.parametrize(
     "spoil", [lambda d: d[:40], lambda d: d[:10] + b"\0" * 9 + d[19:], lambda _: b"\x1f\x8b"]
 )
@@ -262,14 +248,6 @@ def test_a_mistake_in_a_workbook_is_told_with_its_row(tmp_path: Path) -> None:
         read_record(path)
 
 
-def test_units_below_names_that_are_none_are_kept(tmp_path: Path) -> None:
-    path = kept(tmp_path, "a", text("x-axis,1,2", "second,Volt,Volt"))
-    with pytest.raises(InputError, match=r"gives the unit 'V', --columns gives 'um'.*such as 10um"):
-        read_record(path, columns="time=x-axis,voltage=1,displacement=2:um")
-    path.write_bytes(text("x-axis,1,2", "second,Volt,um"))
-    assert_read(path, "time=x-axis,voltage=1,displacement=2")
-
-
 def test_a_scale_says_what_one_in_the_file_is(tmp_path: Path) -> None:
     path = kept(tmp_path, "a", text("x-axis,1,2", "second,Volt,Volt"))
     record = read_record(path, columns="time=x-axis,voltage=1:15V,displacement=2:-2.5e0 um")
@@ -287,19 +265,3 @@ def test_a_scale_says_what_one_in_the_file_is(tmp_path: Path) -> None:
 def test_a_scale_that_leaves_nothing_is_refused(scale: str) -> None:
     with pytest.raises(InputError, match="leaves nothing of the numbers"):
         parse_columns(f"displacement=x:{scale}um")
-
-
-def test_a_sensors_volts_are_told_to_need_a_scale(tmp_path: Path) -> None:
-    path = kept(tmp_path, "a", text("time [s],voltage [V],displacement [V]"))
-    with pytest.raises(
-        InputError,
-        match=r"does not measure length.* is: --columns displacement=displacement:1um",
-    ):
-        read_record(path)
-    assert_read(path, "displacement=displacement:1um")
-
-
-def test_an_oscilloscope_without_an_increment_is_told(tmp_path: Path) -> None:
-    path = kept(tmp_path, "a", b"X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,0,,\n0,1,2,\n")
-    with pytest.raises(InputError, match=r"line 2: the head gives no sample time \(Increment"):
-        read_record(path)

@@ -4,7 +4,6 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pyarrow
 import pytest
@@ -16,7 +15,6 @@ from scipy.io import savemat
 
 from psa_casadi.records import Record, read_record
 from tests.reading_here import here
-from tests.test_formats import mat
 
 N = 40
 T = np.arange(N) / 1000.0
@@ -105,28 +103,6 @@ def test_dates_in_workbooks_and_instants_of_tdms(tmp_path: Path) -> None:
     assert_is(read_record(tmp_path / "a.tdms"))
 
 
-def test_structures_and_texts_of_hdf5_and_matlab_7_3(tmp_path: Path) -> None:
-    content = {"log": {"run": {"time_s": T, "voltage_V": V, "displacement_um": X}}}
-    assert_is(read_record(mat(tmp_path / "a.mat", content, "7.3")))
-    with h5py.File(tmp_path / "b.h5", "w") as file:
-        stamps = [(START + timedelta(seconds=t)).isoformat() for t in T.tolist()]
-        file["stamp"] = stamps
-        file["both"] = np.stack([V, X])
-        file["both"].attrs["sample_rate"] = 1000.0
-    columns = "voltage=both.1:V,displacement=both.2:um"
-    assert_is(read_record(tmp_path / "b.h5", columns=columns))
-    assert_is(read_record(tmp_path / "b.h5", columns=f"time=stamp,{columns}"))
-
-
 def test_a_sample_rate_beside_the_arrays_is_their_clock(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"voltage_V": V, "displacement_um": X, "fs": 1000.0})
     assert_is(read_record(tmp_path / "a.mat"))
-
-
-def test_a_file_whose_ending_says_nothing_is_known_by_its_first_bytes(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros(3))
-    named = {"time_s": T, "voltage_V": V, "displacement_um": X}
-    with h5py.File(tmp_path / "record.dat", "w") as file:
-        for name, values in named.items():
-            file[name] = values
-    assert_is(read_record(tmp_path / "record.dat"))

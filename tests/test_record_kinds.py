@@ -15,8 +15,6 @@ from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
 from tests.laboratory_bytes import Cell, npz, xlsx
 from tests.reading_here import here
-from tests.test_laboratory_files import OPEN
-from tests.test_laboratory_files import X as OPEN_X
 from tests.tiers import slow_but
 
 N = 40
@@ -174,12 +172,6 @@ def test_comments_remarks_and_what_stands_below_are_no_samples(tmp_path: Path) -
     assert_is(read_record(written(tmp_path, table("TIME(S) VOLTAGE(V) DISP(UM)", mark=" "))))
 
 
-def test_samples_lie_in_rows_too(tmp_path: Path) -> None:
-    rows = zip(("time [s]", "voltage [V]", "displacement [um]"), (T, V, X), strict=True)
-    text = "\n".join(",".join([name, *map(str, values)]) for name, values in rows)
-    assert_is(read_record(written(tmp_path, text)))
-
-
 NAMES: dict[str, dict[str, Any]] = {
     "Sample,voltage [V],displacement [um]": {"sample_time": 1e-3},
     "No.,OUT1 [V],OUT2 [um]": {"sample_time": 1e-3},
@@ -209,11 +201,6 @@ def test_names_that_count_or_mark_are_never_the_time_or_the_drive(
     if "columns" in NAMES[head]:
         for part in str(NAMES[head]["columns"]).split(","):
             assert part in offered["columns"].split(",")
-
-
-def test_a_trigger_beside_the_drive_is_left_alone(tmp_path: Path) -> None:
-    head = "time [s],Trigger (V),Ch 2 (V),displacement [um]"
-    assert_is(read_record(written(tmp_path, table(head, columns=(T, 5 * (V > 50), V, X)))))
 
 
 def several(folder: Path) -> dict[str, Path]:
@@ -259,11 +246,6 @@ def test_several_tables_are_listed_chosen_and_taken_together(
         assert_is(second, v=2 * V)
         assert len({first.sha256, second.sha256}) == len({first.name, second.name}) == 2
         assert_is(read_record(path, columns="table=2"), v=2 * V)
-
-
-def test_a_table_that_is_not_there_is_told(tmp_path: Path) -> None:
-    path = several(tmp_path)["stacked"]
-    assert "there is no table '3'; there are '1', '2'" in refused(path, columns="table=3")
 
 
 def test_packets_have_no_time_of_their_own(tmp_path: Path) -> None:
@@ -341,18 +323,6 @@ def test_any_unit_of_the_right_dimension_is_read(unit: str, size: float, tmp_pat
     np.testing.assert_allclose(np.asarray(record.displacement), size * X, rtol=1e-12)
 
 
-@pytest.mark.parametrize("form", OPEN)
-def test_what_is_offered_reads_the_file_as_typed(
-    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here(monkeypatch)
-    path = written(tmp_path, OPEN[form], f"a{Path(form).suffix or '.csv'}")
-    asked = options(refused(path))
-    assert asked
-    record = read_record(path, **asked)
-    np.testing.assert_allclose(np.asarray(record.displacement), 1e-6 * OPEN_X, rtol=1e-5)
-
-
 def csv_of(path: Path, columns: Mapping[str, Any]) -> None:
     rows = (",".join(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True))
     path.write_text("\n".join([",".join(columns), *rows, ""]))
@@ -414,11 +384,3 @@ def test_every_row_is_read_bit_for_bit(
     np.testing.assert_array_equal(record.time, columns["time [s]"])
     np.testing.assert_array_equal(record.voltage, columns["voltage [V]"])
     np.testing.assert_array_equal(np.asarray(record.displacement), columns["displacement [m]"])
-
-
-@pytest.mark.parametrize("rows", [2000, 3000])
-def test_hdf5_above_the_size_of_a_pipe_is_read_apart(rows: int, tmp_path: Path) -> None:
-    t = np.arange(rows) / 1e3
-    columns = {"time [s]": t, "voltage [V]": np.sin(t), "displacement [m]": np.cos(t)}
-    hdf5_of(tmp_path / "a.h5", columns)
-    np.testing.assert_array_equal(read_record(tmp_path / "a.h5").voltage, np.sin(t))

@@ -1,6 +1,5 @@
 """What a sensor has made is told from what a stack has made."""
 
-import time as clock
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from psa_casadi.records import Record, multisine, read_record, sine, steps, time_grid, triangle
+from psa_casadi.records import Record, multisine, sine, steps, time_grid, triangle
 from psa_casadi.records.noise import quantum_of
 from psa_casadi.records.suspects import cleaned, suspects
-from tests.tiers import slow, slow_but
+from tests.tiers import slow_but
 
 FloatArray = NDArray[np.float64]
 RANGE = 20e-6
@@ -91,14 +90,6 @@ def test_a_kick_of_the_load_is_not_suspect() -> None:
     y[6001:6004] += 0.2 * RANGE
     assert not suspects(replace(base, displacement=y, load_force=load)).mask.any()
     assert list(np.flatnonzero(suspects(replace(base, displacement=y)).mask)) == [6001, 6002, 6003]
-
-
-@pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
-def test_the_measured_records_have_no_suspects(measured_data: object, file: str) -> None:
-    found = suspects(read_record(f"{measured_data}/micromanipulator/{file}.csv"))
-    assert found.counts == {"outlier": 0, "drop-out": 0, "stuck": 0, "saturated": 0}
-    assert found.quantum is None
-    assert found.sentences(file) == ()
 
 
 @pytest.mark.parametrize("width", [1, 2, 3])
@@ -211,18 +202,6 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
     assert found.sentences("c") == ("c: the displacement is quantised in steps of 1 counts.",)
 
 
-@slow
-def test_a_million_samples_are_looked_at_quickly() -> None:
-    t = time_grid(100.0, 1e-4)
-    u = sine(t, 0.0, 100.0, 0.1)
-    y = 1e-7 * u + 2e-8 * np.random.default_rng(5).standard_normal(t.size)
-    y[[200, 500_000, t.size - 5]] += 5e-6
-    started = clock.process_time()
-    found = suspects(Record(name="long", time=t, voltage=u, displacement=y))
-    assert clock.process_time() - started < 10.0
-    assert list(np.flatnonzero(found.mask)) == [200, 500_000, t.size - 5]
-
-
 def test_a_reading_repeated_shortly_while_the_stack_moves_is_masked() -> None:
     """The next reading makes up for what was missed; a stack that always answers late is none."""
     given = record("triangle", "white")
@@ -258,21 +237,3 @@ def test_readings_repeated_to_the_last_digit_are_masked_where_noise_makes_none(
     assert found.counts["stuck"] == int(found.mask.sum()) < 1.1 * places.size + 10
     coarse = np.round(y / (1e-3 * RANGE)) * (1e-3 * RANGE)
     assert suspects(replace(given, displacement=coarse)).counts["stuck"] == 0
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_what_chance_and_digits_repeat_is_not_stuck(seed: int) -> None:
-    """Short records; files with five significant digits; motion without noise and a rest."""
-    rng = np.random.default_rng(seed)
-    short, y = record("sine", "white", seed), np.array(record("sine", "white", seed).displacement)
-    digits = np.round(y[:300] / 2e-3 / RANGE * 1e3) * 2e-3 * RANGE / 1e3
-    given = replace(short.slice(0, 300), displacement=digits)
-    assert suspects(given).counts["stuck"] == 0
-    significant = np.array([float(f"{v:.5g}") for v in y])
-    assert suspects(replace(short, displacement=significant)).counts["stuck"] == 0
-    frequencies = rng.uniform(50.0, 900.0, 8)
-    voltage = np.sum(np.sin(2 * np.pi * np.outer(T, frequencies)), axis=1)
-    voltage -= voltage[300]
-    voltage[:301] = 0.0
-    smooth = Record(name="smooth", time=T, voltage=10.0 * voltage, displacement=1e-7 * voltage)
-    assert not suspects(smooth).mask.any()

@@ -12,11 +12,10 @@ from psa_casadi.components import BASE
 from psa_casadi.model.compose import compose
 from psa_casadi.records import write_record
 from psa_casadi.records.excitation import time_grid, triangle
-from psa_casadi.report.words.tables import timings_table
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import run
-from psa_casadi.simulation.timings import REST, Stage, stage, timed
+from psa_casadi.simulation.timings import REST, stage, timed
 
 MODEL = compose(BASE)
 
@@ -61,15 +60,6 @@ def test_a_stage_ends_with_an_error() -> None:
             time.sleep(0.01)
     assert [s.name for s in spent.stages] == ["failing", "next", REST]
     assert spent.stages[1].wall > 0.009 > spent.stages[0].wall
-
-
-def test_the_table_adds_up() -> None:
-    stages = (Stage("fits", 2.0, 3.0, 10, 8), Stage(REST, 1.0, 1.0))
-    assert timings_table(stages).rows == (
-        ("fits", "2.00 s", "3.00 s", "75 %", "10", "8"),
-        (REST, "1.00 s", "1.00 s", "25 %", "", ""),
-        ("total", "3.00 s", "4.00 s", "100 %", "10", "8"),
-    )
 
 
 def test_a_diagnosis_tells_its_stages(tmp_path: Path) -> None:
