@@ -34,23 +34,6 @@ def planned(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", sorted(STACKS))
-def test_every_figure_of_a_stack_is_shown_with_its_source(name: str) -> None:
-    shown = psa("stacks", name)
-    assert shown.exit_code == 0
-    head, table = shown.stdout.split("\n\n")
-    assert " ".join(head.split()) == f"{name}: {STACKS[name].description}"
-    assert max(map(len, shown.stdout.splitlines())) <= 80
-    source = table.splitlines()[0].index("source")
-    rows = re.split(r"\n(?=\S)", table)[2:]
-    assert len(rows) == len(STACKS[name].values)
-    for row in rows:
-        lines = row.splitlines()
-        figure = STACKS[name].values[lines[0].split()[0]]
-        assert " ".join(line[source:] for line in lines).split() == figure.source.split()
-        assert (" assumed " in lines[0][:source]) == figure.assumed
-
-
 @slow
 def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> None:
     fmu = tmp_path / "p.fmu"

@@ -20,7 +20,7 @@ from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps
 from psa_casadi.scratch import PREFIX
 from psa_casadi.simulation import compiler
-from tests.record_files import HEADER, ROWS, write
+from tests.record_files import write
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
 MODEL = dumps(compose(BASE))
@@ -36,11 +36,6 @@ def shell(line: str, **variables: str) -> "subprocess.CompletedProcess[str]":
         ["bash", "-c", start + line], capture_output=True, encoding="utf-8", check=False,
         env={**os.environ, **variables}, timeout=60,
     )  # fmt: skip
-
-
-@pytest.fixture
-def record(tmp_path: Path) -> Path:
-    return write(tmp_path / "record.csv", HEADER, *ROWS)
 
 
 def program(path: Path, *lines: str) -> Path:
@@ -232,22 +227,3 @@ def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
         fill()
     assert (tmp_path / "x.fmu").read_text() == "old"
     assert os.listdir(tmp_path) == ["x.fmu"]
-
-
-@posix
-@pytest.mark.slow
-def test_a_command_without_home_cache_temporary_folder_and_docstrings(
-    record: Path, tmp_path: Path
-) -> None:
-    output = tmp_path / "m.json"
-    done = shell(
-        f"unset HOME; psa simulate --model '{write(tmp_path / 'model.json', MODEL)}'"
-        f" --input '{record}' -o '{output}'",
-        PSA_CASADI_CACHE="/dev/null/cache", TMPDIR=str(tmp_path / "no"), MPLCONFIGDIR="/dev/null",
-        PYTHONOPTIMIZE="2", **ASCII,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    told = [line for line in done.stderr.splitlines() if "cache" in line]
-    assert len(told) == 1
-    assert "The cache folder /dev/null/cache/models cannot be used (Not a directory)" in told[0]
-    assert output.read_text(encoding="utf-8").startswith("time")

@@ -12,9 +12,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from pyarrow import parquet
 from scipy.io import savemat
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
 from psa_casadi.records.read import apart
@@ -203,20 +201,6 @@ def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     assert "array 'z' (displacement) has 7 values, 'time' has 24" in problem
 
 
-def test_mistakes_of_a_parquet_file_are_told_at_once(tmp_path: Path) -> None:
-    t = T.copy()
-    t[1] = 9.0
-    columns = {"time [s]": t, "voltage [V]": ["a"] * N, "displacement [kg]": Y}
-    problems = problems_of(table(tmp_path / "a.parquet", columns))
-    assert len(problems) == 3
-    everything = "\n".join(problems)
-    assert (
-        "column names, column 'displacement': the unit 'kg' does not measure length" in everything
-    )
-    assert "column 'voltage': holds texts such as 'a', expected numbers" in everything
-    assert "row 3, column 'time': time goes back (from 9 in row 2 to 0.25)" in everything
-
-
 def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
     text = write(tmp_path / "text.mat", HEADER, *ROWS)
     (problem,) = problems_of(text)
@@ -243,25 +227,6 @@ def test_a_missing_optional_package_is_named(
     monkeypatch.setattr(apart, "find_spec", lambda name: None)
     (problem,) = problems_of(path)
     assert "reading it needs pyarrow, which is not installed; run `pip install pyarrow`" in problem
-
-
-def test_the_commands_take_every_format(tmp_path: Path) -> None:
-    path = mat(tmp_path / "a.mat", {"t": 1e-3 * T, "u": 10 + U})
-    out = tmp_path / "out.csv"
-    base = ["simulate", "--stack", "demo", "--input", str(path), "-o", str(out)]
-    result = CliRunner().invoke(app, [*base, "--columns", "time=t,voltage=u"])
-    assert result.exit_code == 0, result.output
-    np.testing.assert_array_equal(read_record(out).voltage, 10 + U)
-    for command in ("identify", "diagnose"):
-        arguments = [command, str(path), "-o", str(tmp_path / "m.json")]
-        result = CliRunner().invoke(
-            app, [*arguments, "--columns", "time=t,voltage=u,displacement=u:s"]
-        )
-        assert result.exit_code == 2
-        assert "the unit 's' does not measure length" in result.stderr
-        result = CliRunner().invoke(app, [*arguments, "--columns", "time=t,voltage=u"])
-        assert result.exit_code == 2
-        assert "the column 'displacement' is missing" in result.stderr
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t"])

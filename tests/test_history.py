@@ -13,54 +13,11 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.simulation.history import memory_after, settled_at
+from psa_casadi.simulation.history import settled_at
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.tiers import slow
 
 STACK = stack_model("P-885.51")
-
-
-def _falling() -> tuple[FloatArray, FloatArray]:
-    t = np.linspace(0.0, 1.0, 1001)
-    return t, 60.0 + 60.0 * np.cos(np.pi * t)
-
-
-@slow
-def test_a_record_that_begins_at_the_top_follows_the_reference_played_from_zero() -> None:
-    """Independent: the reference integrates the way up and the record in one piece."""
-    t, voltage = _falling()
-    whole_t = np.concatenate([np.linspace(0.0, 1.0, 501), 1.0 + t[1:]])
-    whole_v = np.concatenate([np.linspace(0.0, 120.0, 501), voltage[1:]])
-    expected = reference.simulate(
-        STACK.values, lambda time: float(np.interp(time, whole_t, whole_v)), whole_t,
-        mechanics="cascade", breakpoints=[1.0],
-    ).states["x"][500:]  # fmt: skip
-    span = float(np.ptp(expected))
-    memory = memory_after(STACK, [], at=120.0)
-    after = simulate(STACK, t, voltage, memory=memory).displacement
-    relaxed = simulate(STACK, t, voltage).displacement
-    # the reference comes to the first sample in motion, the record begins at rest
-    assert np.abs(after - expected)[1:].max() < 2e-5 * span
-    assert np.abs(relaxed - expected).max() > 0.05 * span
-
-
-def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
-    creeping = STACK.with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02, "creep_time": 0.1})
-    model = creeping.with_effect(EFFECTS["hysteresis_memory"], {"memory_gain": 0.05})
-    turns, sweep, rest = [0.0, 100.0, 20.0, 80.0, 50.0], 0.7, 2.0
-    corners = np.append(sweep * np.arange(len(turns)), sweep * (len(turns) - 1) + rest)
-    t = np.linspace(0.0, 1.0, 501)
-    voltage = 50.0 + 30.0 * np.sin(2 * np.pi * t)
-    before = np.linspace(0.0, corners[-1], 2401)
-    played = np.interp(before, corners, [*turns, turns[-1]])
-    whole = simulate(
-        model, np.append(before, corners[-1] + t[1:]), np.append(played, voltage[1:])
-    ).displacement[2400:]
-    memory = memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
-    # the record begins in motion: the fast states start there, as `start_state` has it
-    found = simulate(model, t, voltage, memory=memory).displacement
-    assert np.abs(found - whole)[50:].max() < 1e-4 * np.ptp(whole)
 
 
 @slow

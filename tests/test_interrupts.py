@@ -259,29 +259,6 @@ def interrupted(
 
 @slow
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to one process")
-@pytest.mark.parametrize(
-    ("command", "word"),
-    [
-        ("diagnose", "base fit from"),
-        ("diagnose", "cause 1: fitting"),
-        ("identify", "base fit from"),
-    ],
-)
-def test_one_interrupt_ends_a_command(command: str, word: str, tmp_path: Path) -> None:
-    """At other words, in one process: above; in the screening, twice: below."""
-    make_record("slow_creep", 3, tmp_path / "r.csv")
-    process, took, told = interrupted(word, tmp_path / "r.csv", tmp_path, command)
-    assert process.returncode == 130
-    assert took < 2.0
-    assert "Interrupted: " in told
-    left = {p.name for p in tmp_path.iterdir()}
-    assert left <= {"r.csv", "m.json"}
-    if "m.json" in left:
-        assert load_model(tmp_path / "m.json").provenance.interrupted
-
-
-@slow
-@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to one process")
 def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     make_record("slow_creep", 3, tmp_path / "r.csv")
     process, took, _ = interrupted("screening", tmp_path / "r.csv", tmp_path, "diagnose", times=2)

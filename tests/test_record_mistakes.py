@@ -131,16 +131,6 @@ def test_a_file_full_of_mistakes_lists_twenty_and_counts_the_others(
     assert problems[-1] == f"... and {expected - 20} more"
 
 
-def test_too_few_samples_and_no_displacement_are_refused(tmp_path: Path) -> None:
-    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *ROWS[:7]))
-    assert "found 7 samples, expected at least 16" in problem
-    (problem,) = problems_of(write(tmp_path / "b.csv", HEADER))
-    assert "found 0 samples" in problem
-    empty = [row.rsplit(",", 1)[0] + "," for row in ROWS]
-    (problem,) = problems_of(write(tmp_path / "c.csv", HEADER, *empty))
-    assert "column 'displacement': found no valid values in 20 rows" in problem
-
-
 def test_instants_that_are_one_in_seconds_are_refused(tmp_path: Path) -> None:
     rows = [f"{k}e-323,{k},{k}" for k in range(1, 21)]
     assert read_record(write(tmp_path / "a.csv", HEADER, *rows)).n == 20

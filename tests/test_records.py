@@ -45,26 +45,6 @@ def test_comments_quotes_blank_lines_and_capitals_are_tolerated(tmp_path: Path) 
     assert record.mask.shape == (20,)
 
 
-@pytest.mark.parametrize("slow", [False, True])
-def test_missing_displacement_is_masked_and_nothing_is_made_up(tmp_path: Path, slow: bool) -> None:
-    rows = ROWS.copy()
-    rows[3], rows[5], rows[6] = "0.003,3,", "0.005,5,nan", "0.006,6, " if slow else "0.006,6,NaN"
-    record = read_record(write(tmp_path / "a.csv", HEADER, *rows))
-    assert record.displacement is not None
-    assert list(np.flatnonzero(~record.mask)) == [3, 5, 6]
-    assert np.isnan(record.displacement[[3, 5, 6]]).all()
-    first = [",".join([row.split(",")[2], *row.split(",")[:2]]) for row in rows]
-    again = read_record(write(tmp_path / "b.csv", "displacement [um],time [s],voltage [V]", *first))
-    assert again.displacement is not None
-    np.testing.assert_array_equal(again.displacement, record.displacement)
-    middle = [",".join([row.split(",")[i] for i in (0, 2, 2, 1)]) for row in rows]
-    again = read_record(
-        write(tmp_path / "c.csv", "time [s],displacement [um],other,voltage [V]", *middle)
-    )
-    assert again.displacement is not None
-    np.testing.assert_array_equal(again.displacement, record.displacement)
-
-
 def test_counts_stay_counts(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv", "time [s],voltage [V],displacement [counts]", *ROWS)
     record = read_record(path)
