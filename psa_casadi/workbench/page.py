@@ -8,7 +8,7 @@ from functools import cache
 from html import escape
 from importlib.resources import files
 
-from psa_casadi.records.read.columns import COLUMNS
+from psa_casadi.records.record import COLUMNS
 from psa_casadi.units import units_of
 from psa_casadi.version import __version__
 

@@ -25,7 +25,8 @@ from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.evidence import evidence_texts
 from psa_casadi.model.model_file import dumps
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.columns import COLUMNS, parse_columns
+from psa_casadi.records.read.columns import parse_columns
+from psa_casadi.records.record import COLUMNS
 from psa_casadi.units import convert, parse_unit, si_unit
 from psa_casadi.variables import Interval, Provenance
 from tests.evidence_models import evident_model

@@ -10,7 +10,6 @@ import numpy as np
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
-    COLUMNS,
     SI_UNITS,
     ColumnMap,
     Field,
@@ -27,6 +26,7 @@ from psa_casadi.records.read.columns import (
     words_of,
 )
 from psa_casadi.records.read.table import Table, as_times, decimal_sign, evened, numbers_in
+from psa_casadi.records.record import COLUMNS
 from psa_casadi.units import parse_unit
 
 #: The quantities that tell the columns which every record has.

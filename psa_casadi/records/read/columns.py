@@ -7,34 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.record import COLUMNS, Column
 from psa_casadi.units import UNITS, parse_unit, units_of
-
-
-@dataclass(frozen=True)
-class Column:
-    """One kind of column: the quantities it may hold and a header as an example."""
-
-    name: str
-    quantities: tuple[str, ...]
-    example: str
-
-
-#: Every column a record may have; others in a file are left alone.
-COLUMNS: dict[str, Column] = {
-    column.name: column
-    for column in (
-        Column("time", ("time",), "time [s]"),
-        Column("voltage", ("voltage",), "voltage [V]"),
-        Column("displacement", ("length", "sensor counts"), "displacement [um]"),
-        Column("load_force", ("force",), "load_force [N]"),
-        Column("current", ("current",), "current [mA]"),
-        Column("temperature", ("temperature",), "temperature [degC]"),
-        Column("monitor_voltage", ("voltage",), "monitor_voltage [V]"),
-        Column("charge", ("charge",), "charge [uC]"),
-        Column("displacement_2", ("length",), "displacement_2 [um]"),
-        Column("strain", ("ratio",), "strain [ppm]"),
-    )
-}
 
 
 @dataclass(frozen=True)
@@ -67,10 +41,7 @@ class Source:
 ColumnMap = Mapping[str, Source]
 
 #: Where nobody names a unit, a column is taken to be in this one; a displacement never is.
-SI_UNITS = {
-    "time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K",
-    "monitor_voltage": "V", "charge": "C", "strain": "1",
-}  # fmt: skip
+SI_UNITS = {name: c.unit for name, c in COLUMNS.items() if "length" not in c.quantities}
 
 
 def ready_line(sources: ColumnMap, sample_time: float | None = None, table: str = "") -> str:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
-    COLUMNS,
     columns_known,
     measures,
     stated_unit,
@@ -33,7 +32,7 @@ from psa_casadi.records.read.table import (
     unit_in,
     unit_of_times,
 )
-from psa_casadi.records.record import FEWEST_SAMPLES
+from psa_casadi.records.record import COLUMNS, FEWEST_SAMPLES
 from psa_casadi.units import units_of
 
 #: Lines in which the first header is looked for, and the most that are asked for further ones.
