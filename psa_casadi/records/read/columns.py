@@ -215,23 +215,20 @@ ALIASES: dict[str, tuple[str, ...]] = {
     ),
     "strain": ("strain", "strain gauge", "dehnung"),
 }  # fmt: skip
-#: Units as instruments write them out, in lower case.
-UNIT_WORDS = {
-    "s": ("sec", "secs", "second", "seconds", "sekunden"),
-    "ms": ("msec", "millisecond", "milliseconds"),
-    "us": ("usec", "microsecond", "microseconds"),
-    "V": ("volt", "volts"),
-    "mV": ("millivolt", "millivolts"),
-    "m": ("meter", "meters", "metre", "metres"),
-    "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
-    "um": ("micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
-    "nm": ("nanometer", "nanometers", "nanometre", "nanometres"),
-    "N": ("newton", "newtons"),
-    "A": ("amp", "amps", "ampere", "amperes"),
-    "mA": ("milliamp", "milliamps"),
-    "degC": ("celsius", "deg c", "degrees celsius"),
-}
-_UNIT_OF = {word: unit for unit, words in UNIT_WORDS.items() for word in words}
+#: Units as instruments write them out, in lower case, each with its plural.
+_SPELLED = {"s": ("second", "sec"), "V": ("volt",), "m": ("meter", "metre"), "N": ("newton",),
+            "A": ("ampere", "amp")}  # fmt: skip
+_MULTIPLES = {"": "", "m": "milli", "u": "micro", "n": "nano"}
+_UNIT_OF = {
+    f"{spelled}{word}{end}": f"{prefix}{unit}"
+    for unit, words in _SPELLED.items()
+    for word in words
+    for prefix, spelled in _MULTIPLES.items()
+    for end in ("", "s")
+} | {
+    "msec": "ms", "usec": "us", "sekunden": "s", "micron": "um", "microns": "um",
+    "celsius": "degC", "deg c": "degC", "degrees celsius": "degC",
+}  # fmt: skip
 #: What names the place of a channel behind the quantity: `Current Position of axis 1`.
 _OF_A_PLACE = re.compile(r" of [\w ]*?(axis|chan|channel)\s*:?\s*\w+$")
 _COLUMN_OF = {alias: column for column, names in ALIASES.items() for alias in names}

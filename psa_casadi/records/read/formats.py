@@ -277,40 +277,36 @@ def _elements(value: Any) -> Any:
     return value
 
 
-def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]] | None:
-    """Return name, numbers and unit of what dSPACE ControlDesk records, None where it is another.
+def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]]:
+    """Return name, numbers and unit of what dSPACE ControlDesk records, none where it is another.
 
     There `X` holds the time in seconds as `Data`, and each element of `Y` a signal with its `Name`.
     Where there are several times, or signals of one name, they are counted.
     """
-    times, signals = (_with_data(value.get(axis)) for axis in ("X", "Y"))
-    if not times or not any(_told(signal, "Name") for signal in signals):
-        return None
-    texts = [_told(signal, "Name") for signal in signals]
-    names = [name_without_unit(text) for text in texts]
-    if "" in names or len(set(names)) < len(names):
-        names = [f"Y.{k}" for k in range(1, len(names) + 1)]
-    clocks = ["time"] if len(times) == 1 else [f"X.{k}" for k in range(1, len(times) + 1)]
-    return [
-        *((own, x["Data"], _told(x, "Unit") or "s") for own, x in zip(clocks, times, strict=True)),
-        *(
-            (own, y["Data"], _told(y, "Unit") or stated_unit(text) or "")
-            for own, text, y in zip(names, texts, signals, strict=True)
-        ),
-    ]
+    found: list[tuple[str, Any, str | None]] = []
+    for axis in ("X", "Y"):
+        own = _elements(value.get(axis))
+        several = own if isinstance(own, list) else [own]
+        data = [s.get("Data") if isinstance(s, Mapping) else None for s in several]
+        if not all(isinstance(numbers, np.ndarray) for numbers in data):
+            return []
+        texts, units = ([_text_of(s.get(key)) for s in several] for key in ("Name", "Unit"))
+        names = [name_without_unit(text) for text in texts]
+        if axis == "X":
+            names, usual = ["time"] * len(several), "s"
+        elif any(names):
+            usual = ""
+        else:
+            return []
+        if "" in names or len(set(names)) < len(names):
+            names = [f"{axis}.{k}" for k in range(1, len(names) + 1)]
+        for name, text, unit, numbers in zip(names, texts, units, data, strict=True):
+            found.append((name, numbers, unit or stated_unit(text) or usual))
+    return found
 
 
-def _with_data(value: Any) -> list[Mapping[str, Any]]:
-    """Return the structures that hold numbers as `Data`, none where one does not."""
-    value = _elements(value)
-    several = value if isinstance(value, list) else [value]
-    found = [v for v in several if isinstance(v, Mapping) and isinstance(v.get("Data"), np.ndarray)]
-    return found if len(found) == len(several) else []
-
-
-def _told(signal: Mapping[str, Any], field: str) -> str:
-    text = signal.get(field)
-    return text.strip() if isinstance(text, str) else ""
+def _text_of(value: object) -> str:
+    return value.strip() if isinstance(value, str) else ""
 
 
 def _modelica(path: str) -> Iterator[Series]:
