@@ -150,7 +150,7 @@ def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray,
     """
     plain = cells if point == "." else [c.translate(SWAPPED) for c in cells]
     with suppress(ValueError):
-        values = np.array(list(map(float, plain)))
+        values = np.array([float(cell or "nan") for cell in plain])
         if "_" not in "".join(cells):
             return without_overload(values), np.zeros(values.size, dtype=np.bool_)
     known = {cell: _number(cell, point, unit) for cell in set(cells)}

@@ -374,15 +374,7 @@ class _Part:
         if body.count(mark) != len(rows) * (width - 1):
             return None
         if point == ",":
-            body = body.translate(SWAPPED)
-        body = f"\n{body}\n"
-        if point == "," or any(gap in body for gap in (mark * 2, f"{mark}\n", f"\n{mark}")):
-            for gap, filled in (
-                (mark * 2, f"{mark}nan{mark}"), (mark * 2, f"{mark}nan{mark}"),
-                (f"{mark}\n", f"{mark}nan\n"), (f"\n{mark}", f"\nnan{mark}"),
-            ):  # fmt: skip
-                body = body.replace(gap, filled)
-            rows = body[1:-1].split("\n")
+            rows = body.translate(SWAPPED).split("\n")
         del body  # of a long record it is as large as the rows
         try:
             values = np.loadtxt(rows, delimiter=mark, comments=None, usecols=asked, ndmin=2)
