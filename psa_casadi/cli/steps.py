@@ -35,7 +35,7 @@ class Course:
         return 0
 
 
-_BASE = ("starting values", ("starting values", "with the sign"))
+_BASE = ("starting values", ("starting values",))
 _FIT = ("the base model", ("base fit", "exchanged", "resonances and lags", "moments", "the model"))
 IDENTIFY = Course(
     (_BASE, _FIT, ("what to measure next", ("what further",)), ("files", ("profile", "writing"))),
