@@ -219,26 +219,6 @@ def test_a_result_that_is_not_as_expected_ends_with_1(
     assert [f for f in cases.values() if f] == [wrong] * bool(wrong)
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--expect", "cause_name"), "'cause_name' is no verdict; is 'cause_named' meant? there"),
-        (("--expect", "good"), "there are adequate, cause_named, partly_explained, ambiguous,"),
-        (("--expect", ","), "--expect names no verdict"),
-        (("--max-error", "0.5"), "give a positive percentage of the range, as 0.5%"),
-        (("--max-error", "-1%"), "give a positive percentage"),
-        (("--max-error", "nan%"), "give a positive percentage"),
-        (("--junit", "a.csv/x"), "a.csv"),
-    ],
-)
-def test_what_cannot_be_expected_is_refused(
-    asked: list[str | Path], options: tuple[str, ...], said: str
-) -> None:
-    result = run(*asked, *options)
-    assert result.exit_code == 2
-    assert said in result.output
-
-
 def test_the_checks_of_an_fmu_are_tests() -> None:
     rows = (
         CheckRow("calls", 0.0, 0.0, True, ""),
