@@ -9,15 +9,15 @@ import h5py
 import numpy as np
 import pyarrow
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pyarrow import parquet
 from scipy.io import savemat
 
 from psa_casadi.errors import InputError
-from psa_casadi.records import Record, read_record, read_records
+from psa_casadi.records import read_record, read_records
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import parse_columns
-from tests.record_files import HEADER, ROWS, write
+from tests.record_files import HEADER, ROWS, assert_is, problems_of, write
 
 N = 24
 T = np.arange(N) / 8.0
@@ -49,22 +49,6 @@ def _fill(group: Any, content: Mapping[str, object]) -> None:
 def table(path: Path, columns: Mapping[str, object]) -> Path:
     parquet.write_table(pyarrow.table(dict(columns)), path)
     return path
-
-
-def problems_of(path: Path, columns: str | None = None) -> tuple[str, ...]:
-    with pytest.raises(InputError) as caught:
-        read_record(path, columns=columns)
-    assert all(p.startswith((str(path), "--columns")) for p in caught.value.problems)
-    assert all(p.endswith(".") for p in caught.value.problems)
-    assert len(caught.value.problems) < 20
-    return caught.value.problems
-
-
-def assert_is(record: Record, t: ArrayLike, u: ArrayLike, y: ArrayLike) -> None:
-    assert record.displacement is not None
-    np.testing.assert_allclose(record.time, np.asarray(t, float), rtol=1e-15)
-    np.testing.assert_allclose(record.voltage, np.asarray(u, float), rtol=1e-15)
-    np.testing.assert_allclose(record.displacement, np.asarray(y, float), rtol=1e-15)
 
 
 @pytest.mark.parametrize("version", ["5", "7", "7.3"])
@@ -135,13 +119,13 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
     plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
     assert plain.displacement is not None
     assert_is(record, plain.time / 1e3, plain.voltage / 1e3, plain.displacement)
-    (problem,) = problems_of(path, "time=t,voltage=amp out,displacement=LVDT:mm")
+    (problem,) = problems_of(path, columns="time=t,voltage=amp out,displacement=LVDT:mm")
     assert "line 1, column 'LVDT': the header gives the unit 'um', --columns gives 'mm'" in problem
-    (problem,) = problems_of(path, "time=t,displacement=LVTD")
+    (problem,) = problems_of(path, columns="time=t,displacement=LVTD")
     assert "'LVTD', which --columns names for 'displacement', is not in the header" in problem
     assert "(found: time, voltage, amp out, LVDT)" in problem
     (problem,) = problems_of(
-        write(tmp_path / "c.csv", "time [s],voltage [V],y", *ROWS), "displacement=y"
+        write(tmp_path / "c.csv", "time [s],voltage [V],y", *ROWS), columns="displacement=y"
     )
     assert "line 1, column 'y': has no unit" in problem
 
@@ -154,7 +138,7 @@ def test_what_is_said_of_one_file_stands_for_what_is_said_of_all(tmp_path: Path)
     a, b = read_records([first, second], columns=f"{said},{mine}")
     assert a.displacement is not None
     assert_is(b, a.time / 1e3, a.voltage, a.displacement)
-    (problem,) = problems_of(first, mine)
+    (problem,) = problems_of(first, columns=mine)
     assert "line 1" in problem
 
 
@@ -184,7 +168,7 @@ def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     t, y = T.copy(), Y.copy()
     t[5], y[9] = t[3], np.inf
     path = mat(tmp_path / "a.mat", {"t": t, "u": np.r_[U[:4], np.nan, U[5:]], "y": y, "z": Y[:7]})
-    problems = problems_of(path, "time=t,voltage=u,displacement=y:um")
+    problems = problems_of(path, columns="time=t,voltage=u,displacement=y:um")
     assert len(problems) == 3
     assert "sample 6, column 'time': time goes back (from 0.5 in sample 5 to 0.375)" in problems[0]
     assert "in every sample; remove repeated samples" in problems[0]
@@ -194,10 +178,10 @@ def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     problems = problems_of(path)
     assert "array names: 'time' has no unit (t), 'voltage' has no unit (u)" in problems[0]
     assert "--columns" not in "".join(problems)  # what would not read the file is not offered
-    problems = problems_of(path, "time=t,voltage=w,displacement=y")
+    problems = problems_of(path, columns="time=t,voltage=w,displacement=y")
     assert "'w', which --columns names for 'voltage', is not in the header" in "".join(problems)
     assert "column 'y': has no unit; write it in brackets" in "".join(problems)
-    (problem,) = problems_of(path, "time=t,voltage=u,displacement=z:um")
+    (problem,) = problems_of(path, columns="time=t,voltage=u,displacement=z:um")
     assert "array 'z' (displacement) has 7 values, 'time' has 24" in problem
 
 

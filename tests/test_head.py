@@ -12,10 +12,8 @@ from psa_casadi.errors import InputError
 from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import Field
 from tests.laboratory_bytes import Cell, xlsx
+from tests.record_files import T, V, X
 
-T = np.arange(20) * 1e-3
-V = np.arange(20) % 7 + 0.5
-X = np.arange(20) % 7 / 10
 ROWS = [f"{t:.6g},{v:.6g},{x:.6g}" for t, v, x in zip(T, V, X, strict=True)]
 
 
@@ -64,8 +62,10 @@ def test_arrays_of_several_lengths(tmp_path: Path) -> None:
     assert head.names == ("t", "u_mV", "x", "fs")
     assert head.units == ("", "mV", "", "")
     assert head.rows == (
-        ("0", "0.5", "0", "1000"), ("0.001", "1.5", "0.1", "1000"), ("0.002", "2.5", "0.2", ""),
-    )  # fmt: skip
+        ("0", "0.5", "0.25", "1000"),
+        ("0.001", "1.5", "0.35", "1000"),
+        ("0.002", "2.5", "0.45", ""),
+    )
     assert head.guess == {
         "time": Field(0, "s"), "voltage": Field(1, "mV"), "displacement": Field(2, "um"),
     }  # fmt: skip

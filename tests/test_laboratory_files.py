@@ -1,8 +1,6 @@
 """One record in the forms that laboratories keep it in: read as it is, or told what to type."""
 
 import gzip
-import re
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,11 +11,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.records import read_record, record_from
 from psa_casadi.records.read.columns import parse_columns
 from tests.laboratory_bytes import gcs, hdf5, lvm, named, npy, npz, tdms, xlsx
-
-N = 20
-T = np.arange(N) * 1e-3
-V = np.arange(N) % 7 + 0.5
-X = np.arange(N) % 7 / 10 + 0.25
+from tests.record_files import T, V, X, assert_is, offered, problems_of, refused
 
 
 def rows(delimiter: str = ",", time: float = 1.0, point: str = ".") -> list[str]:
@@ -111,11 +105,7 @@ READ: dict[str, bytes] = {
 
 
 def assert_read(path: Path, columns: str | None = None) -> None:
-    record = read_record(path, columns=columns)
-    assert record.displacement is not None
-    np.testing.assert_allclose(record.time, T, rtol=1e-12)
-    np.testing.assert_allclose(record.voltage, V, rtol=1e-12)
-    np.testing.assert_allclose(record.displacement, 1e-6 * X, rtol=1e-5)
+    assert_is(read_record(path, columns=columns), T, V, 1e-6 * X, 1e-5)
 
 
 def kept(folder: Path, form: str, content: bytes) -> Path:
@@ -169,11 +159,7 @@ OPEN: dict[str, bytes] = {
 @pytest.mark.parametrize("form", OPEN)
 def test_what_cannot_be_decided_ends_with_the_line_to_type(form: str, tmp_path: Path) -> None:
     path = kept(tmp_path, form, OPEN[form])
-    with pytest.raises(InputError) as caught:
-        read_record(path)
-    typed = re.findall(r"--columns (\S.*?) \(with your units", str(caught.value))
-    assert len(set(typed)) == 1, caught.value  # one line for all that is open
-    assert_read(path, columns=shlex.split(typed[0])[0])
+    assert_read(path, **offered(refused(path)))  # one line for all that is open
 
 
 @pytest.mark.parametrize(
@@ -191,10 +177,8 @@ def test_the_line_to_type_is_told_once_and_works(
     path = tmp_path / "r.csv"
     milliseconds = 1e3 if ":ms" in line else 1.0
     path.write_text("\n".join([head, *rows(time=milliseconds), ""]))
-    with pytest.raises(InputError) as caught:
-        read_record(path, columns=given)
-    assert re.findall(r"--columns (\S+) \(with your units\)", str(caught.value)) == [line]
-    assert len(caught.value.problems) == 1
+    (problem,) = problems_of(path, columns=given)
+    assert offered(problem) == {"columns": line}
     assert_read(path, columns=line)
 
 

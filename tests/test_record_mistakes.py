@@ -6,14 +6,7 @@ import pytest
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import file_bytes
-from tests.record_files import HEADER, ROWS, write
-
-
-def problems_of(path: Path, *, need_excitation: bool = False) -> tuple[str, ...]:
-    with pytest.raises(InputError) as caught:
-        read_record(path, need_excitation=need_excitation)
-    assert all(problem.startswith((str(path), "... and")) for problem in caught.value.problems)
-    return caught.value.problems
+from tests.record_files import HEADER, ROWS, problems_of, write
 
 
 def with_row(row: int, text: str) -> list[str]:
