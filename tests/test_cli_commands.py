@@ -1,4 +1,4 @@
-"""The command `psa design mechanism`: files, page, and what it says of mistakes."""
+"""Single commands: stacks, models, what CI asks, the mechanism, and what is said of mistakes."""
 
 import json
 import re

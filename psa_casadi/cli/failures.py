@@ -1,4 +1,4 @@
-"""How a command ends when something is wrong: 2 for the user's input, 1 for everything else."""
+"""How a command ends: 2 for the user's input, 1 for everything else, 130 for Ctrl-C."""
 
 import atexit
 import contextlib

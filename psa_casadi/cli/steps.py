@@ -1,4 +1,4 @@
-"""How far a long work is, in words: the step of how many, the time so far, what is usual."""
+"""What long work tells: its step, the time so far, what is usual, and events in a file."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The devices of which there are public records, and every dataset by name."""
+"""Public datasets: what is published under which licence, and how a record is made of it."""
 
 import io
 from collections.abc import Iterable, Sequence

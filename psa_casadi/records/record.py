@@ -1,4 +1,4 @@
-"""One experiment: what was applied to the stack and what was measured."""
+"""One experiment: its columns, what must hold for their numbers, and the record of them."""
 
 import hashlib
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The columns a record may have, their units, and which array of a file is which of them."""
+"""What headers mean: columns by name and unit, and `--columns`, which says it in their place."""
 
 import difflib
 import os

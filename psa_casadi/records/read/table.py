@@ -1,4 +1,4 @@
-"""What every file is read to: tables of named columns, whose cells are numbers or text."""
+"""What every file is read to: tables of named columns, whose cells are numbers, text or times."""
 
 import calendar
 import math
