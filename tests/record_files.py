@@ -1,9 +1,66 @@
+"""Records in files, what is read of them, and what is said of those that are not read."""
+
+import re
+import shlex
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from psa_casadi.errors import InputError
+from psa_casadi.records import Record, read_record
 
 HEADER = "time [s],voltage [V],displacement [um]"
 ROWS = [f"{k / 1000},{k % 7},{k % 7 / 10}" for k in range(20)]
+#: A time [s], a voltage [V] and a displacement [um] of 20 samples that have few digits.
+T, V, X = np.arange(20) * 1e-3, np.arange(20) % 7 + 0.5, np.arange(20) % 7 / 10 + 0.25
+_OFFERED = re.compile(r"((?:--columns|--sample-time) .*?) \(with your|(--columns table=\S+?)[.,]? ")
 
 
 def write(path: Path, *lines: str, end: str = "\n", encoding: str = "utf-8") -> Path:
+    """Write lines of text."""
     path.write_bytes((end.join(lines) + end).encode(encoding))
     return path
+
+
+def assert_is(
+    record: Record, t: ArrayLike, v: ArrayLike, x: ArrayLike, accuracy: float = 1e-12
+) -> None:
+    """Demand the columns of a record in SI units; its time may begin anywhere."""
+    begin = np.asarray(t, float)
+    assert record.displacement is not None
+    np.testing.assert_allclose(
+        record.time - record.time[0], begin - begin[0], rtol=1e-9, atol=1e-12
+    )
+    np.testing.assert_allclose(record.voltage, np.asarray(v, float), rtol=accuracy)
+    np.testing.assert_allclose(record.displacement, np.asarray(x, float), rtol=accuracy)
+
+
+def problems_of(path: Path, **asked: Any) -> tuple[str, ...]:
+    """Return the sentences with which a file is refused; each begins with its name."""
+    with pytest.raises(InputError) as caught:
+        read_record(path, **asked)
+    begin = (*str(path).split("+"), str(path), "--columns", "... and")
+    assert all(p.startswith(begin) for p in caught.value.problems), caught.value
+    return caught.value.problems
+
+
+def refused(path: Path, **asked: Any) -> str:
+    """Return what is said of a file that is refused."""
+    return "\n".join(problems_of(path, **asked))
+
+
+def offered(said: str) -> dict[str, Any]:
+    """Return the options that a message offers once, as the command line would take them."""
+    every = {a or b for a, b in _OFFERED.findall(said + " ")}
+    found = every - {"--columns table=all"}
+    assert len(found) < 2, said
+    words = shlex.split(found.pop()) if found else []
+    asked: dict[str, Any] = {}
+    if "--columns" in words:
+        asked["columns"] = words[words.index("--columns") + 1]
+    if "--sample-time" in words:
+        asked["sample_time"] = float(words[words.index("--sample-time") + 1])
+    return asked

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.datasets.conversions.one_axis import linear_response
+from psa_casadi.datasets.devices import linear_response
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model
 from tests.benchmarks.mirror import RATE, SKIPPED, run_on, scores, settled

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import fmpy
-import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -20,8 +19,6 @@ from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import load_model, save_model
 from psa_casadi.records import multisine, read_record, time_grid, write_record
 from psa_casadi.records.split import whole
-from psa_casadi.report.words.text import identification_text
-from psa_casadi.simulation.simulate import simulate_record
 from tests.html_page import Page, figures
 from tests.identified_plants import same_as_the_named_stack
 from tests.test_report import png_size
@@ -33,18 +30,6 @@ pytestmark = pytest.mark.xdist_group("demo")
 
 #: The record that the demonstration copies.
 DEMO = Path(psa_casadi.__file__).parent / "data" / "demo.csv"
-COMMANDS = {
-    (): "demo",
-    ("demo",): "psa demo",
-    ("identify",): "psa identify",
-    ("simulate",): "psa simulate",
-    ("diagnose",): "psa diagnose",
-    ("effects",): "psa effects",
-    ("stacks",): "psa stacks",
-    ("export",): "fmu",
-    ("export", "fmu"): "psa export fmu",
-    ("check",): "psa check",
-}
 
 
 @dataclass(frozen=True)
@@ -82,15 +67,6 @@ def planned(tmp_path: Path) -> tuple[Path, Path]:
     return model, voltage
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_shows_an_example_that_is_a_command(command: tuple[str, ...]) -> None:
-    text = " ".join(done(*command, "--help").stdout.split())
-    assert COMMANDS[command] in text
-    if command and command != ("export",):
-        assert f"Example: psa {' '.join(command)}" in text
-        assert "--quiet" in text
-
-
 def test_the_version_is_one() -> None:
     assert done("--version").stdout == f"psa_casadi {psa_casadi.__version__}\n"
     root = Path(__file__).parent.parent
@@ -100,14 +76,6 @@ def test_the_version_is_one() -> None:
     assert released is not None
     heading = f"\n## [{psa_casadi.__version__}] - {released[1]}\n"
     assert heading in (root / "CHANGELOG.md").read_text(encoding="utf-8")
-
-
-def test_every_public_name_is_there() -> None:
-    for name in psa_casadi.__all__:
-        assert getattr(psa_casadi, name) is not None
-    assert set(dir(psa_casadi)) <= set(psa_casadi.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'identfy'"):
-        psa_casadi.__getattr__("identfy")
 
 
 @slow
@@ -244,24 +212,6 @@ def test_diagnose_writes_only_what_is_asked_for_and_can_be_quiet(
     assert "slow_creep" in d["notes"][-1]
 
 
-def test_simulate_writes_every_output_with_its_unit(
-    planned: tuple[Path, Path], tmp_path: Path
-) -> None:
-    model, voltage = planned
-    out = tmp_path / "motion.csv"
-    said = done("simulate", "--model", model, "--input", voltage, "-o", out).stdout
-    header, *rows = out.read_text(encoding="utf-8").splitlines()
-    names = [re.sub(r" \[.*", "", h) for h in header.split(",")]
-    assert names == ["time", "voltage", *load_model(model).output_names]
-    assert "displacement [um]" in header
-    assert header.replace(",", ", ") in said
-    values = np.array([[float(c) for c in row.split(",")] for row in rows])
-    expected = simulate_record(
-        load_model(model), read_record(voltage, need_displacement=False)
-    ).outputs["displacement"]
-    np.testing.assert_allclose(values[:, names.index("displacement")], 1e6 * expected, rtol=1e-12)
-
-
 @pytest.mark.usefixtures("without_binary")
 def test_export_leaves_the_sensor_out_unless_asked(
     planned: tuple[Path, Path], tmp_path: Path
@@ -275,34 +225,3 @@ def test_export_leaves_the_sensor_out_unless_asked(
     said = done("export", "fmu", "--model", model, "-o", fmu, "--include-sensor").stdout
     assert "left out" not in said
     assert "sensor_delay" in [v.name for v in fmpy.read_model_description(str(fmu)).modelVariables]
-
-
-def test_a_short_option_asks_for_help() -> None:
-    assert "Usage: psa diagnose" in " ".join(done("diagnose", "-h").stdout.split())
-
-
-def test_effects_are_listed_and_shown() -> None:
-    listed = done("effects").stdout.strip()
-    head, _, *rows = re.split(r"\n(?=\S)", listed)
-    looks = head.index("what it looks like")
-    for row, (name, effect) in zip(rows, EFFECTS.items(), strict=True):
-        assert row.split()[0] == name
-        told = " ".join(line[looks:] for line in row.splitlines())
-        assert told.split() == effect.looks_like.split()
-    assert max(map(len, listed.splitlines())) <= 80
-    assert done("effects", "--quiet").stdout.split() == list(EFFECTS)
-    shown = done("effects", "slow-creep").stdout
-    assert "equation" in shown
-    assert "Croft, Shed and Devasia" in " ".join(shown.split())
-    assert "4 further resonances" in done("effects", "modal_series_4").stdout
-
-
-def test_an_identification_tells_its_warnings() -> None:
-    record = read_record(DEMO).slice(0, 800)
-    found = psa_casadi.identify([record], model=psa_casadi.stack_model("demo"))
-    text = identification_text(found)
-    for warning in found.warnings:
-        assert " ".join(warning.split()) in " ".join(text.split())
-    for name in found.determinacy.undetermined:
-        assert re.search(rf"^{name} .*fit, (undetermined|on its bound)", text, re.MULTILINE)
-    assert "Force scale assumed" in text

@@ -1,7 +1,5 @@
 """Columns that a person sees at once: told by their units, and never against what a name says."""
 
-import re
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,20 +8,13 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.columns import (
-    columns_known,
     parse_columns,
     stated_unit,
     understood,
-    units_row,
 )
-
-N = 20
-T = np.arange(N) * 1e-3
-V = np.arange(N) % 7 + 0.5
-X = np.arange(N) % 7 / 10 + 0.25
+from tests.record_files import T, V, X, assert_is, offered, refused
 
 
 def table(
@@ -36,26 +27,14 @@ def table(
     return path
 
 
-def assert_is(record: Record, t: float = 1.0, v: float = 1.0, x: float = 1e-6) -> None:
+def is_read(record: Record, t: float = 1.0, v: float = 1.0, x: float = 1e-6) -> None:
     """Demand the record that was written, its columns in units of these sizes."""
-    assert record.displacement is not None
-    np.testing.assert_allclose(record.time, t * T, rtol=1e-5)
-    np.testing.assert_allclose(record.voltage, v * V, rtol=1e-5)
-    np.testing.assert_allclose(record.displacement, x * X, rtol=1e-5)
-
-
-def refused(path: Path, columns: str | None = None) -> str:
-    with pytest.raises(InputError) as caught:
-        read_record(path, columns=columns)
-    return str(caught.value)
+    assert_is(record, t * T, v * V, x * X, 1e-5)
 
 
 def suggestion(path: Path) -> str:
     """Return what is suggested for the file, once for all that is open; it can be parsed."""
-    said = refused(path)
-    typed = re.findall(r"--columns (\S.*?) \(with your units", said)
-    assert len(set(typed)) == 1, said
-    line = shlex.split(typed[0])[0]
+    line: str = offered(refused(path))["columns"]
     assert parse_columns(line)
     return line
 
@@ -80,7 +59,7 @@ def suggestion(path: Path) -> str:
 def test_units_tell_what_is_what(
     head: list[str], sizes: tuple[float, float, float], tmp_path: Path
 ) -> None:
-    assert_is(read_record(table(tmp_path / "a.csv", *head)), *sizes)
+    is_read(read_record(table(tmp_path / "a.csv", *head)), *sizes)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +78,7 @@ def test_what_a_name_speaks_against_is_left_alone(
     head: str, monitor: float | None, tmp_path: Path
 ) -> None:
     record = read_record(table(tmp_path / "a.csv", head, columns=(T, V, X, 9.0 + X)))
-    assert_is(record)
+    is_read(record)
     if monitor is None:
         assert record.monitor_voltage is None
     else:
@@ -151,12 +130,12 @@ def test_nothing_is_suggested_that_is_not_meant(head: str, told: str, tmp_path: 
 
 def test_columns_without_a_unit_have_that_of_the_name(tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", "Elapsed (us),A_mV,B (V),C/nm,D (nm)", columns=(T, V, V, X, X))
-    assert_is(read_record(path, columns="voltage=A_mV,displacement=C/nm"), 1e-6, 1e-3, 1e-9)
-    said = refused(path, "time=Elapsed (us):s,voltage=A_mV,displacement=C/nm")
+    is_read(read_record(path, columns="voltage=A_mV,displacement=C/nm"), 1e-6, 1e-3, 1e-9)
+    said = refused(path, columns="time=Elapsed (us):s,voltage=A_mV,displacement=C/nm")
     assert "the header gives the unit 'us', --columns gives 's'" in said
     archive = tmp_path / "a.npz"
     np.savez(archive, a=T, b_mV=V, c_mV=V, x=X)
-    assert_is(read_record(archive, columns="time=a,voltage=b_mV,displacement=x:um"), 1.0, 1e-3)
+    is_read(read_record(archive, columns="time=a,voltage=b_mV,displacement=x:um"), 1.0, 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -173,15 +152,9 @@ def test_excels_first_line_says_what_separates_the_cells(
     head: list[str], mark: str, point: str, tmp_path: Path
 ) -> None:
     path = table(tmp_path / "a.csv", *head, mark=mark, point=point)
-    assert_is(read_record(path))
+    is_read(read_record(path))
     path.write_text(path.read_text().replace(f"{5 * 1e-3:.6g}".replace(".", point), "oops"))
     assert f"line {len(head) + 6}, column 'time': found 'oops'" in refused(path)
-
-
-def test_numbers_alone_below_excels_line_are_counted(tmp_path: Path) -> None:
-    path = table(tmp_path / "a.csv", "sep=;", mark=";", point=",")
-    assert suggestion(path) == "time=1:s,voltage=2:V,displacement=3:um"
-    assert_is(read_record(path, columns="time=1:s,voltage=2:V,displacement=3:um"))
 
 
 def structures(*items: Mapping[str, Any]) -> Any:
@@ -203,40 +176,30 @@ def recorded(path: Path, *signals: Mapping[str, Any], clocks: int = 1, packed: b
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_recording_of_control_desk_is_read(tmp_path: Path, *, packed: bool) -> None:
     named = [{"Name": "Model Root/U_amp [V]", "Data": V}, {"Name": "Probe (um)", "Data": X}]
-    assert_is(read_record(recorded(tmp_path / "a.mat", *named, packed=packed)))
+    is_read(read_record(recorded(tmp_path / "a.mat", *named, packed=packed)))
     stated = [
         {"Name": "Model Root/DAC/cmd", "Data": V, "Unit": "V", "XIndex": 1.0},
         {"Name": "Model Root/ADC/monitor", "Data": V, "Unit": "V", "XIndex": 1.0},
         {"Name": "Weg µ", "Data": X, "Unit": "um", "XIndex": 1.0},
     ]
     path = recorded(tmp_path / "b.mat", *stated, packed=packed)
-    assert_is(read_record(path))
+    is_read(read_record(path))
     columns = "voltage=exp001.Model Root/ADC/monitor,displacement=exp001.Weg µ:nm"
-    assert_is(read_record(path, columns=columns), x=1e-9)
+    is_read(read_record(path, columns=columns), x=1e-9)
 
 
 def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
     names = [{"Name": "Model Root/cmd", "Data": V}, {"Name": "Model Root/Out1", "Data": X}]
     line = "voltage=exp001.Model Root/cmd:V,displacement=exp001.Model Root/Out1:um"
     assert suggestion(recorded(tmp_path / "a.mat", *names)) == line
-    assert_is(read_record(tmp_path / "a.mat", columns=line))
+    is_read(read_record(tmp_path / "a.mat", columns=line))
     alike = [{"Name": "Out1", "Data": V}, {"Name": "Out1", "Data": X}]
     line = "voltage=exp001.Y.1:V,displacement=exp001.Y.2:um"
     assert suggestion(recorded(tmp_path / "b.mat", *alike)) == line
-    assert_is(read_record(tmp_path / "b.mat", columns=line))
+    is_read(read_record(tmp_path / "b.mat", columns=line))
     path = recorded(tmp_path / "c.mat", *names, clocks=2)
     both = "voltage=exp001.Model Root/cmd:V,displacement=exp001.Model Root/Out1:um"
     assert suggestion(path) == both  # the two clocks are the same
-
-
-def test_the_elements_of_other_structures_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "a.mat"
-    signals = structures({"label": "U", "values": V}, {"label": "x", "values": X})
-    savemat(path, {"log": {"time": T, "signals": signals}})
-    record = read_record(
-        path, columns="voltage=log.signals.1.values,displacement=log.signals.2.values:um"
-    )
-    assert_is(record)
 
 
 @pytest.mark.parametrize(
@@ -261,11 +224,3 @@ def test_the_unit_of_a_cell(cell: str, column: str | None, unit: str | None) -> 
     found = understood(cell)
     assert (None if found is None else found.column) == column
     assert stated_unit(cell) == unit
-
-
-def test_rows_of_units_and_of_names() -> None:
-    assert units_row(["s", "V", "-"]) == ["s", "V", ""]
-    assert units_row(["s", "V", "-1"]) is None
-    assert columns_known(["Clock (s)", "Bridge (V)"]) == 2
-    assert columns_known(["Clock (s)", "0.1", "Bridge (V)"]) == 0
-    assert columns_known(["ms", "mV", "nm"]) == 0

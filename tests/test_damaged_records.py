@@ -17,6 +17,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import apart, file_bytes
 from psa_casadi.records.read.formats import READERS
+from psa_casadi.records.read.samples import Request
 from tests.laboratory_bytes import hdf5, npy, npz, tdms, xlsx
 from tests.mutations import sentences
 
@@ -104,9 +105,9 @@ def test_arrays_hold_what_they_state(tmp_path: Path) -> None:
 
 def here(path: Path) -> tuple[str, ...]:
     """Read a file in this process, and return what is wrong with it."""
-    request = {"columns": {}, "displacement": False}
-    told = apart.answered({"path": str(path), "request": request, "out": str(path.parent)})
-    return tuple(told.get("refused") or told["problems"])
+    request = Request(displacement=False)
+    told = apart.answered(apart.Asked(str(path), request, str(path.parent)))
+    return told.refused or told.problems
 
 
 def test_no_more_is_read_than_a_record_may_hold(

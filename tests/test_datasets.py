@@ -3,7 +3,7 @@
 import hashlib
 import http.server
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from psa_casadi import datasets
 from psa_casadi.cli.datasets import datasets as command
 from psa_casadi.cli.failures import guarded
 from psa_casadi.datasets import DATASETS, Dataset
-from psa_casadi.datasets.conversions.columns import Columns
+from psa_casadi.datasets.devices import Columns
 from psa_casadi.datasets.fetching import DATA_VARIABLE
 from psa_casadi.errors import InputError, PsaError
 
@@ -93,46 +93,6 @@ def test_a_table_becomes_a_record(
     assert Path(record.source).is_relative_to(tmp_path / "cache")
 
 
-class Halves:
-    """Makes the record of a table that is published in two files."""
-
-    words = "both halves of the table"
-
-    def csv(self, originals: Sequence[bytes]) -> bytes:
-        first, second = originals
-        return PART.csv([first + second])
-
-
-def test_a_record_may_be_made_of_several_originals(
-    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    dataset = publish(served, TABLE)
-    (file,) = dataset.files
-    halves = []
-    for name, part in (("first.dat", TABLE[:700]), ("second.dat", TABLE[700:])):
-        (tmp_path / "published" / name).write_bytes(part)
-        url = served.replace("table.dat", name)
-        halves.append(replace(file.originals[0], name=name, url=url, sha256=sha(part)))
-    split = replace(file, originals=tuple(halves), conversion=Halves())
-    monkeypatch.setitem(DATASETS, "small", replace(dataset, files=(split,)))
-    assert datasets.paths("small")[0].read_bytes() == PART.csv([TABLE])
-    text = datasets.origin_text(DATASETS["small"])
-    assert "From first.dat, second.dat: both halves of the table." in text
-
-
-def test_what_was_downloaded_is_kept_and_what_was_spoilt_is_made_again(
-    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
-) -> None:
-    publish(served, TABLE)
-    (path,) = datasets.paths("small")
-    whole = path.read_bytes()
-    (tmp_path / "published" / "table.dat").unlink()
-    assert datasets.paths("small") == [path]
-    path.write_bytes(whole[:-9])
-    assert datasets.paths("small")[0].read_bytes() == whole
-
-
 def test_another_file_than_the_published_one_is_refused(
     served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
 ) -> None:
@@ -175,14 +135,6 @@ def test_a_folder_is_taken_as_it_is_or_refused(
     assert list(datasets.originals("small")) == ["table.dat"]
 
 
-def test_the_measured_records_are_the_published_ones(
-    measured_data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(DATA_VARIABLE, str(measured_data))
-    sine, loops = datasets.micromanipulator()
-    assert (sine.name, sine.n, loops.name, loops.n) == ("sine_1hz", 7927, "minor_loops", 3600)
-
-
 @pytest.mark.parametrize("dataset", DATASETS.values(), ids=lambda d: d.name)
 def test_every_dataset_says_what_it_is(dataset: Dataset) -> None:
     text = datasets.origin_text(dataset)
@@ -214,19 +166,3 @@ def test_the_command_lists_shows_and_writes(
     assert [p.name for p in kept] == ["part.csv", "small_licence.txt"]
     assert kept[0].read_bytes() == PART.csv([TABLE])
     assert kept[1].read_text() == datasets.origin_text(dataset)
-
-
-def test_mistakes_of_the_command(
-    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
-) -> None:
-    publish(served, TABLE)
-    (tmp_path / "file").write_text("")
-    for arguments, sentence in (
-        (["micromanipulater"], "There is no dataset named 'micromanipulater'; did you mean micro"),
-        (["zzz"], "There is no dataset named 'zzz'; there are micromanipulator"),
-        (["-o", tmp_path], "--output needs the name of a dataset"),
-        (["small", "-o", tmp_path / "file"], "cannot be created"),
-    ):
-        code, out, err = psa(*arguments)
-        assert (code, out) == (2, "")
-        assert sentence in err

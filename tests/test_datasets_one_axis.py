@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from psa_casadi.datasets import DATASETS
-from psa_casadi.datasets.conversions.one_axis import OneAxis, linear_response
+from psa_casadi.datasets.devices import OneAxis, linear_response
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -90,14 +90,6 @@ def test_a_test_signal_is_judged_by_the_response_of_the_training_signals() -> No
     np.testing.assert_allclose(v, np.tile(test[:, 1, 2, 0], 2), atol=6e-7)
     own = 1e6 * driven(test, 1)[:, 1, 2]
     np.testing.assert_allclose(x, own.T.reshape(-1), atol=6e-5)
-
-
-def test_the_bytes_do_not_depend_on_rounding() -> None:
-    u = voltages(1, 6)
-    y = driven(u)
-    one = OneAxis(0, 1, 0, 1, RATE).csv([saved(u), saved(y)])
-    other = OneAxis(0, 1, 0, 1, RATE).csv([saved(u * (1 + 3e-16)), saved(y * (1 - 3e-16))])
-    assert one == other
 
 
 @pytest.mark.slow

@@ -16,10 +16,8 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification import prepare
 from psa_casadi.identification.identify import identify
-from psa_casadi.identification.prepare import averaged
-from psa_casadi.records import Record, hold, read_record, sine, split, steps, time_grid, triangle
+from psa_casadi.records import Record, hold, sine, split, steps, time_grid
 from psa_casadi.records.decimate import decimated
-from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.split import LEAST, MOST, PARTS, excerpts
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
@@ -68,24 +66,6 @@ def test_a_million_slow_samples_shrink_and_keep_their_content() -> None:
     assert (small.name, small.source, small.sha256) == (record.name, record.source, record.sha256)
 
 
-def test_a_louder_record_shrinks_further_and_a_quieter_one_less() -> None:
-    factors = [decimated(loop(noise=s), s, SLOPE)[1] for s in (1e-12, 1e-10, 1e-8)]
-    assert factors == sorted(factors)
-    assert factors[0] < factors[-1] // 4
-
-
-def test_the_tips_of_a_triangle_are_kept() -> None:
-    u = triangle(T, 0.0, 100.0, 0.05)
-    record = Record(name="triangle", time=T, voltage=u, displacement=curve(u) + NOISE * white(2))
-    small, q = decimated(record, NOISE, SLOPE)
-    assert q >= 8
-    tips = 100.0 - small.voltage.max(), small.voltage.min()
-    assert max(tips) < 0.2 * NOISE / SLOPE
-    assert 2 * q * 1e-4 * 5.0 * SLOPE > 0.1 * NOISE or N // (2 * q) < 2000
-    again = np.interp(record.time[q:-q], small.time, small.voltage)
-    assert np.max(np.abs(again - u[q:-q])) < 0.1 * NOISE / SLOPE
-
-
 def test_a_ringing_step_is_not_touched() -> None:
     u = steps(T, [0.0, 100.0, 0.0, 100.0])
     for period in (10, 100, 1000):
@@ -105,16 +85,6 @@ def test_a_tone_below_the_noise_is_kept(frequency: float) -> None:
     small, q = decimated(replace(base, displacement=base.displacement + tone), NOISE, SLOPE)
     assert frequency < 0.5 / small.sample_time
     assert q < decimated(base, NOISE, SLOPE)[1]
-
-
-def test_a_resonance_in_the_noise_is_kept() -> None:
-    base = loop()
-    assert base.displacement is not None
-    w, d = 2 * np.pi * 0.31, 2e-4
-    a = [1.0, -2 * np.exp(-d * w) * np.cos(w), np.exp(-2 * d * w)]
-    hum = lfilter([1.0], a, white(7))
-    y = base.displacement + 0.1 * NOISE * hum / np.std(hum)
-    assert decimated(replace(base, displacement=y), NOISE, SLOPE)[1] == 1
 
 
 def test_a_step_in_a_slow_record_is_kept() -> None:
@@ -177,28 +147,12 @@ def test_other_columns_are_averaged_and_a_sudden_load_is_kept() -> None:
     assert decimated(kicked, NOISE, SLOPE)[1] == 1
 
 
-@pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
-def test_the_measured_records_have_nothing_to_spare(measured_data: object, file: str) -> None:
-    record = read_record(f"{measured_data}/micromanipulator/{file}.csv")
-    assert decimated(record, 7e-8, record.range_m / float(np.ptp(record.voltage)))[1] == 1
-
-
 def test_a_noise_or_slope_of_nothing_is_refused() -> None:
     for noise, slope in ((0.0, 1e-7), (-1.0, 1e-7), (np.nan, 1e-7), (1e-8, 0.0)):
         with pytest.raises(InputError, match="expected a positive number"):
             decimated(loop(time_grid(1.0, 1e-4)), noise, slope)
     record = loop(time_grid(100.0, 1e-3))
     assert decimated(record, NOISE, -SLOPE)[1] == decimated(record, NOISE, SLOPE)[1]
-
-
-def test_fast_noise_is_the_white_part() -> None:
-    t = T[:20_000]
-    for motion in (0.0 * t, 50.0 * np.sin(2 * np.pi * 5 * t), triangle(t, 0.0, 100.0, 3.0)):
-        assert fast_noise(motion + 0.3 * white(12, t.size)) == pytest.approx(0.3, rel=0.05)
-        assert fast_noise(motion) < 1e-6
-    assert fast_noise(np.sin(2 * np.pi * 500 * t)) == 0.0
-    assert fast_noise(np.asarray(lfilter([1], [1, -0.9], white(13, t.size)))) < 1.0
-    assert fast_noise(np.repeat([1.0, 2.0], 3)) == 0.0
 
 
 def night(n: int, rate: float = 100.0) -> Record:
@@ -235,14 +189,6 @@ def test_short_records_stay_whole_beside_a_long_one() -> None:
     assert excerpts([short]) == ([short], [])
     many = [night(LEAST + k) for k in range(12)]
     assert [p.n for p in excerpts(many)[0][:2]] == [LEAST, LEAST // PARTS]
-
-
-def test_a_long_record_that_is_oversampled_is_averaged_and_stays_whole() -> None:
-    record = loop(time_grid(100.0, 1e-4))
-    (small,), said = averaged([record])
-    assert small.n < MOST
-    assert small.duration == pytest.approx(record.duration, rel=1e-2)
-    assert "averaged in blocks" in said[0]
 
 
 @slow

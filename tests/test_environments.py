@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,8 +19,7 @@ from psa_casadi.files import PREFIX, atomic_path, atomic_write
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps
 from psa_casadi.simulation import compiler
-from tests.record_files import HEADER, ROWS, write
-from tests.tiers import slow
+from tests.record_files import write
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
 MODEL = dumps(compose(BASE))
@@ -37,11 +35,6 @@ def shell(line: str, **variables: str) -> "subprocess.CompletedProcess[str]":
         ["bash", "-c", start + line], capture_output=True, encoding="utf-8", check=False,
         env={**os.environ, **variables}, timeout=60,
     )  # fmt: skip
-
-
-@pytest.fixture
-def record(tmp_path: Path) -> Path:
-    return write(tmp_path / "record.csv", HEADER, *ROWS)
 
 
 def program(path: Path, *lines: str) -> Path:
@@ -75,7 +68,7 @@ def test_output_that_cannot_be_written(case: str) -> None:
 
 @posix
 def test_letters_that_the_terminal_lacks_do_not_end_a_command() -> None:
-    code = "from psa_casadi.cli.surroundings import prepare; prepare()"
+    code = "from psa_casadi.cli.failures import prepare; prepare()"
     done = shell(
         f"""'{sys.executable}' -c '{code}; print("5 \\u00b5m, \\udcff.csv")'""",
         PYTHONIOENCODING="ascii", **ASCII,
@@ -87,7 +80,7 @@ def test_letters_that_the_terminal_lacks_do_not_end_a_command() -> None:
 @pytest.mark.parametrize("end", ["", "os._exit(0)", "os.kill(os.getpid(), 15)"])
 def test_temporary_files_of_other_packages_go_too(end: str, tmp_path: Path) -> None:
     """With the command that made them, or with the next."""
-    code = "import os, tempfile; from psa_casadi.cli.surroundings import prepare; prepare()"
+    code = "import os, tempfile; from psa_casadi.cli.failures import prepare; prepare()"
     for last in (end, ""):
         script = f"{code}; print(tempfile.mkdtemp(), os.environ['TMPDIR']); {last}"
         done = shell(f"'{sys.executable}' -uc '{script}'".replace("['", '["').replace("']", '"]'),
@@ -234,43 +227,3 @@ def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
         fill()
     assert (tmp_path / "x.fmu").read_text() == "old"
     assert os.listdir(tmp_path) == ["x.fmu"]
-
-
-@slow
-@posix
-def test_no_search_takes_a_broken_compiler_for_a_model_that_fails(
-    record: Path, tmp_path: Path
-) -> None:
-    where = {"CC": "nothing-of-this-name", "PSA_CASADI_CACHE": str(tmp_path / "cache")}
-    done = shell(f"psa identify '{record}' -q -o '{tmp_path}/m.json'", **where)
-    assert done.returncode == 1
-    assert done.stderr.startswith("Failed: The C compiler nothing-of-this-name cannot be started")
-
-
-@posix
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("prlimit") is None, reason="no prlimit")
-def test_a_command_with_too_little_memory_says_so(record: Path, tmp_path: Path) -> None:
-    done = shell(f"ulimit -v 150000; psa identify '{record}' -q -o '{tmp_path}/m.json'")
-    assert done.returncode == 1
-    assert "there is too little memory" in done.stderr
-    assert FAULT not in done.stderr
-
-
-@posix
-@pytest.mark.slow
-def test_a_command_without_home_cache_temporary_folder_and_docstrings(
-    record: Path, tmp_path: Path
-) -> None:
-    output = tmp_path / "m.json"
-    done = shell(
-        f"unset HOME; psa simulate --model '{write(tmp_path / 'model.json', MODEL)}'"
-        f" --input '{record}' -o '{output}'",
-        PSA_CASADI_CACHE="/dev/null/cache", TMPDIR=str(tmp_path / "no"), MPLCONFIGDIR="/dev/null",
-        PYTHONOPTIMIZE="2", **ASCII,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    told = [line for line in done.stderr.splitlines() if "cache" in line]
-    assert len(told) == 1
-    assert "The cache folder /dev/null/cache/models cannot be used (Not a directory)" in told[0]
-    assert output.read_text(encoding="utf-8").startswith("time")

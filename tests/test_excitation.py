@@ -7,26 +7,14 @@ from hypothesis import strategies as st
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import (
-    concatenate,
     decaying_triangle,
-    hold,
     multisine,
     sine,
-    steps,
     time_grid,
     triangle,
 )
 
 TIME = time_grid(2.0, 1e-3)
-
-
-def test_the_grid_has_every_instant_before_the_end() -> None:
-    grid = time_grid(0.3, 0.1)
-    np.testing.assert_allclose(grid, [0.0, 0.1, 0.2], rtol=1e-15)
-    assert TIME.size == 2000
-    for duration, sample_time in ((0.0, 0.1), (1.0, 0.0), (1.0, -1.0), (0.1, 0.1)):
-        with pytest.raises(InputError, match="holds no two samples"):
-            time_grid(duration, sample_time)
 
 
 @given(st.floats(-50, 100), st.floats(0.1, 200), st.floats(0.6, 60))
@@ -69,14 +57,6 @@ def test_a_decaying_triangle_nests_its_reversals(centre: float) -> None:
     np.testing.assert_allclose(np.diff(branch), branch[-1] / 125, rtol=1e-9)
 
 
-def test_steps_share_the_grid_and_hold_holds() -> None:
-    voltage = steps(TIME, [10.0, 0.0, 30.0, 5.0])
-    np.testing.assert_array_equal(voltage, np.repeat([10.0, 0.0, 30.0, 5.0], 500))
-    np.testing.assert_array_equal(hold(TIME, 7.0), np.full(2000, 7.0))
-    with pytest.raises(InputError, match="levels do not fit"):
-        steps(TIME[:3], [1, 2, 3, 4])
-
-
 def test_a_multisine_is_flat_in_its_band_and_empty_outside() -> None:
     voltage = multisine(TIME, 0.0, 100.0, (5.0, 100.0), seed=3)
     lines = np.abs(np.fft.rfft(voltage)) / TIME.size
@@ -88,14 +68,6 @@ def test_a_multisine_is_flat_in_its_band_and_empty_outside() -> None:
     again = multisine(TIME, 0.0, 100.0, (5.0, 100.0), seed=3)
     np.testing.assert_array_equal(voltage, again)
     assert np.abs(voltage - multisine(TIME, 0.0, 100.0, (5.0, 100.0), seed=4)).max() > 1.0
-
-
-def test_a_sequence_has_one_uniform_grid() -> None:
-    wave = concatenate([hold(TIME, 0.0), sine(TIME, 0.0, 10.0, 1.0)], 1e-3)
-    assert wave.time.shape == wave.voltage.shape == (4000,)
-    np.testing.assert_allclose(np.diff(wave.time), 1e-3, rtol=1e-9)
-    with pytest.raises(InputError, match="at least one part"):
-        concatenate([], 1e-3)
 
 
 def test_what_the_grid_cannot_show_is_refused() -> None:

@@ -19,7 +19,7 @@ MODELS = (
 
 
 #: The two versions are two faces of one core: each kind of model in one of them, one in both. Other
-#: stacks are checked in `test_cli_stacks` and played in `test_fmu_accuracy`.
+#: stacks are checked in `test_cli_commands` and played in `test_fmu_accuracy`.
 CHECKED = (
     (STACK, 3), ("flexure", 3), (STACK, 2), ("single_mass", 2), ("slow_creep", 2),
     ("every_effect", 3),

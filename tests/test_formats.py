@@ -1,7 +1,6 @@
 """Records in other formats and spellings than a plain CSV file."""
 
 import hashlib
-import time as clock
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,18 +9,15 @@ import h5py
 import numpy as np
 import pyarrow
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pyarrow import parquet
 from scipy.io import savemat
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.records import Record, read_record, read_records, write_record
+from psa_casadi.records import read_record, read_records
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.columns import Source, parse_columns
-from tests.record_files import HEADER, ROWS, write
-from tests.tiers import slow, slow_but
+from psa_casadi.records.read.columns import parse_columns
+from tests.record_files import HEADER, ROWS, assert_is, problems_of, write
 
 N = 24
 T = np.arange(N) / 8.0
@@ -53,22 +49,6 @@ def _fill(group: Any, content: Mapping[str, object]) -> None:
 def table(path: Path, columns: Mapping[str, object]) -> Path:
     parquet.write_table(pyarrow.table(dict(columns)), path)
     return path
-
-
-def problems_of(path: Path, columns: str | None = None) -> tuple[str, ...]:
-    with pytest.raises(InputError) as caught:
-        read_record(path, columns=columns)
-    assert all(p.startswith((str(path), "--columns")) for p in caught.value.problems)
-    assert all(p.endswith(".") for p in caught.value.problems)
-    assert len(caught.value.problems) < 20
-    return caught.value.problems
-
-
-def assert_is(record: Record, t: ArrayLike, u: ArrayLike, y: ArrayLike) -> None:
-    assert record.displacement is not None
-    np.testing.assert_allclose(record.time, np.asarray(t, float), rtol=1e-15)
-    np.testing.assert_allclose(record.voltage, np.asarray(u, float), rtol=1e-15)
-    np.testing.assert_allclose(record.displacement, np.asarray(y, float), rtol=1e-15)
 
 
 @pytest.mark.parametrize("version", ["5", "7", "7.3"])
@@ -112,20 +92,6 @@ def test_structures_matrices_lying_vectors_and_names_with_units(
     np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + Y)
 
 
-def test_missing_displacements_of_other_formats_are_masked(tmp_path: Path) -> None:
-    y = Y.copy()
-    y[[3, 7]] = np.nan
-    record = read_record(
-        mat(tmp_path / "a.mat", {"t": T, "u": U, "y": y}),
-        columns="time=t,voltage=u,displacement=y:m",
-    )
-    assert list(np.flatnonzero(~record.mask)) == [3, 7]
-    holes = [None if k in (2, 5) else float(v) for k, v in enumerate(Y)]
-    columns = {"time [s]": T, "voltage [V]": U, "displacement [um]": holes}
-    record = read_record(table(tmp_path / "a.parquet", columns))
-    assert list(np.flatnonzero(~record.mask)) == [2, 5]
-
-
 def test_parquet_columns_are_named_as_in_a_csv_header(tmp_path: Path) -> None:
     columns = {
         "remark": ["ok"] * N,
@@ -153,13 +119,13 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
     plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
     assert plain.displacement is not None
     assert_is(record, plain.time / 1e3, plain.voltage / 1e3, plain.displacement)
-    (problem,) = problems_of(path, "time=t,voltage=amp out,displacement=LVDT:mm")
+    (problem,) = problems_of(path, columns="time=t,voltage=amp out,displacement=LVDT:mm")
     assert "line 1, column 'LVDT': the header gives the unit 'um', --columns gives 'mm'" in problem
-    (problem,) = problems_of(path, "time=t,displacement=LVTD")
+    (problem,) = problems_of(path, columns="time=t,displacement=LVTD")
     assert "'LVTD', which --columns names for 'displacement', is not in the header" in problem
     assert "(found: time, voltage, amp out, LVDT)" in problem
     (problem,) = problems_of(
-        write(tmp_path / "c.csv", "time [s],voltage [V],y", *ROWS), "displacement=y"
+        write(tmp_path / "c.csv", "time [s],voltage [V],y", *ROWS), columns="displacement=y"
     )
     assert "line 1, column 'y': has no unit" in problem
 
@@ -172,7 +138,7 @@ def test_what_is_said_of_one_file_stands_for_what_is_said_of_all(tmp_path: Path)
     a, b = read_records([first, second], columns=f"{said},{mine}")
     assert a.displacement is not None
     assert_is(b, a.time / 1e3, a.voltage, a.displacement)
-    (problem,) = problems_of(first, mine)
+    (problem,) = problems_of(first, columns=mine)
     assert "line 1" in problem
 
 
@@ -198,23 +164,11 @@ def test_mistakes_of_the_columns_option(text: str, expected: str) -> None:
     assert expected in problem
 
 
-def test_the_columns_option_is_read_whole(tmp_path: Path) -> None:
-    found = parse_columns(" time = t:ms , load-force=f[kN],displacement=log.y.2")
-    assert found == {
-        "time": Source("t", "ms"),
-        "load_force": Source("f", "kN"),
-        "displacement": Source("log.y.2", None),
-    }
-    with pytest.raises(InputError) as caught:
-        read_records([tmp_path / "a.csv"], columns="a=b,voltage=u:s,=,c")
-    assert len(caught.value.problems) == 4
-
-
 def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     t, y = T.copy(), Y.copy()
     t[5], y[9] = t[3], np.inf
     path = mat(tmp_path / "a.mat", {"t": t, "u": np.r_[U[:4], np.nan, U[5:]], "y": y, "z": Y[:7]})
-    problems = problems_of(path, "time=t,voltage=u,displacement=y:um")
+    problems = problems_of(path, columns="time=t,voltage=u,displacement=y:um")
     assert len(problems) == 3
     assert "sample 6, column 'time': time goes back (from 0.5 in sample 5 to 0.375)" in problems[0]
     assert "in every sample; remove repeated samples" in problems[0]
@@ -224,25 +178,11 @@ def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     problems = problems_of(path)
     assert "array names: 'time' has no unit (t), 'voltage' has no unit (u)" in problems[0]
     assert "--columns" not in "".join(problems)  # what would not read the file is not offered
-    problems = problems_of(path, "time=t,voltage=w,displacement=y")
+    problems = problems_of(path, columns="time=t,voltage=w,displacement=y")
     assert "'w', which --columns names for 'voltage', is not in the header" in "".join(problems)
     assert "column 'y': has no unit; write it in brackets" in "".join(problems)
-    (problem,) = problems_of(path, "time=t,voltage=u,displacement=z:um")
+    (problem,) = problems_of(path, columns="time=t,voltage=u,displacement=z:um")
     assert "array 'z' (displacement) has 7 values, 'time' has 24" in problem
-
-
-def test_mistakes_of_a_parquet_file_are_told_at_once(tmp_path: Path) -> None:
-    t = T.copy()
-    t[1] = 9.0
-    columns = {"time [s]": t, "voltage [V]": ["a"] * N, "displacement [kg]": Y}
-    problems = problems_of(table(tmp_path / "a.parquet", columns))
-    assert len(problems) == 3
-    everything = "\n".join(problems)
-    assert (
-        "column names, column 'displacement': the unit 'kg' does not measure length" in everything
-    )
-    assert "column 'voltage': holds texts such as 'a', expected numbers" in everything
-    assert "row 3, column 'time': time goes back (from 9 in row 2 to 0.25)" in everything
 
 
 def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
@@ -264,18 +204,6 @@ def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
     assert "the column 'time' is missing (found: nothing)" in problems_of(empty)[0]
 
 
-@pytest.mark.parametrize("version", slow_but(["5", "7"], ["5", "7", "7.3"]))
-def test_a_damaged_matlab_file_is_told_in_sentences(tmp_path: Path, version: str) -> None:
-    whole = mat(tmp_path / "a.mat", {"t": T, "u": U, "y": Y}, version).read_bytes()
-    draw = np.random.default_rng(1)
-    for stop in draw.integers(1, len(whole), 8):  # a process each
-        cut = tmp_path / "cut.mat"
-        cut.write_bytes(whole[:stop])
-        with pytest.raises(InputError) as caught:
-            read_record(cut, columns=COLUMNS)
-        assert str(cut) in str(caught.value)
-
-
 def test_a_missing_optional_package_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -283,25 +211,6 @@ def test_a_missing_optional_package_is_named(
     monkeypatch.setattr(apart, "find_spec", lambda name: None)
     (problem,) = problems_of(path)
     assert "reading it needs pyarrow, which is not installed; run `pip install pyarrow`" in problem
-
-
-def test_the_commands_take_every_format(tmp_path: Path) -> None:
-    path = mat(tmp_path / "a.mat", {"t": 1e-3 * T, "u": 10 + U})
-    out = tmp_path / "out.csv"
-    base = ["simulate", "--stack", "demo", "--input", str(path), "-o", str(out)]
-    result = CliRunner().invoke(app, [*base, "--columns", "time=t,voltage=u"])
-    assert result.exit_code == 0, result.output
-    np.testing.assert_array_equal(read_record(out).voltage, 10 + U)
-    for command in ("identify", "diagnose"):
-        arguments = [command, str(path), "-o", str(tmp_path / "m.json")]
-        result = CliRunner().invoke(
-            app, [*arguments, "--columns", "time=t,voltage=u,displacement=u:s"]
-        )
-        assert result.exit_code == 2
-        assert "the unit 's' does not measure length" in result.stderr
-        result = CliRunner().invoke(app, [*arguments, "--columns", "time=t,voltage=u"])
-        assert result.exit_code == 2
-        assert "the column 'displacement' is missing" in result.stderr
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t"])
@@ -321,44 +230,3 @@ def test_decimal_commas_are_read(tmp_path: Path, delimiter: str, encoding: str) 
     quoted = [row.replace(";", '";"').replace("\t", '"\t"') for row in rows]
     again = read_record(write(tmp_path / "c.csv", header, *(f'"{row}"' for row in quoted)))
     assert_is(again, expected.time, expected.voltage, expected.displacement)
-
-
-def test_quoted_decimal_commas_between_commas_are_read(tmp_path: Path) -> None:
-    rows = [",".join(f'"{cell.replace(".", ",")}"' for cell in row.split(",")) for row in ROWS]
-    record = read_record(write(tmp_path / "a.csv", HEADER, *rows))
-    plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
-    assert plain.displacement is not None
-    assert_is(record, plain.time, plain.voltage, plain.displacement)
-
-
-@pytest.mark.parametrize("unit", ["um", "counts"])
-@pytest.mark.parametrize("low", [-150.0, 0.0])
-@pytest.mark.parametrize("temperature", ["degC", "K", "°C"])
-def test_half_an_hour_at_10_hz_one_sided_and_bipolar(
-    tmp_path: Path, unit: str, low: float, temperature: str
-) -> None:
-    t = np.arange(18000) / 10.0
-    u = low + (150.0 - low) * 0.5 * (1 - np.cos(2 * np.pi * t / 60.0))
-    y = np.round(u / 3.0)
-    kelvin = temperature == "K"
-    degrees = (293.15 if kelvin else 20.0) + t / 1800.0
-    path = tmp_path / "slow.csv"
-    columns = {"time [s]": t, "voltage [V]": u, f"displacement [{unit}]": y}
-    write_record(path, columns | {f"temperature [{temperature}]": degrees})
-    record = read_record(path, need_excitation=True)
-    assert (record.n, record.displacement_unit) == (18000, "counts" if unit == "counts" else "m")
-    assert record.sample_time == pytest.approx(0.1)
-    assert record.voltage.min() == pytest.approx(low)
-    assert_is(record, t, u, y if unit == "counts" else y / 1e6)
-    np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + t / 1800.0, rtol=1e-14)
-
-
-@slow
-def test_a_million_rows_with_decimal_commas_are_read_quickly(tmp_path: Path) -> None:
-    rows = [
-        f"{k / 10000:.4f};{k % 1000 / 10};{k % 1000 / 100}".replace(".", ",") for k in range(10**6)
-    ]
-    path = write(tmp_path / "long.csv", HEADER.replace(",", ";"), *rows)
-    started = clock.process_time()
-    assert read_record(path).n == 10**6
-    assert clock.process_time() - started < 6.0

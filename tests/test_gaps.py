@@ -5,7 +5,6 @@ import pytest
 
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.identify import identify
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import gaps, without_gaps
 from psa_casadi.units import FloatArray
@@ -52,15 +51,6 @@ def test_what_happened_in_a_gap_is_no_cause(whole: Record) -> None:
     assert "r: no sample for 1.005 s from 1.495 s on, while the voltage moves" in found.notes[-1]
 
 
-@pytest.mark.slow
-def test_parts_are_identified_together(whole: Record) -> None:
-    found = identify([without(whole, (300, 500))])
-    assert [e.record.n for e in found.experiments] == [300, 400]
-    assert "the 2 parts count as records of their own" in found.sentences[0]
-    assert found.fit.rms < 3e-4 * whole.range_m
-    assert [name for name, _ in found.model.provenance.identified_from] == ["r"]
-
-
 def record(time: FloatArray, voltage: FloatArray) -> Record:
     return Record(name="r", time=time, voltage=voltage, displacement=1e-6 * voltage)
 
@@ -85,9 +75,3 @@ def test_what_is_no_gap(case: str) -> None:
     parts, said = without_gaps([NO_GAP[case]])
     assert parts == [NO_GAP[case]]
     assert not said
-
-
-def test_several_gaps_make_several_parts() -> None:
-    parts, said = without_gaps([without(record(T, SINE), (200, 300), (500, 530))])
-    assert [p.n for p in parts] == [200, 200, 370]
-    assert len(said) == 1

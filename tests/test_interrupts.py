@@ -1,6 +1,5 @@
 """Ctrl-C: one ends long work within two seconds and keeps what there is, a second one at once."""
 
-import json
 import os
 import signal
 import subprocess
@@ -21,12 +20,11 @@ from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import identify
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import dumps, load_model, loads
+from psa_casadi.model.model_file import load_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, write_record
 from psa_casadi.simulation.exact.run import run_exact
@@ -92,17 +90,6 @@ def test_another_thread_ends_a_long_run_in_c(way: str) -> None:
         assert time.perf_counter() - begin < 2.0
 
 
-def test_what_is_wrapped_up_after_an_interrupt_can_simulate() -> None:
-    model = stack_model("P-885.51")
-    with interruptible_work() as work:
-        work.stop()
-        with pytest.raises(KeyboardInterrupt):
-            simulate(model, TIME, VOLTAGE)
-        work.wrap_up()
-        work.stop()  # the same interrupt, told by another thread
-        assert simulate(model, TIME, VOLTAGE).displacement.size == TIME.size
-
-
 def test_an_interrupt_ends_the_other_threads_too() -> None:
     """The one who waits has the interrupt; the other would go on simulating for minutes."""
     model = stack_model("P-885.51")
@@ -146,16 +133,6 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: Record
     assert found.fit.interrupted == found.model.provenance.interrupted == search
     assert not found.advice
     assert found.fit.rms < 0.1 * record.range_m
-
-
-def test_a_model_file_says_that_it_was_interrupted(record: Record) -> None:
-    model = identify([record], progress=at("to the end")).model
-    text = dumps(model)
-    assert json.loads(text)["interrupted"] is True
-    assert loads(text).provenance.interrupted
-    with pytest.raises(InputError, match="'interrupted' is 'yes'; give true or false"):
-        loads(text.replace('"interrupted": true', '"interrupted": "yes"'))
-    assert "interrupted" not in json.loads(dumps(stack_model("P-885.51")))
 
 
 def columns(record: Record) -> dict[str, np.ndarray]:
@@ -278,29 +255,6 @@ def interrupted(
     rest = process.stderr.read()
     process.wait()
     return process, time.perf_counter() - begin, rest
-
-
-@slow
-@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to one process")
-@pytest.mark.parametrize(
-    ("command", "word"),
-    [
-        ("diagnose", "base fit from"),
-        ("diagnose", "cause 1: fitting"),
-        ("identify", "base fit from"),
-    ],
-)
-def test_one_interrupt_ends_a_command(command: str, word: str, tmp_path: Path) -> None:
-    """At other words, in one process: above; in the screening, twice: below."""
-    make_record("slow_creep", 3, tmp_path / "r.csv")
-    process, took, told = interrupted(word, tmp_path / "r.csv", tmp_path, command)
-    assert process.returncode == 130
-    assert took < 2.0
-    assert "Interrupted: " in told
-    left = {p.name for p in tmp_path.iterdir()}
-    assert left <= {"r.csv", "m.json"}
-    if "m.json" in left:
-        assert load_model(tmp_path / "m.json").provenance.interrupted
 
 
 @slow

@@ -1,6 +1,4 @@
-import os
 import re
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -64,25 +62,6 @@ def test_blocks_and_their_marks_are_found() -> None:
 def test_commands_run_in_an_empty_directory_that_the_next_block_may_share() -> None:
     assert run_text(TEXT) == []
     assert len(run_text(TEXT.replace("<!-- run: continue -->", ""))) == 1
-
-
-def test_programs_run() -> None:
-    text = "```console\n$ echo 3 > n\n```\n{}```python\nassert int(open('n').read()) == {}\n```\n"
-    assert run_text(text.format("<!-- run: continue -->\n", 3)) == []
-    assert run_text(text.format("<!-- before: echo 4 > n -->\n", 4)) == []
-    (failure,) = run_text(text.format("<!-- run: continue -->\n", 4))
-    assert "line 5" in failure
-    assert "ended with exit code 1" in failure
-
-
-@pytest.mark.skipif(not (os.environ.get("CC") or shutil.which("cc")), reason="no compiler")
-def test_statements_of_c_are_compiled_with_the_files_beside_them() -> None:
-    begin = "```console\n$ mkdir code && echo 'int two(void);' > code/two.h\n"
-    begin += "$ echo 'int two(void) { return 2; }' > code/two.c\n```\n<!-- run: continue -->\n"
-    statements = '```c\n#include "two.h"\nint found = two();\nif (found != {}) return 1;\n```\n'
-    assert run_text(begin + statements.format(2)) == []
-    assert len(run_text(begin + statements.format(3))) == 1
-    assert len(run_text(begin + statements.format("three"))) == 1
 
 
 def test_what_pages_show_as_text_is_no_command() -> None:

@@ -20,34 +20,11 @@ T = np.arange(64) * 1e-3
 V = 50.0 - 50.0 * np.cos(40.0 * T)
 X = 0.1 * V + 0.01 * np.sin(7.0 * T)
 TABLE = {"time [ms]": 1e3 * T, "voltage [V]": V, "displacement [um]": X}
-NAMES = ("time", "voltage", "displacement")
 #: What is asked of a diagnosis, whether it was just made or is read back.
 ANSWERS = (
     "verdict", "causes", "candidates", "base_errors", "extended_errors", "gain",
     "noise_floor_rms_m", "kept", "doubt", "notes",
 )  # fmt: skip
-
-
-def assert_same(record: psa.Record) -> None:
-    for name, values in zip(NAMES, (T, V, 1e-6 * X), strict=True):
-        np.testing.assert_allclose(getattr(record, name), values, rtol=1e-12)
-
-
-def test_a_record_comes_from_a_mapping_or_a_data_frame() -> None:
-    assert_same(psa.record_from(TABLE))
-    assert_same(psa.record_from(pd.DataFrame(TABLE)))
-    bare = pd.DataFrame({"t": T, "u": V, "y": X})
-    columns = "time=t:s,voltage=u:V,displacement=y:um"
-    assert_same(psa.record_from(bare, columns=columns))
-
-
-def test_a_table_gives_the_record_that_its_file_gives(tmp_path: Path) -> None:
-    path = tmp_path / "r.csv"
-    pd.DataFrame(TABLE).to_csv(path, index=False)
-    table, file = psa.record_from(TABLE, name="r"), psa.read_record(path)
-    assert table.name == file.name
-    for name in NAMES:
-        np.testing.assert_array_equal(getattr(table, name), getattr(file, name))
 
 
 def test_a_missing_reading_of_a_frame_is_missing() -> None:
@@ -80,21 +57,6 @@ def test_one_or_several_records_paths_and_tables_are_records(tmp_path: Path) -> 
         (listed,) = records_given([one])
         assert alone.n == listed.n == 64
     assert [r.n for r in records_given([record, path, TABLE])] == [64, 64, 64]
-
-
-def test_mistakes_of_all_that_was_given_are_told_together(tmp_path: Path) -> None:
-    with pytest.raises(psa.InputError) as caught:
-        records_given([tmp_path / "none.csv", 3, {"t": T}])  # type: ignore[list-item]
-    assert "none.csv" in str(caught.value)
-    assert "int is no record" in str(caught.value)
-    assert "record 3" in str(caught.value)
-
-
-def test_diagnose_and_identify_take_what_stands_for_a_record() -> None:
-    with pytest.raises(psa.InputError, match=r"none\.csv"):
-        psa.diagnose("none.csv")
-    with pytest.raises(psa.InputError, match=r"none\.csv"):
-        psa.identify("none.csv")
 
 
 def test_results_are_short_in_a_line() -> None:
@@ -141,16 +103,6 @@ def test_results_are_data_frames() -> None:
     np.testing.assert_array_equal(read.displacement, run.outputs["displacement"])
 
 
-def test_a_record_is_a_table_that_reads_as_the_record() -> None:
-    record = psa.record_from({**TABLE, "current [mA]": V, "load_force [N]": 2.0 * V})
-    again = psa.record_from(record.to_frame())
-    assert {*record.to_frame()} == {
-        "time [s]", "voltage [V]", "displacement [m]", "current [A]", "load_force [N]"
-    }  # fmt: skip
-    for name in (*NAMES, "current", "load_force"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(record, name))
-
-
 def test_one_output_is_drawn_on_the_axes_that_are_given() -> None:
     d, found = diagnosis("cause_named"), identification()
     run, record = psa.simulate(found.model, T, V), d.experiments[0].record
@@ -169,17 +121,6 @@ def test_one_output_is_drawn_on_the_axes_that_are_given() -> None:
         d.plot(output="speed")
     with pytest.raises(psa.InputError, match=r"no output 'x_1'.*voltage, "):
         run.plot(output="x_1")
-
-
-def test_models_and_records_are_cells_of_a_notebook() -> None:
-    model = psa.stack_model("P-885.51")
-    cell = model._repr_html_()
-    assert "<table>" in cell
-    assert cell.count("<tr>") == 1 + len(model.values)
-    assert "stiffness" in cell
-    record = psa.record_from(TABLE, name="<a&b>")._repr_html_()
-    assert "&lt;a&amp;b&gt;" in record
-    assert "data:image/png;base64," in record
 
 
 @pytest.mark.parametrize("verdict", ["cause_named", "adequate", "ambiguous"])

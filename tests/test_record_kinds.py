@@ -1,7 +1,6 @@
 """What files of laboratories have in common: tables, times, missing readings, names, numbers."""
 
 import re
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,17 +14,14 @@ from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
 from tests.laboratory_bytes import Cell, npz, xlsx
 from tests.reading_here import here
-from tests.test_laboratory_files import OPEN
-from tests.test_laboratory_files import X as OPEN_X
+from tests.record_files import HEADER as HEAD
+from tests.record_files import assert_is, offered, refused
 from tests.tiers import slow_but
 
 N = 40
 T = np.round(np.arange(N) * 4e-4, 7)
 V = np.round(50 + 40 * np.sin(np.arange(N) / 3.0), 4)
 X = np.round(5 + 4 * np.sin(np.arange(N) / 3.0 - 0.2), 4)
-HEAD = "time [s],voltage [V],displacement [um]"
-#: Beyond a channel's number, what is offered has the same numbers in units that it takes for given.
-HOW = re.compile(r"((?:--columns|--sample-time) .*?) \(with your|(--columns table=\S+?)[.,]? ")
 
 
 def table(*head: str, columns: Sequence[Any] = (T, V, X), mark: str = ",") -> str:
@@ -39,29 +35,8 @@ def written(folder: Path, text: str | bytes, name: str = "a.csv") -> Path:
     return path
 
 
-def assert_is(record: Record, t: Any = T, v: Any = V, x: Any = X) -> None:
-    assert record.displacement is not None
-    np.testing.assert_allclose(record.time - record.time[0], t - t[0], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(record.voltage, v, rtol=1e-12)
-    np.testing.assert_allclose(record.displacement, 1e-6 * x, rtol=1e-12)
-
-
-def options(said: str) -> dict[str, Any]:
-    """Return the options that a message offers, as the command line would take them."""
-    found = HOW.search(said + " ")
-    words = shlex.split(found[1] or found[2]) if found else []
-    asked: dict[str, Any] = {}
-    if "--columns" in words:
-        asked["columns"] = words[words.index("--columns") + 1]
-    if "--sample-time" in words:
-        asked["sample_time"] = float(words[words.index("--sample-time") + 1])
-    return asked
-
-
-def refused(path: Path, **asked: Any) -> str:
-    with pytest.raises(InputError) as caught:
-        read_record(path, **asked)
-    return str(caught.value)
+def is_read(record: Record, t: Any = T, v: Any = V, x: Any = X) -> None:
+    assert_is(record, t, v, 1e-6 * x)
 
 
 def clocks() -> dict[str, list[str]]:
@@ -93,7 +68,7 @@ def test_times_are_seconds_from_the_first(how: str, tmp_path: Path) -> None:
     name = "time [s]" if how == "too few digits" else "Timestamp"
     text = table(f"{name},voltage [V],displacement [um]", columns=(clocks()[how], V, X))
     record = read_record(written(tmp_path, text))
-    assert_is(record)
+    is_read(record)
     assert ("too few digits" in "".join(record.notes)) == (how == "too few digits")
 
 
@@ -111,7 +86,7 @@ def test_days_of_matlab_are_days(tmp_path: Path) -> None:
 def test_the_time_is_as_the_head_states_it(head: str, tmp_path: Path) -> None:
     text = table("rig 3", head, "voltage [V],displacement [um]", columns=(V, X))
     record = read_record(written(tmp_path, text))
-    assert_is(record)
+    is_read(record)
     assert "that the file states, 0.0004 s" in record.notes[0]
 
 
@@ -159,25 +134,19 @@ def test_numbers_as_programs_write_them(how: str, tmp_path: Path) -> None:
     points = [str(t).replace(".", "," if how[:2] in ("Ge", "Fr") else ".") for t in T]
     volts = [str(v).replace(".", "," if how[:2] in ("Ge", "Fr") else ".") for v in V]
     text = table(head, columns=(points, volts, [form(x) for x in X]), mark=mark)
-    assert_is(read_record(written(tmp_path, text)))
+    is_read(read_record(written(tmp_path, text)))
 
 
 def test_comments_remarks_and_what_stands_below_are_no_samples(tmp_path: Path) -> None:
     lines = table(HEAD).splitlines()
     lines[9:9] = ["# the door was opened", "% gain 10", "; later"]
     lines += ["Mean,50.0,5.0", "End of data"]
-    assert_is(read_record(written(tmp_path, "\n".join(lines))))
+    is_read(read_record(written(tmp_path, "\n".join(lines))))
     origin = table("Time\tVoltage\tDisplacement", "s\tV\tum", "\tE-504\tsensor 2", mark="\t")
-    assert_is(read_record(written(tmp_path, origin)))
+    is_read(read_record(written(tmp_path, origin)))
     wide = table("Time (s)   Drive voltage (V)   Stack displacement (um)", mark="   ")
-    assert_is(read_record(written(tmp_path, wide)))
-    assert_is(read_record(written(tmp_path, table("TIME(S) VOLTAGE(V) DISP(UM)", mark=" "))))
-
-
-def test_samples_lie_in_rows_too(tmp_path: Path) -> None:
-    rows = zip(("time [s]", "voltage [V]", "displacement [um]"), (T, V, X), strict=True)
-    text = "\n".join(",".join([name, *map(str, values)]) for name, values in rows)
-    assert_is(read_record(written(tmp_path, text)))
+    is_read(read_record(written(tmp_path, wide)))
+    is_read(read_record(written(tmp_path, table("TIME(S) VOLTAGE(V) DISP(UM)", mark=" "))))
 
 
 NAMES: dict[str, dict[str, Any]] = {
@@ -202,18 +171,13 @@ def test_names_that_count_or_mark_are_never_the_time_or_the_drive(
     fill = {"S": np.arange(N), "N": np.arange(N) + 1, "t": T, "d": X, "D": X}
     columns = [fill.get(n[0], X if n == "OUT2 [um]" else V) for n in names]
     path = written(tmp_path, table(head, columns=columns))
-    offered = options(refused(path))
-    assert {k: v for k, v in offered.items() if k != "columns"} == {
+    found = offered(refused(path))
+    assert {k: v for k, v in found.items() if k != "columns"} == {
         k: v for k, v in NAMES[head].items() if k != "columns"
     }
     if "columns" in NAMES[head]:
         for part in str(NAMES[head]["columns"]).split(","):
-            assert part in offered["columns"].split(",")
-
-
-def test_a_trigger_beside_the_drive_is_left_alone(tmp_path: Path) -> None:
-    head = "time [s],Trigger (V),Ch 2 (V),displacement [um]"
-    assert_is(read_record(written(tmp_path, table(head, columns=(T, 5 * (V > 50), V, X)))))
+            assert part in found["columns"].split(",")
 
 
 def several(folder: Path) -> dict[str, Path]:
@@ -251,19 +215,14 @@ def test_several_tables_are_listed_chosen_and_taken_together(
     here(monkeypatch)
     for form, path in several(tmp_path).items():
         said = refused(path)
-        asked = options(said)
+        asked = offered(said)
         assert "table=all" in said, form
-        assert_is(read_record(path, **asked))
+        is_read(read_record(path, **asked))
         first, second = read_records([path], columns="table=all")
-        assert_is(first)
-        assert_is(second, v=2 * V)
+        is_read(first)
+        is_read(second, v=2 * V)
         assert len({first.sha256, second.sha256}) == len({first.name, second.name}) == 2
-        assert_is(read_record(path, columns="table=2"), v=2 * V)
-
-
-def test_a_table_that_is_not_there_is_told(tmp_path: Path) -> None:
-    path = several(tmp_path)["stacked"]
-    assert "there is no table '3'; there are '1', '2'" in refused(path, columns="table=3")
+        is_read(read_record(path, columns="table=2"), v=2 * V)
 
 
 def test_packets_have_no_time_of_their_own(tmp_path: Path) -> None:
@@ -271,8 +230,8 @@ def test_packets_have_no_time_of_their_own(tmp_path: Path) -> None:
     path = written(tmp_path, packets)
     said = refused(path)
     assert "the time begins anew every 2 lines" in said
-    assert options(said) == {"sample_time": 1e-3}
-    assert_is(read_record(path, sample_time=4e-4))
+    assert offered(said) == {"sample_time": 1e-3}
+    is_read(read_record(path, sample_time=4e-4))
 
 
 def channel(values: Any, unit: str, time: Any = T) -> str:
@@ -284,8 +243,8 @@ def test_channels_in_files_of_their_own_are_joined(tmp_path: Path) -> None:
     two = written(tmp_path, channel(X, "um"), "x.csv")
     assert "files of one channel each are joined as FILE+FILE" in refused(one)
     (record,) = read_records([one, two])
-    assert_is(record)
-    assert_is(read_record(f"{one}+{two}"))
+    is_read(record)
+    is_read(read_record(f"{one}+{two}"))
     late = written(tmp_path, channel(X, "um", T + 1e-4), "late.csv")
     (record,) = read_records([one, late])
     assert record.n == N - 1
@@ -305,7 +264,7 @@ def test_dates_of_files_to_be_joined_are_on_one_clock(tmp_path: Path) -> None:
     sensor = table("Timestamp,x [um]", columns=(stamped(2e-3), X))  # begins five samples later
     paths = [written(tmp_path, drive, "v.csv"), written(tmp_path, sensor, "x.csv")]
     (record,) = read_records(paths)
-    assert_is(record, t=T[5:], v=V[5:], x=X[:-5])
+    is_read(record, t=T[5:], v=V[5:], x=X[:-5])
     bare = written(tmp_path, channel(X, "um"), "bare.csv")
     assert "some have dates or clock times, others numbers" in refused(Path(f"{paths[0]}+{bare}"))
 
@@ -325,9 +284,9 @@ def test_settings_beside_the_samples_are_no_samples(tmp_path: Path) -> None:
     ]
     with pytest.raises(InputError) as caught:
         read_records(paths)
-    asked = options(str(caught.value))
+    asked = offered(str(caught.value))
     assert asked == {"columns": "voltage=CH1:V,displacement=CH2:1um"}
-    assert_is(*read_records(paths, **asked))
+    is_read(*read_records(paths, **asked))
     bad = paths[0].read_text().replace(f"{V[3]:10.5f}", "  oops")
     assert "line 4, column 'voltage': found 'oops'" in refused(written(tmp_path, bad, "b.csv"))
 
@@ -339,18 +298,6 @@ def test_settings_beside_the_samples_are_no_samples(tmp_path: Path) -> None:
 def test_any_unit_of_the_right_dimension_is_read(unit: str, size: float, tmp_path: Path) -> None:
     record = read_record(written(tmp_path, table(f"time [s],voltage [V],displacement [{unit}]")))
     np.testing.assert_allclose(np.asarray(record.displacement), size * X, rtol=1e-12)
-
-
-@pytest.mark.parametrize("form", OPEN)
-def test_what_is_offered_reads_the_file_as_typed(
-    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here(monkeypatch)
-    path = written(tmp_path, OPEN[form], f"a{Path(form).suffix or '.csv'}")
-    asked = options(refused(path))
-    assert asked
-    record = read_record(path, **asked)
-    np.testing.assert_allclose(np.asarray(record.displacement), 1e-6 * OPEN_X, rtol=1e-5)
 
 
 def csv_of(path: Path, columns: Mapping[str, Any]) -> None:
@@ -414,11 +361,3 @@ def test_every_row_is_read_bit_for_bit(
     np.testing.assert_array_equal(record.time, columns["time [s]"])
     np.testing.assert_array_equal(record.voltage, columns["voltage [V]"])
     np.testing.assert_array_equal(np.asarray(record.displacement), columns["displacement [m]"])
-
-
-@pytest.mark.parametrize("rows", [2000, 3000])
-def test_hdf5_above_the_size_of_a_pipe_is_read_apart(rows: int, tmp_path: Path) -> None:
-    t = np.arange(rows) / 1e3
-    columns = {"time [s]": t, "voltage [V]": np.sin(t), "displacement [m]": np.cos(t)}
-    hdf5_of(tmp_path / "a.h5", columns)
-    np.testing.assert_array_equal(read_record(tmp_path / "a.h5").voltage, np.sin(t))

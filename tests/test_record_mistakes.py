@@ -4,16 +4,9 @@ from pathlib import Path
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.records import read_record, read_records
+from psa_casadi.records import read_record
 from psa_casadi.records.read import file_bytes
-from tests.record_files import HEADER, ROWS, write
-
-
-def problems_of(path: Path, *, need_excitation: bool = False) -> tuple[str, ...]:
-    with pytest.raises(InputError) as caught:
-        read_record(path, need_excitation=need_excitation)
-    assert all(problem.startswith((str(path), "... and")) for problem in caught.value.problems)
-    return caught.value.problems
+from tests.record_files import HEADER, ROWS, problems_of, write
 
 
 def with_row(row: int, text: str) -> list[str]:
@@ -105,11 +98,6 @@ def test_decimal_commas_between_commas_are_told_from_a_row_too_long(tmp_path: Pa
     assert "separate the cells by semicolons" in problems[0]
 
 
-def test_line_numbers_count_comments_and_blank_lines(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.csv", "# one", HEADER, "", *with_row(4, "0.001,1,1"))
-    assert "line 8, column 'time': time goes back (from 0.003 in line 7" in problems_of(path)[0]
-
-
 @pytest.mark.parametrize(
     ("order", "told"),
     [
@@ -126,25 +114,6 @@ def test_many_lines_out_of_order_are_told_in_one_sentence(
     assert told in problem
 
 
-def test_time_is_compared_across_a_row_without_time(tmp_path: Path) -> None:
-    rows = with_row(4, ",1,1")
-    rows[5] = "0.003,1,1"
-    problems = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
-    assert len(problems) == 2
-    assert "line 7, column 'time': time stands still (from 0.003 in line 5" in problems[1]
-
-
-def test_every_mistake_of_a_file_is_reported_at_once(tmp_path: Path) -> None:
-    rows = ROWS.copy()
-    rows[2], rows[9], rows[12] = "0.002,x,1", "0.001,1,1", "0.012,inf,1"
-    header = "time [s],voltage [KV],displacement"
-    problems = problems_of(write(tmp_path / "a.csv", header, *rows))
-    everything = "\n".join(problems)
-    assert len(problems) == 5
-    for part in ("'KV' is unknown", "'displacement' has no unit", "line 4", "line 11", "line 14"):
-        assert part in everything
-
-
 @pytest.mark.parametrize("row", ["inf,nan,1", "a,b,c"])
 def test_a_file_full_of_mistakes_lists_twenty_and_counts_the_others(
     tmp_path: Path, row: str
@@ -153,16 +122,6 @@ def test_a_file_full_of_mistakes_lists_twenty_and_counts_the_others(
     expected = {"inf,nan,1": 1000, "a,b,c": 1501}[row]
     assert len(problems) == 21
     assert problems[-1] == f"... and {expected - 20} more"
-
-
-def test_too_few_samples_and_no_displacement_are_refused(tmp_path: Path) -> None:
-    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *ROWS[:7]))
-    assert "found 7 samples, expected at least 16" in problem
-    (problem,) = problems_of(write(tmp_path / "b.csv", HEADER))
-    assert "found 0 samples" in problem
-    empty = [row.rsplit(",", 1)[0] + "," for row in ROWS]
-    (problem,) = problems_of(write(tmp_path / "c.csv", HEADER, *empty))
-    assert "column 'displacement': found no valid values in 20 rows" in problem
 
 
 def test_instants_that_are_one_in_seconds_are_refused(tmp_path: Path) -> None:
@@ -181,13 +140,6 @@ def test_lines_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.Monke
     assert "its lines need more than" in problem
 
 
-def test_a_constant_voltage_is_refused_only_for_a_fit(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.csv", HEADER, *(f"{k},3.5,{k}" for k in range(20)))
-    assert read_record(path).n == 20
-    (problem,) = problems_of(path, need_excitation=True)
-    assert "column 'voltage': found 3.5 in every row, expected a voltage that changes" in problem
-
-
 def test_files_that_are_no_csv_are_named_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "empty.csv").write_text("\n \n")
     (tmp_path / "comments.csv").write_text("# only\n# comments\n")
@@ -204,17 +156,3 @@ def test_files_that_are_no_csv_are_named_with_the_reason(tmp_path: Path) -> None
     for name, reason in reasons.items():
         (problem,) = problems_of(tmp_path / name)
         assert reason in problem
-
-
-def test_several_files_report_the_mistakes_of_all(tmp_path: Path) -> None:
-    good = write(tmp_path / "good.csv", HEADER, *ROWS)
-    bad = write(tmp_path / "bad.csv", HEADER, *with_row(4, "0.004,x,1"))
-    assert [r.name for r in read_records([good, good])] == ["good", "good"]
-    with pytest.raises(InputError) as caught:
-        read_records([good, bad, tmp_path / "absent.csv"])
-    assert [p.split(":")[0] for p in caught.value.problems] == [
-        str(bad),
-        str(tmp_path / "absent.csv"),
-    ]
-    with pytest.raises(InputError, match="name at least one CSV file"):
-        read_records([])

@@ -1,4 +1,3 @@
-import hashlib
 import math
 import time as clock
 from pathlib import Path
@@ -16,28 +15,6 @@ from tests.record_files import HEADER, ROWS, write
 from tests.tiers import slow
 
 T = np.arange(24) / 8.0
-
-
-def test_a_record_is_read_in_si_units_whatever_the_order_and_the_unit(tmp_path: Path) -> None:
-    lines = [f"{k + 5},{k},{k / 8},{k * 3},{k * 2},{k}" for k in range(20)]
-    header = (
-        "temperature [degC],displacement [nm],time [ms],load_force [kN],current [mA],voltage [kV]"
-    )
-    path = write(tmp_path / "a.csv", header, *lines)
-    record = read_record(path)
-    k = np.arange(20.0)
-    np.testing.assert_array_equal(record.time, k / 8 / 1000)
-    np.testing.assert_array_equal(record.voltage, k * 1000)
-    assert record.displacement is not None
-    assert record.load_force is not None
-    assert record.current is not None
-    assert record.temperature is not None
-    np.testing.assert_array_equal(record.displacement, k / 1e9)
-    np.testing.assert_array_equal(record.load_force, 3000 * k)
-    np.testing.assert_array_equal(record.current, 2 * k / 1000)
-    np.testing.assert_allclose(record.temperature, k + 278.15, rtol=1e-15)
-    assert record.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert (record.name, record.source, record.displacement_unit) == ("a", str(path), "m")
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
@@ -68,26 +45,6 @@ def test_comments_quotes_blank_lines_and_capitals_are_tolerated(tmp_path: Path) 
     assert record.mask.shape == (20,)
 
 
-@pytest.mark.parametrize("slow", [False, True])
-def test_missing_displacement_is_masked_and_nothing_is_made_up(tmp_path: Path, slow: bool) -> None:
-    rows = ROWS.copy()
-    rows[3], rows[5], rows[6] = "0.003,3,", "0.005,5,nan", "0.006,6, " if slow else "0.006,6,NaN"
-    record = read_record(write(tmp_path / "a.csv", HEADER, *rows))
-    assert record.displacement is not None
-    assert list(np.flatnonzero(~record.mask)) == [3, 5, 6]
-    assert np.isnan(record.displacement[[3, 5, 6]]).all()
-    first = [",".join([row.split(",")[2], *row.split(",")[:2]]) for row in rows]
-    again = read_record(write(tmp_path / "b.csv", "displacement [um],time [s],voltage [V]", *first))
-    assert again.displacement is not None
-    np.testing.assert_array_equal(again.displacement, record.displacement)
-    middle = [",".join([row.split(",")[i] for i in (0, 2, 2, 1)]) for row in rows]
-    again = read_record(
-        write(tmp_path / "c.csv", "time [s],displacement [um],other,voltage [V]", *middle)
-    )
-    assert again.displacement is not None
-    np.testing.assert_array_equal(again.displacement, record.displacement)
-
-
 def test_counts_stay_counts(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv", "time [s],voltage [V],displacement [counts]", *ROWS)
     record = read_record(path)
@@ -112,20 +69,6 @@ def test_what_is_written_reads_back_bit_for_bit(
     np.testing.assert_array_equal(record.displacement, values)
 
 
-@pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
-def test_the_measured_records_are_read(measured_data: Path, file: str) -> None:
-    path = measured_data / "micromanipulator" / f"{file}.csv"
-    record = read_record(path, need_excitation=True)
-    expected = np.genfromtxt(path, delimiter=",", skip_header=1)
-    assert record.displacement is not None
-    assert record.n == {"sine_1hz": 7927, "minor_loops": 3600}[file]
-    assert record.mask.all()
-    assert record.sample_time == pytest.approx(0.005)
-    np.testing.assert_array_equal(record.voltage, expected[:, 1])
-    np.testing.assert_allclose(record.displacement, expected[:, 2] * 1e-6, rtol=1e-15)
-    assert 35e-6 < record.range_m < 50e-6
-
-
 @slow
 def test_a_million_rows_are_read_quickly(tmp_path: Path) -> None:
     rows = [f"{k / 10000:.4f},{k % 1000 / 10},{k % 1000 / 100}" for k in range(10**6)]
@@ -143,26 +86,6 @@ def make_record() -> Record:
         voltage=2 * time,
         displacement=np.array([1.0, np.nan, 3.0, -1.0, 0.0]) * 1e-6,
     )
-
-
-def test_a_record_cannot_be_changed_and_does_not_share_memory() -> None:
-    voltage = np.arange(5.0)
-    record = Record(name="r", time=np.arange(5.0), voltage=voltage)
-    voltage[0] = 99.0
-    assert record.voltage[0] == 0.0
-    with pytest.raises(ValueError, match="read-only"):
-        record.voltage[0] = 1.0
-    with pytest.raises(AttributeError):
-        record.name = "other"  # type: ignore[misc]
-
-
-def test_facts_of_a_record() -> None:
-    record = make_record()
-    assert record.n == 5
-    assert list(record.mask) == [True, False, True, True, True]
-    assert record.range_m == pytest.approx(4e-6)
-    assert record.sample_time == pytest.approx(0.1)
-    assert record.duration == pytest.approx(0.5)
 
 
 def test_records_made_in_memory_are_told_apart_by_their_hash() -> None:
@@ -221,21 +144,3 @@ def test_arrays_are_checked_as_files_are(column: str, values: FloatArray, senten
     assert Record(name="r", **sound).n == 24
     with pytest.raises(InputError, match=sentence):
         Record(name="r", **{**sound, column: values})
-
-
-def test_a_record_is_made_by_keywords() -> None:
-    with pytest.raises(TypeError, match="positional"):
-        Record("r", T, T)  # type: ignore[call-arg]
-
-
-def test_a_record_is_written_as_it_is(tmp_path: Path) -> None:
-    t = np.arange(20.0)
-    x = np.where(t == 3.0, np.nan, 1e-7 * t)
-    record = Record(
-        name="a", time=t, voltage=2.0 * t + 1.0, displacement=x, current=1e-3 * t,
-        temperature=300.0 + t, displacement_2=0.5e-7 * t,
-    )  # fmt: skip
-    write_record(tmp_path / "a.csv", record)
-    again = read_record(tmp_path / "a.csv")
-    for name in ("time", "voltage", "displacement", "current", "temperature", "displacement_2"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(record, name))

@@ -1,7 +1,6 @@
 """Noise that is measured without a model: from a voltage played again, and from a held one."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from scipy.signal import lfilter
 
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records import Record, excitation, read_record
+from psa_casadi.records import Record, excitation
 from psa_casadi.records.repeats import held, holds, repeats, repetitions
 
 FloatArray = NDArray[np.float64]
@@ -116,14 +115,6 @@ def test_what_is_not_repeated_shows_nothing() -> None:
     assert repeats(replace(record(ramp, ramp), displacement=None)) is None
 
 
-def test_another_load_is_no_repeat() -> None:
-    v = sine(4_000)
-    r = record(v, 1e-7 * v + noise(v.size, 0.0))
-    ramped = replace(r, load_force=np.linspace(0.0, 10.0, v.size))
-    assert repeats(r) is not None
-    assert repeats(ramped) is None
-
-
 def held_levels() -> tuple[FloatArray, FloatArray]:
     levels = np.array([0.0, 50.0, 20.0, 80.0])
     v = np.repeat(levels, 5_000)
@@ -189,14 +180,3 @@ def test_a_coarse_sensor_has_at_least_the_noise_of_rounding() -> None:
     assert floor.level >= step / np.sqrt(12.0) * 0.999
     assert floor.autocovariance[0] == pytest.approx(floor.level**2)
     assert "steps of 0.1 µm" in floor.sentence
-
-
-@pytest.mark.parametrize(("file", "samples"), [("sine_1hz.csv", 5_000), ("minor_loops.csv", 1_500)])
-def test_the_micromanipulator_repeats(measured_data: Path, file: str, samples: int) -> None:
-    r = read_record(measured_data / "micromanipulator" / file)
-    found = repeats(r)
-    assert found is not None
-    assert found.distances[0] == pytest.approx(1.0, abs=0.006)
-    assert found.level == pytest.approx(0.07e-6, rel=0.1)
-    assert found.samples >= samples
-    assert holds(r) is None

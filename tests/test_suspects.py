@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from psa_casadi.records import Record, multisine, read_record, sine, steps, time_grid, triangle
+from psa_casadi.records import Record, multisine, sine, steps, time_grid, triangle
 from psa_casadi.records.noise import quantum_of
 from psa_casadi.records.suspects import cleaned, suspects
 from tests.tiers import slow_but
@@ -90,14 +90,6 @@ def test_a_kick_of_the_load_is_not_suspect() -> None:
     y[6001:6004] += 0.2 * RANGE
     assert not suspects(replace(base, displacement=y, load_force=load)).mask.any()
     assert list(np.flatnonzero(suspects(replace(base, displacement=y)).mask)) == [6001, 6002, 6003]
-
-
-@pytest.mark.parametrize("file", ["sine_1hz", "minor_loops"])
-def test_the_measured_records_have_no_suspects(measured_data: object, file: str) -> None:
-    found = suspects(read_record(f"{measured_data}/micromanipulator/{file}.csv"))
-    assert found.counts == {"outlier": 0, "drop-out": 0, "stuck": 0, "saturated": 0}
-    assert found.quantum is None
-    assert found.sentences(file) == ()
 
 
 @pytest.mark.parametrize("width", [1, 2, 3])
@@ -228,21 +220,3 @@ def test_readings_repeated_to_the_last_digit_are_masked_where_noise_makes_none(
     assert found.counts["stuck"] == int(found.mask.sum()) < 1.1 * places.size + 10
     coarse = np.round(y / (1e-3 * RANGE)) * (1e-3 * RANGE)
     assert suspects(replace(given, displacement=coarse)).counts["stuck"] == 0
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_what_chance_and_digits_repeat_is_not_stuck(seed: int) -> None:
-    """Short records; files with five significant digits; motion without noise and a rest."""
-    rng = np.random.default_rng(seed)
-    short, y = record("sine", "white", seed), np.array(record("sine", "white", seed).displacement)
-    digits = np.round(y[:300] / 2e-3 / RANGE * 1e3) * 2e-3 * RANGE / 1e3
-    given = replace(short.slice(0, 300), displacement=digits)
-    assert suspects(given).counts["stuck"] == 0
-    significant = np.array([float(f"{v:.5g}") for v in y])
-    assert suspects(replace(short, displacement=significant)).counts["stuck"] == 0
-    frequencies = rng.uniform(50.0, 900.0, 8)
-    voltage = np.sum(np.sin(2 * np.pi * np.outer(T, frequencies)), axis=1)
-    voltage -= voltage[300]
-    voltage[:301] = 0.0
-    smooth = Record(name="smooth", time=T, voltage=10.0 * voltage, displacement=1e-7 * voltage)
-    assert not suspects(smooth).mask.any()

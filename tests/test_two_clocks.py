@@ -16,8 +16,6 @@ from tests.plants.two_clocks import held
 
 #: Sampling time [s], samples, renewals in one of them, and loops in the record.
 STEP, SAMPLES, RENEWALS, LOOPS = 5e-3, 3000, 4, 40
-#: Beats of the loops' size in the record, where it goes through a saw tooth of its own.
-GROUPS = 3.0
 
 
 def played(size: FloatArray) -> Run:
@@ -119,13 +117,3 @@ def test_nothing_else_is_taken_for_two_clocks(run: Run) -> None:
     assert saw is not None
     still = Record(name="still", time=run.times, voltage=0.0 * x, displacement=noise * along)
     assert two_clocks(still) is None
-
-
-def test_loops_in_growing_groups_are_no_clocks() -> None:
-    """The size of the loops goes through a saw tooth of its own, and an amplifier's lag with it."""
-    along = np.arange(SAMPLES) / SAMPLES
-    run = played(0.15 + 0.3 * ((GROUPS * along) % 1.0))
-    x = run.displacement + 0.02 * run.displacement**2 / np.max(run.displacement)
-    noise = 1e-4 * float(np.ptp(x))
-    assert two_clocks(record(run, x, noise)) is None
-    assert two_clocks(record(run, np.interp(run.times - 2e-3, run.times, x), noise)) is None

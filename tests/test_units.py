@@ -1,21 +1,16 @@
 import math
-from fractions import Fraction
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from psa_casadi.errors import InputError
 from psa_casadi.units import (
-    BASE_UNITS,
-    NO_DIMENSION,
     UNITS,
     Power,
     Unit,
     convert,
     parse_unit,
-    si_unit,
     to_si,
     units_of,
 )
@@ -76,32 +71,12 @@ def test_compound_units(text: str) -> None:
     assert unit.offset == 0.0
 
 
-PREFIXED = [
-    symbol
-    for symbol, unit in UNITS.items()
-    if symbol[1:] in UNITS and unit.quantity == UNITS[symbol[1:]].quantity and symbol != "kg"
-]
-
-
-@pytest.mark.parametrize("symbol", PREFIXED)
-def test_prefixes_scale_by_their_power_of_ten(symbol: str) -> None:
-    assert UNITS[symbol].ratio == Fraction(10) ** PREFIXES[symbol[0]]
-
-
 @pytest.mark.parametrize(
     ("written", "name"),
     [("µm", "um"), ("\u03bcF", "uF"), ("\u2126", "Ohm"), ("k\u03a9", "kOhm"), ("°C", "degC")],
 )
 def test_signs_that_people_write_are_understood(written: str, name: str) -> None:
     assert parse_unit(written) == UNITS[name]
-
-
-def test_base_units_stand_in_the_order_of_fmi() -> None:
-    assert BASE_UNITS == ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-    for position, name in enumerate(BASE_UNITS):
-        assert UNITS[name].exponents[position] == 1
-        assert sum(abs(float(power)) for power in UNITS[name].exponents) == 1
-    assert UNITS["1"].exponents == NO_DIMENSION
 
 
 @given(st.integers(-(10**9), 10**9), st.sampled_from(["um", "mV", "uF", "nm", "mA", "kN"]))
@@ -147,22 +122,6 @@ def test_temperature_has_an_offset_only_by_itself() -> None:
     assert to_si(25.0, "degC") == 298.15
     assert convert(0.0, "K", "degC") == -273.15
     assert convert(2.0, "V/degC", "V/K") == 2.0
-
-
-def test_arrays_convert_element_by_element() -> None:
-    values = np.array([7.0, np.nan, -3.0])
-    np.testing.assert_array_equal(to_si(values, "um"), [7e-6, np.nan, -3e-6])
-    np.testing.assert_array_equal(values, [7.0, np.nan, -3.0])
-
-
-@pytest.mark.parametrize(
-    ("unit", "si"),
-    [("mV", "V"), ("um/ms", "m/s"), ("degC", "K"), ("counts", "counts"), ("%", "1"), ("kHz", "Hz")],
-)
-def test_si_unit(unit: str, si: str) -> None:
-    assert si_unit(unit) == si
-    assert parse_unit(si).dimension == parse_unit(unit).dimension
-    assert parse_unit(si).factor == 1.0
 
 
 def test_converting_between_quantities_is_an_error_that_names_both() -> None:

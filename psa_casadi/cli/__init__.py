@@ -24,7 +24,7 @@ def main() -> None:
         return
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done; Python tidies up
-    from psa_casadi.cli.interrupts import leave
+    from psa_casadi.cli.failures import leave
 
     sys.stdout.flush()
     sys.stderr.flush()

@@ -21,12 +21,11 @@ from psa_casadi.cli.effects import effects
 from psa_casadi.cli.examples import examples
 from psa_casadi.cli.export import c, fmu, modelica
 from psa_casadi.cli.export_ssp import ssp
-from psa_casadi.cli.failures import guarded
+from psa_casadi.cli.failures import guarded, prepare
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.sample import sample
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
-from psa_casadi.cli.surroundings import prepare
 from psa_casadi.cli.web import web
 from psa_casadi.command_line import typed
 from psa_casadi.version import __version__

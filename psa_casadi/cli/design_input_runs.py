@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psa_casadi.cli.interrupts import kept
+from psa_casadi.cli.failures import kept
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.inversion import invert as inverted

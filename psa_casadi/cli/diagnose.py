@@ -136,8 +136,8 @@ def diagnose(
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli import diagnosis_files as files
-            from psa_casadi.cli.events import events_to
             from psa_casadi.cli.inputs import Given
+            from psa_casadi.cli.steps import events_to
             from psa_casadi.diagnosis.diagnose import diagnose as run
             from psa_casadi.diagnosis.result import DiagnosisInterrupted
             from psa_casadi.report.words.text import story

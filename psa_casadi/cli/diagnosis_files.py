@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from psa_casadi.cli.interrupts import kept
+from psa_casadi.cli.failures import kept
 
 if TYPE_CHECKING:
     from psa_casadi.diagnosis.result import Alternative, Diagnosis, DiagnosisInterrupted

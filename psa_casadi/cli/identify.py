@@ -130,7 +130,7 @@ def _finish(
 
     `more` are the JSON file, the page, and whether that is still.
     """
-    from psa_casadi.cli.interrupts import kept
+    from psa_casadi.cli.failures import kept
     from psa_casadi.files import atomic_write
     from psa_casadi.identification.certainty.profile import profile
     from psa_casadi.model.model_file import save_model

@@ -10,9 +10,8 @@ that `DATASETS` gives. Where the authors publish another format, what is kept is
 the conversion stated with the record makes of it, byte for byte.
 """
 
-from psa_casadi.datasets.devices import DATASETS
+from psa_casadi.datasets.devices import DATASETS, Dataset, DatasetFile
 from psa_casadi.datasets.fetching import copy, find, origin_text, originals, paths
-from psa_casadi.datasets.published import Dataset, DatasetFile
 from psa_casadi.records import Record, read_records
 
 __all__ = [

@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from psa_casadi.cache import writable_room
-from psa_casadi.datasets.devices import DATASETS
-from psa_casadi.datasets.published import Dataset, DatasetFile, Original
+from psa_casadi.datasets.devices import DATASETS, Dataset, DatasetFile, Original
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.files import atomic_write, make_folder
 

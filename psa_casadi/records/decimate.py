@@ -1,6 +1,7 @@
 """Block averages of a record, taken only as far as they lose nothing that a fit could use."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,23 +68,10 @@ def _uniform(time: FloatArray) -> bool:
 def _averages(record: Record, q: int) -> Record:
     """Return the record of block averages over q samples."""
     time = _means(record.time, q)
-
-    def averaged(array: FloatArray | None) -> FloatArray | None:
-        return None if array is None else _means(array, q)
-
-    return replace(
-        record,
-        time=time,
-        voltage=_means(record.voltage, q),
-        displacement=None if record.displacement is None else _valid_means(record, time, q),
-        load_force=averaged(record.load_force),
-        current=averaged(record.current),
-        temperature=averaged(record.temperature),
-        monitor_voltage=averaged(record.monitor_voltage),
-        charge=averaged(record.charge),
-        displacement_2=averaged(record.displacement_2),
-        strain=averaged(record.strain),
-    )
+    columns: dict[str, Any] = {n: _means(values, q) for n, values in record.recorded.items()}
+    if record.displacement is not None:
+        columns["displacement"] = _valid_means(record, time, q)
+    return replace(record, time=time, **columns)
 
 
 def _means(array: FloatArray, q: int) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The periodicity of a drive voltage: its dominant line and harmonics."""
+"""The periodicity of a drive voltage, its turns, and where it comes back by a threshold."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,4 +1,4 @@
-"""The noise floor of a measured displacement, and how a residual compares with it."""
+"""The noise floor of a signal, the quantum of its sensor, and small filters."""
 
 from collections.abc import Sequence
 

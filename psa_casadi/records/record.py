@@ -1,4 +1,4 @@
-"""One experiment: what was applied to the stack and what was measured."""
+"""One experiment: its columns, what must hold for their numbers, and the record of them."""
 
 import hashlib
 from dataclasses import dataclass, replace
@@ -34,6 +34,11 @@ class Located:
     lines: NDArray[np.int64]
     reported: NDArray[np.bool_]
     place: str = "line"
+
+    def part(self, where: slice) -> "Located":
+        """Return some of the values."""
+        own = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
+        return replace(self, **own)
 
     def complain(self, at: NDArray[np.bool_], sentence: str, problems: Problems) -> None:
         """Add `sentence` for every sample that `at` marks.
@@ -138,16 +143,33 @@ def check_finite(column: Located, problems: Problems) -> None:
     )
 
 
-#: Columns beside time and voltage that a record may have.
-_OPTIONAL = (
-    "displacement", "load_force", "current", "temperature", "monitor_voltage", "charge",
-    "displacement_2", "strain",
-)  # fmt: skip
-#: Units of all columns but the displacement.
-_UNITS = {
-    "time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K",
-    "monitor_voltage": "V", "charge": "C", "displacement_2": "m", "strain": "1",
-}  # fmt: skip
+@dataclass(frozen=True)
+class Column:
+    """One kind of column: its SI unit, the quantities it may hold and a header as an example."""
+
+    name: str
+    unit: str
+    quantities: tuple[str, ...]
+    example: str
+
+
+#: Every column a record may have, its time and voltage first; others in a file are left alone.
+COLUMNS: dict[str, Column] = {
+    column.name: column
+    for column in (
+        Column("time", "s", ("time",), "time [s]"),
+        Column("voltage", "V", ("voltage",), "voltage [V]"),
+        Column("displacement", "m", ("length", "sensor counts"), "displacement [um]"),
+        Column("load_force", "N", ("force",), "load_force [N]"),
+        Column("current", "A", ("current",), "current [mA]"),
+        Column("temperature", "K", ("temperature",), "temperature [degC]"),
+        Column("monitor_voltage", "V", ("voltage",), "monitor_voltage [V]"),
+        Column("charge", "C", ("charge",), "charge [uC]"),
+        Column("displacement_2", "m", ("length",), "displacement_2 [um]"),
+        Column("strain", "1", ("ratio",), "strain [ppm]"),
+    )
+}
+_OPTIONAL = tuple(COLUMNS)[2:]
 #: Columns whose absence is hashed too: those of the first version, so that its hashes stay.
 _HASHED = ("time", "voltage", "displacement", "load_force", "current", "temperature")
 
@@ -190,7 +212,7 @@ class Record(Plotted):
 
     def __post_init__(self) -> None:
         problems = []
-        for column in ("time", "voltage", *_OPTIONAL):
+        for column in COLUMNS:
             given = getattr(self, column)
             if given is None and column in _OPTIONAL:
                 continue
@@ -212,7 +234,7 @@ class Record(Plotted):
         problems = Problems()
         numbers = np.arange(self.n, dtype=np.int64)
         unreported = np.zeros(self.n, dtype=np.bool_)
-        for column in ("time", "voltage", *_OPTIONAL):
+        for column in COLUMNS:
             values = getattr(self, column)
             if values is None:
                 continue
@@ -243,7 +265,8 @@ class Record(Plotted):
     @property
     def units(self) -> dict[str, str]:
         """The units of all columns."""
-        return {**_UNITS, "displacement": self.displacement_unit}
+        units = {name: column.unit for name, column in COLUMNS.items()}
+        return {**units, "displacement": self.displacement_unit}
 
     @property
     def shown(self) -> str:
@@ -309,7 +332,7 @@ class Record(Plotted):
 
     def _hash(self) -> str:
         digest = hashlib.sha256()
-        for column in ("time", "voltage", *_OPTIONAL):
+        for column in COLUMNS:
             array = getattr(self, column)
             if array is not None or column in _HASHED:
                 digest.update(column.encode() + (b"-" if array is None else array.tobytes()))

@@ -1,4 +1,4 @@
-"""Training and held-out samples of a record: a quarter is held out, whole segments together."""
+"""Parts of records: training and held-out samples, gaps, kinds of stretches, and excerpts."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

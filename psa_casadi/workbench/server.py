@@ -23,7 +23,7 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.records.read.columns import COLUMNS
+from psa_casadi.records.record import COLUMNS
 from psa_casadi.units import units_of
 from psa_casadi.version import __version__
 from psa_casadi.workbench.desk import BUSY, BusyError, Desk

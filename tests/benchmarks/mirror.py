@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi import datasets
-from psa_casadi.datasets.conversions.one_axis import linear_response, own_part
-from psa_casadi.datasets.devices.steering_mirror import LEVELS, SIGNS
+from psa_casadi.datasets.devices import LEVELS, SIGNS, linear_response, own_part
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model

@@ -25,7 +25,8 @@ from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.evidence import evidence_texts
 from psa_casadi.model.model_file import dumps
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.columns import COLUMNS, parse_columns
+from psa_casadi.records.read.columns import parse_columns
+from psa_casadi.records.record import COLUMNS
 from psa_casadi.units import convert, parse_unit, si_unit
 from psa_casadi.variables import Interval, Provenance
 from tests.evidence_models import evident_model
@@ -33,7 +34,7 @@ from tests.fmu_models import model_named
 from tests.fuzz.campaign import FALSE_PASS, Found, Target
 from tests.fuzz.damage import WORDS, damaged_bytes, damaged_json, damaged_table, damaged_words
 from tests.laboratory_bytes import gcs, hdf5, lvm, mat, named, npy, npz, parquet, tdms, xlsx
-from tests.reading_here import told_by_fork
+from tests.reading_here import answered_by_fork
 
 _UNIT_TEXTS = ("N.s/m", "um", "V/degC", "kg.m2/s3", "N/(V.s)", "1/A", "counts/um", "%", "MOhm")
 _UNIT_WORDS = ("m", "s", "V", "1", "%", "/", ".", "(", ")", "-", "+", "^", "2", "-2", "99999999",
@@ -148,7 +149,7 @@ def _read(suffix: str, data: bytes, folder: Path) -> Iterator[Found]:
     """Read a record and yield what is unsound in it."""
     path = folder / f"r{suffix}"
     path.write_bytes(data)
-    with patch.object(apart, "_told", told_by_fork):
+    with patch.object(apart, "answered_apart", answered_by_fork):
         record = psa.read_record(path)
     yield from _unsound(record)
 

@@ -9,18 +9,19 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import cast
 
+import msgspec
 import numpy as np
 
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
 from psa_casadi.records.read.choose import choose
-from psa_casadi.records.read.columns import Field, Source, stated_unit
+from psa_casadi.records.read.columns import Field, stated_unit
 from psa_casadi.records.read.file_bytes import check_there, read_text, reason_of
 from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
 from psa_casadi.records.read.samples import Outcome, Request, Samples, samples_of
@@ -48,16 +49,30 @@ class Head:
     guess: Mapping[str, Field]
     tables: tuple[str, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
-        """Return it as JSON can hold it."""
-        return asdict(self)
 
-    @classmethod
-    def from_json(cls, told: Mapping[str, Any]) -> "Head":
-        """Return what `to_json` was made of."""
-        guess = {name: Field(**own) for name, own in told["guess"].items()}
-        rows = tuple(tuple(row) for row in told["rows"])
-        return cls(tuple(told["names"]), tuple(told["units"]), rows, guess, tuple(told["tables"]))
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a file: with a `request` its numbers in the folder `out`, else its head."""
+
+    path: str
+    request: Request | None = None
+    out: str = ""
+    count: int = 0
+    table: str = ""
+    memory: int = 0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the other process tells of a file: why it is `refused`, its head, or its numbers."""
+
+    refused: tuple[str, ...] = ()
+    head: Head | None = None
+    problems: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ()
+    sha256: str = ""
 
 
 def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -> Head:
@@ -106,15 +121,14 @@ def read(path: str, request: Request) -> tuple[Outcome, str]:
         tables, digest = text_of(path)
         return samples_of(path, tables, request), digest
     with temporary_folder() as folder:
-        told = _told(path, {"request": asdict(request), "out": str(folder)})
+        told = _told(Asked(path, request, str(folder)))
         problems = Problems()
-        for sentence in told["problems"]:
+        for sentence in told.problems:
             problems.add(sentence)
         samples = None
-        if told["units"]:
-            values = np.load(folder / "values.npy")
-            samples = Samples(told["units"], values, told["notes"])
-        return Outcome(samples, problems, told["tables"]), told["sha256"]
+        if told.units:
+            samples = Samples(told.units, np.load(folder / "values.npy"), told.notes)
+        return Outcome(samples, problems, told.tables), told.sha256
 
 
 def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
@@ -126,7 +140,8 @@ def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
     place = str(path)
     if not ending_of(place):
         return head_of_tables(place, text_of(place)[0], count, table)
-    return Head.from_json(_told(place, {"head": count, "table": table}))
+    head = _told(Asked(place, count=count, table=table)).head
+    return cast("Head", head)
 
 
 def text_of(path: str) -> tuple[Sequence[Table], str]:
@@ -144,8 +159,21 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
     return text_tables(path, text.split("\n"), "line"), digest
 
 
-def _told(path: str, asked: dict[str, Any]) -> dict[str, Any]:
-    """Return what the process tells of a file."""
+def _told(asked: Asked) -> Answer:
+    """Return what the process tells of a file.
+
+    Raises:
+        InputError: it refuses the file.
+    """
+    answer = answered_apart(asked)
+    if answer.refused:
+        raise InputError(answer.refused)
+    return answer
+
+
+def answered_apart(asked: Asked) -> Answer:
+    """Return what `answered` does in a process of its own."""
+    path = asked.path
     check_there(path)
     _, package = READERS[ending_of(path)]
     if find_spec(package) is None:
@@ -155,81 +183,70 @@ def _told(path: str, asked: dict[str, Any]) -> dict[str, Any]:
         )
     size = Path(path).stat().st_size
     limit = _TIME + _TIME_PER_MIB * size / 2**20
-    asked = {"path": path, "memory": _MEMORY + _MEMORY_PER_BYTE * size, **asked}
+    asked = replace(asked, memory=_MEMORY + _MEMORY_PER_BYTE * size)
     try:
         with started_python(
-            _MODULE, json.dumps(asked), OPENBLAS_NUM_THREADS="1", ARROW_DEFAULT_MEMORY_POOL="system"
-        ) as child:
+            _MODULE, json.dumps(msgspec.to_builtins(asked)),
+            OPENBLAS_NUM_THREADS="1", ARROW_DEFAULT_MEMORY_POOL="system",
+        ) as child:  # fmt: skip
             done = heard(child, limit=limit)
     except subprocess.TimeoutExpired:
-        raise InputError(
-            f"{path}: is no readable {_kind(path)} file (reading it takes more than {limit:.0f} s);"
-            " save it again, or export the record as CSV."
-        ) from None
+        return _unreadable(path, f"reading it takes more than {limit:.0f} s")
     if done.returncode:
-        raise InputError(
-            f"{path}: is no readable {_kind(path)} file (the library that reads it fails, or needs"
-            " more memory than such a file may); save it again, or export the record as CSV."
-        )
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    if "refused" in found:
-        raise InputError(found["refused"])
-    return found
+        why = "the library that reads it fails, or needs more memory than such a file may"
+        return _unreadable(path, why)
+    return msgspec.convert(json.loads(done.stdout.splitlines()[-1]), Answer)
 
 
-def _kind(path: str) -> str:
-    kinds = {".mat": "MATLAB", ".h5": "HDF5", ".hdf5": "HDF5", ".hdf": "HDF5", ".npy": "NumPy",
-             ".npz": "NumPy", ".pq": "Parquet", ".parquet": "Parquet", ".tdms": "TDMS"}  # fmt: skip
+def _unreadable(path: str, why: str) -> Answer:
+    """Return that a file is damaged."""
     ending = ending_of(path)
     excel = ending in (".xlsx", ".xlsm", ".xls", ".xlsb", ".ods")
-    return "Excel" if excel else kinds.get(ending, ending.lstrip("."))
+    kinds = {".mat": "MATLAB", ".h5": "HDF5", ".hdf5": "HDF5", ".hdf": "HDF5", ".npy": "NumPy",
+             ".npz": "NumPy", ".pq": "Parquet", ".parquet": "Parquet", ".tdms": "TDMS"}  # fmt: skip
+    kind = "Excel" if excel else kinds.get(ending, ending.lstrip("."))
+    return Answer((
+        f"{path}: is no readable {kind} file ({why}); save it again, or export the record as CSV.",
+    ))  # fmt: skip
 
 
-def answered(asked: dict[str, Any]) -> dict[str, Any]:
+def answered(asked: Asked) -> Answer:
     """Return what is told of a file, read in this process."""
-    path = asked["path"]
+    path = asked.path
     try:
         tables = READERS[ending_of(path)][0](path)
-        if "head" in asked:
-            return head_of_tables(path, tables, asked["head"], asked["table"]).to_json()
-        request = asked["request"]
-        columns = {name: Source(**source) for name, source in request.pop("columns").items()}
-        outcome = samples_of(path, tables, Request(columns=columns, **request))
+        if asked.request is None:
+            return Answer(head=head_of_tables(path, tables, asked.count, asked.table))
+        outcome = samples_of(path, tables, asked.request)
     except InputError as error:
-        return {"refused": list(error.problems)}
+        return Answer(tuple(error.problems))
     except MemoryError:
-        return {"refused": [f"{path}: needs more memory than a record may; split it."]}
+        return Answer((f"{path}: needs more memory than a record may; split it.",))
     except Exception as error:  # noqa: BLE001 - a library may raise anything on a damaged file
-        return {
-            "refused": [
-                f"{path}: is no readable {_kind(path)} file ({reason_of(error)}); save it again, or"
-                " export the record as CSV."
-            ]
-        }
-    units: dict[str, str] = {}
-    notes: Sequence[str] = ()
-    if outcome.samples is not None:
-        units, notes = dict(outcome.samples.units), outcome.samples.notes
-        np.save(Path(asked["out"]) / "values.npy", outcome.samples.values)
+        return _unreadable(path, reason_of(error))
     with Path(path).open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return {
-        "problems": outcome.problems.sentences(), "units": units, "notes": list(notes),
-        "tables": list(outcome.tables), "sha256": digest,
-    }  # fmt: skip
+    found, problems = outcome.samples, outcome.problems.sentences()
+    if found is None:
+        return Answer(problems=problems, tables=tuple(outcome.tables), sha256=digest)
+    np.save(Path(asked.out) / "values.npy", found.values)
+    return Answer(
+        problems=problems, units=found.units, notes=tuple(found.notes),
+        tables=tuple(outcome.tables), sha256=digest,
+    )  # fmt: skip
 
 
 def main() -> None:
     """Answer what is asked on the command line on standard output, in JSON."""
     end_with_parent()
-    asked = json.loads(sys.argv[1])
+    asked = msgspec.convert(json.loads(sys.argv[1]), Asked)
     if sys.platform != "win32":
         import resource  # noqa: PLC0415
 
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        limit = asked["memory"] if hard == resource.RLIM_INFINITY else min(asked["memory"], hard)
+        limit = asked.memory if hard == resource.RLIM_INFINITY else min(asked.memory, hard)
         resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
-    sys.stdout.write(f"\n{json.dumps(answered(asked))}\n")
+    sys.stdout.write(f"\n{json.dumps(msgspec.to_builtins(answered(asked)))}\n")
 
 
 if __name__ == "__main__":

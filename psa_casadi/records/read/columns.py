@@ -1,4 +1,4 @@
-"""The columns a record may have, their units, and which array of a file is which of them."""
+"""What headers mean: columns by name and unit, and `--columns`, which says it in their place."""
 
 import difflib
 import os
@@ -7,34 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.record import COLUMNS, Column
 from psa_casadi.units import UNITS, parse_unit, units_of
-
-
-@dataclass(frozen=True)
-class Column:
-    """One kind of column: the quantities it may hold and a header as an example."""
-
-    name: str
-    quantities: tuple[str, ...]
-    example: str
-
-
-#: Every column a record may have; others in a file are left alone.
-COLUMNS: dict[str, Column] = {
-    column.name: column
-    for column in (
-        Column("time", ("time",), "time [s]"),
-        Column("voltage", ("voltage",), "voltage [V]"),
-        Column("displacement", ("length", "sensor counts"), "displacement [um]"),
-        Column("load_force", ("force",), "load_force [N]"),
-        Column("current", ("current",), "current [mA]"),
-        Column("temperature", ("temperature",), "temperature [degC]"),
-        Column("monitor_voltage", ("voltage",), "monitor_voltage [V]"),
-        Column("charge", ("charge",), "charge [uC]"),
-        Column("displacement_2", ("length",), "displacement_2 [um]"),
-        Column("strain", ("ratio",), "strain [ppm]"),
-    )
-}
 
 
 @dataclass(frozen=True)
@@ -67,10 +41,7 @@ class Source:
 ColumnMap = Mapping[str, Source]
 
 #: Where nobody names a unit, a column is taken to be in this one; a displacement never is.
-SI_UNITS = {
-    "time": "s", "voltage": "V", "load_force": "N", "current": "A", "temperature": "K",
-    "monitor_voltage": "V", "charge": "C", "strain": "1",
-}  # fmt: skip
+SI_UNITS = {name: c.unit for name, c in COLUMNS.items() if "length" not in c.quantities}
 
 
 def ready_line(sources: ColumnMap, sample_time: float | None = None, table: str = "") -> str:
@@ -244,23 +215,20 @@ ALIASES: dict[str, tuple[str, ...]] = {
     ),
     "strain": ("strain", "strain gauge", "dehnung"),
 }  # fmt: skip
-#: Units as instruments write them out, in lower case.
-UNIT_WORDS = {
-    "s": ("sec", "secs", "second", "seconds", "sekunden"),
-    "ms": ("msec", "millisecond", "milliseconds"),
-    "us": ("usec", "microsecond", "microseconds"),
-    "V": ("volt", "volts"),
-    "mV": ("millivolt", "millivolts"),
-    "m": ("meter", "meters", "metre", "metres"),
-    "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
-    "um": ("micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
-    "nm": ("nanometer", "nanometers", "nanometre", "nanometres"),
-    "N": ("newton", "newtons"),
-    "A": ("amp", "amps", "ampere", "amperes"),
-    "mA": ("milliamp", "milliamps"),
-    "degC": ("celsius", "deg c", "degrees celsius"),
-}
-_UNIT_OF = {word: unit for unit, words in UNIT_WORDS.items() for word in words}
+#: Units as instruments write them out, in lower case, each with its plural.
+_SPELLED = {"s": ("second", "sec"), "V": ("volt",), "m": ("meter", "metre"), "N": ("newton",),
+            "A": ("ampere", "amp")}  # fmt: skip
+_MULTIPLES = {"": "", "m": "milli", "u": "micro", "n": "nano"}
+_UNIT_OF = {
+    f"{spelled}{word}{end}": f"{prefix}{unit}"
+    for unit, words in _SPELLED.items()
+    for word in words
+    for prefix, spelled in _MULTIPLES.items()
+    for end in ("", "s")
+} | {
+    "msec": "ms", "usec": "us", "sekunden": "s", "micron": "um", "microns": "um",
+    "celsius": "degC", "deg c": "degC", "degrees celsius": "degC",
+}  # fmt: skip
 #: What names the place of a channel behind the quantity: `Current Position of axis 1`.
 _OF_A_PLACE = re.compile(r" of [\w ]*?(axis|chan|channel)\s*:?\s*\w+$")
 _COLUMN_OF = {alias: column for column, names in ALIASES.items() for alias in names}

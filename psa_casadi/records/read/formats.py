@@ -27,6 +27,7 @@ from psa_casadi.records.read.columns import (
     unit_named,
 )
 from psa_casadi.records.read.file_bytes import check_size
+from psa_casadi.records.read.instruments import stated_step
 from psa_casadi.records.read.table import Cells, Columns, Table, unit_of_times
 from psa_casadi.records.read.text import text_tables
 
@@ -74,15 +75,14 @@ def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator
 
 
 def array_tables(
-    path: str, found: Iterable[Series], steps: Iterable[float] = (), place: str = "sample"
+    path: str, found: Iterable[Series], stated: Iterable[str] = (), place: str = "sample"
 ) -> list[Table]:
     """Return the tables that series make: all of them, then those of each group with several.
 
     A group is also what the columns of one number of several matrices are; what is in none, such as
     a time, belongs to each.
 
-    The first of a name counts. `steps` [s] are the times between samples that the file states; they
-    count where they agree.
+    The first of a name counts. `stated` are lines such as "fs = 1000" that a file has beside them.
     """
     series: dict[str, Series] = {}
     for one in found:
@@ -91,8 +91,7 @@ def array_tables(
         unit = one.unit or (match["unit"].strip() if match else None)
         series.setdefault(name, replace(one, name=name, unit=unit))
     scalars = {n.rpartition(".")[2]: s.values() for n, s in series.items() if s.size == 1}
-    stated = {*steps, *told_step(scalars)}
-    step = stated.pop() if len(stated) == 1 else None
+    step = stated_step([*stated, *statements(scalars)])
     texts = {name: _text(one) for name, one in series.items()}
     whole = _table(path, "", list(series.values()), texts, step, place)
     groups: dict[str, list[Series]] = {}
@@ -143,22 +142,12 @@ def _text(series: Series) -> str:
     return f"{series.name} [{unit}]" if unit else series.name
 
 
-def told_step(attributes: Mapping[str, Any]) -> Iterator[float]:
-    """Yield the times between samples [s] that attributes state, as a time or as a rate [Hz]."""
+def statements(attributes: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what attributes of one value state, as the lines above a table do."""
     for key, value in attributes.items():
-        name = re.sub(r"[\W_]+", "", str(key).lower())
-        try:
-            number = float(np.asarray(value).reshape(-1)[0])
-        except (TypeError, ValueError, IndexError):
-            continue
-        if not 0.0 < number < 1e12:
-            continue
-        if name in ("sampletime", "samplingtime", "sampleinterval", "samplinginterval", "dt",
-                    "timestep", "increment", "xincrement", "wfincrement", "ts"):  # fmt: skip
-            yield number
-        elif name in ("samplerate", "samplingrate", "samplingfrequency", "samplefrequency", "fs",
-                      "rate", "samplefreq"):  # fmt: skip
-            yield 1.0 / number
+        if np.size(value) == 1:
+            name = "sample rate" if key.lower() == "rate" else key
+            yield f"{name} = {np.asarray(value).reshape(-1)[0]}"
 
 
 def hdf5_tables(path: str) -> list[Table]:
@@ -173,8 +162,8 @@ def hdf5_tables(path: str) -> list[Table]:
         held = list(checked_datasets(path, file, set()))
         found = [s for item in held for s in _of_dataset(path, item)]
         about = [file, *held, *(item.parent for item in held)]
-        steps = {step for item in about for step in told_step(_attributes(item))}
-    return array_tables(path, found, steps)
+        stated = [line for item in about for line in statements(_attributes(item))]
+    return array_tables(path, found, stated)
 
 
 def _of_dataset(path: str, item: Any) -> Iterator[Series]:
@@ -288,40 +277,36 @@ def _elements(value: Any) -> Any:
     return value
 
 
-def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]] | None:
-    """Return name, numbers and unit of what dSPACE ControlDesk records, None where it is another.
+def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]]:
+    """Return name, numbers and unit of what dSPACE ControlDesk records, none where it is another.
 
     There `X` holds the time in seconds as `Data`, and each element of `Y` a signal with its `Name`.
     Where there are several times, or signals of one name, they are counted.
     """
-    times, signals = (_with_data(value.get(axis)) for axis in ("X", "Y"))
-    if not times or not any(_told(signal, "Name") for signal in signals):
-        return None
-    texts = [_told(signal, "Name") for signal in signals]
-    names = [name_without_unit(text) for text in texts]
-    if "" in names or len(set(names)) < len(names):
-        names = [f"Y.{k}" for k in range(1, len(names) + 1)]
-    clocks = ["time"] if len(times) == 1 else [f"X.{k}" for k in range(1, len(times) + 1)]
-    return [
-        *((own, x["Data"], _told(x, "Unit") or "s") for own, x in zip(clocks, times, strict=True)),
-        *(
-            (own, y["Data"], _told(y, "Unit") or stated_unit(text) or "")
-            for own, text, y in zip(names, texts, signals, strict=True)
-        ),
-    ]
+    found: list[tuple[str, Any, str | None]] = []
+    for axis in ("X", "Y"):
+        own = _elements(value.get(axis))
+        several = own if isinstance(own, list) else [own]
+        data = [s.get("Data") if isinstance(s, Mapping) else None for s in several]
+        if not all(isinstance(numbers, np.ndarray) for numbers in data):
+            return []
+        texts, units = ([_text_of(s.get(key)) for s in several] for key in ("Name", "Unit"))
+        names = [name_without_unit(text) for text in texts]
+        if axis == "X":
+            names, usual = ["time"] * len(several), "s"
+        elif any(names):
+            usual = ""
+        else:
+            return []
+        if "" in names or len(set(names)) < len(names):
+            names = [f"{axis}.{k}" for k in range(1, len(names) + 1)]
+        for name, text, unit, numbers in zip(names, texts, units, data, strict=True):
+            found.append((name, numbers, unit or stated_unit(text) or usual))
+    return found
 
 
-def _with_data(value: Any) -> list[Mapping[str, Any]]:
-    """Return the structures that hold numbers as `Data`, none where one does not."""
-    value = _elements(value)
-    several = value if isinstance(value, list) else [value]
-    found = [v for v in several if isinstance(v, Mapping) and isinstance(v.get("Data"), np.ndarray)]
-    return found if len(found) == len(several) else []
-
-
-def _told(signal: Mapping[str, Any], field: str) -> str:
-    text = signal.get(field)
-    return text.strip() if isinstance(text, str) else ""
+def _text_of(value: object) -> str:
+    return value.strip() if isinstance(value, str) else ""
 
 
 def _modelica(path: str) -> Iterator[Series]:
@@ -402,7 +387,7 @@ def tdms_tables(path: str) -> list[Table]:
     if sum(len(c) * c.dtype.itemsize for c in channels) > 2 * Path(path).stat().st_size:
         raise ValueError("it states more numbers than it has bytes for")
     several = len(file.groups()) > 1
-    found, steps = [], set()
+    found, stated = list[Series](), list[str]()
     for channel in channels:
         if channel.dtype.kind not in "biufM":
             continue
@@ -414,8 +399,8 @@ def tdms_tables(path: str) -> list[Table]:
                 return np.asarray(whole[group][own][:])
 
         found.append(Series(name, len(channel), read, unit_stated(unit)))
-        steps |= {float(s) for k, s in channel.properties.items() if k == "wf_increment" and s > 0}
-    return array_tables(path, found, steps)
+        stated += statements({k: v for k, v in channel.properties.items() if k == "wf_increment"})
+    return array_tables(path, found, stated)
 
 
 def parquet_tables(path: str) -> list[Table]:
@@ -483,7 +468,7 @@ def universal_tables(path: str) -> list[Table]:
     import pyuff  # noqa: PLC0415
 
     found: list[Series] = []
-    steps = []
+    stated: list[str] = []
     for k, one in enumerate(pyuff.UFF(path).read_sets() or []):
         if one.get("type") != 58:
             continue
@@ -492,10 +477,10 @@ def universal_tables(path: str) -> list[Table]:
         unit = str(one.get("ordinate_axis_units_lab") or "").strip()
         found += series_in(name, np.real(one["data"]), unit)
         if one.get("abscissa_spacing") == 1:
-            steps.append(float(one["abscissa_inc"]))
-        elif not steps:
+            stated += statements({"dt": one["abscissa_inc"]})
+        elif not stated:
             found += series_in("time", np.asarray(one["x"]), "s")
-    return array_tables(path, found, steps)
+    return array_tables(path, found, stated)
 
 
 #: What reads a file, by its ending, and the package that it needs.

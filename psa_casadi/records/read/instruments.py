@@ -23,13 +23,14 @@ _ENTRY = re.compile(r"#\s*(?P<key>[A-Z_]+[0-9]*)\s*=\s*(?P<value>.*?)\s*")
 _MOST_LINES = 500
 #: How a head states the time between samples, or their rate, with a unit before or behind it.
 _STEP = re.compile(
-    r"""\W*(?P<name>[\w ]*?(?:(?P<rate>rate|freq\w*|\bfs)|interval|period|increment|\bx ?incr?|\bdt|
-        time step|step|delta[_ ]?[xt]|sample[_ ]?time|sampling[_ ]?time))\s*
+    r"""\W*(?P<name>[\w ]*?(?:(?P<rate>rate|freq\w*|\bfs)|interval|period|increment|\bx ?incr?|
+        \bdt|\bts|step|delta[_ ]?[xt]|sample[_ ]?time|sampling[_ ]?time))\s*
         [\[(]?(?P<before>[A-Za-zµ/]+)?[\])]?[\s:=,;"']+(?P<number>[\d.,]+(?:[eE][+-]?\d+)?)"?
         [\s,;"\[(]*(?P<unit>[A-Za-zµ]+(?:/s|PS)?)?.*""",
     re.I | re.X,
 )
-_SAMPLES = ("sampl", "acqui", "record", "scan", "adc", "time", "x", "delta", "dt", "fs", "incr")
+_SAMPLES = ("sampl", "acqui", "record", "scan", "adc", "time", "x", "delta", "dt",
+            "fs", "ts", "wf", "incr")  # fmt: skip
 
 
 Form = tuple[Sequence[str], tuple[str, ...], float | None]
@@ -112,15 +113,15 @@ def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
     ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
     if len(ends) < 2:
         raise InputError(f"{path}: the head of this LabVIEW file does not end; save it again.")
-    head = _entries(lines[: ends[0]], None)
+    head = _entries(lines[: ends[0]], "[\t,]")
     mark = "," if head.get("Separator", [""])[0].lower() == "comma" else "\t"
-    columns = (head.get("X_Columns") or ["One"])[0].strip()
+    columns = head.get("X_Columns", ["One"])[0]
     table, header = [""] * len(lines), ""
     for start, end, stop in zip(ends, ends[1:], [*ends[2:], len(lines)], strict=False):
         segment = _entries(lines[start + 1 : end], mark)
         if end + 1 >= stop:
             raise InputError(f"{path}: line {end + 1}: no columns follow; save the file again.")
-        names = _names(lines[end + 1].split(mark), segment, columns)
+        names = _labview_names(lines[end + 1].split(mark), segment.get("Y_Unit_Label", ()))
         if header and names != header:
             raise InputError(
                 f"{path}: line {end + 2}: this part has other columns than the one before; save"
@@ -128,71 +129,46 @@ def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
             )
         if not header:
             table[end + 1] = header = names
-        # what stands before the next part's end is its head: it begins with the channels
-        body = _body(lines, end + 2, stop)
-        for k, row in enumerate(body, end + 2):
-            table[k] = _row(f"{path}: line {k + 1}", row, segment, (columns, mark), k - end - 2)
-    width = header.count("\t")
-    return [row + "\t" * (width - row.count("\t")) if row else row for row in table]
+        for k, row in enumerate(lines[end + 2 : stop], end + 2):
+            if not row.strip() or row.startswith("Channels"):  # the head of the next part
+                break
+            cells = row.split(mark)
+            if columns == "No":
+                cells[0] = _labview_time(f"{path}: line {k + 1}", row, segment, k - end - 2)
+            elif columns == "Multi" and len({c for c in cells[: len(cells) // 2 * 2 : 2] if c}) > 1:
+                raise InputError(
+                    f"{path}: line {k + 1}: the channels were sampled at different instants; save"
+                    " them on one time axis."
+                )
+            cells += [""] * (header.count("\t") + 1 - len(cells))
+            table[k] = "\t".join(cells)
+    return table
 
 
-def _body(lines: Sequence[str], start: int, stop: int) -> Sequence[str]:
-    """Return the rows of one part: they end where the next part's head begins."""
-    rows = lines[start:stop]
-    ends = (k for k, row in enumerate(rows) if not row.strip() or row.startswith("Channels"))
-    return rows[: next(ends, len(rows))]
+def _entries(lines: Sequence[str], mark: str) -> dict[str, list[str]]:
+    found = [[cell.strip() for cell in re.split(mark, line)] for line in lines]
+    return {key: values or [""] for key, *values in found}
 
 
-def _entries(lines: Sequence[str], mark: str | None) -> dict[str, list[str]]:
-    found = {}
-    for line in lines:
-        key, *values = re.split(r"[\t,]", line, maxsplit=1) if mark is None else line.split(mark)
-        found[key.strip()] = [value.strip() for value in values]
-    return found
-
-
-def _names(cells: Sequence[str], segment: Mapping[str, Sequence[str]], columns: str) -> str:
-    """Return the header of a part: the time, and the channels with the units that are stated."""
-    names, units = [], iter(segment.get("Y_Unit_Label", ()))
-    for cell in cells:
-        if cell.strip() == "X_Value":
-            names.append("" if "time [s]" in names else "time [s]")
-        elif cell.strip() == "Comment":
-            names.append("Comment")
+def _labview_names(cells: Sequence[str], units: Sequence[str]) -> str:
+    """Return the header: one time, and the channels with the units that are stated."""
+    names: list[str] = []
+    left = iter(units)
+    for name in map(str.strip, cells):
+        if name == "X_Value":
+            names.append("" if names else "X_Value [s]")
         else:
-            unit = unit_named(next(units, ""))
-            names.append(f"{cell.strip()} [{unit}]" if unit else cell.strip())
+            unit = unit_named(next(left, "")) if name != "Comment" else None
+            names.append(f"{name} [{unit}]" if unit else name)
     return "\t".join(names)
 
 
-def _row(
-    where: str,
-    row: str,
-    segment: Mapping[str, Sequence[str]],
-    form: tuple[str, str],
-    k: int,
-) -> str:
-    """Return one row with its time; row k of a part without times has the time that steps give."""
-    columns, mark = form
-    cells = row.split(mark)
-    if columns == "No":
-        first, step = (segment.get(key, [""])[0] for key in ("X0", "Delta_X"))
-        start = _number(first) if first else 0.0
-        time = (start or 0.0) + k * _positive(where, "Delta_X", step)
-        return "\t".join([_written(time, row), *cells[1:]])
-    if columns == "Multi":
-        times = {c.strip() for c in cells[: 2 * (len(cells) // 2) : 2] if c.strip()}
-        if len(times) > 1:
-            raise InputError(
-                f"{where}: the channels were sampled at different instants"
-                f" ({', '.join(sorted(times))[:60]}); save them on one time axis."
-            )
-    return "\t".join(cells)
-
-
-def _written(time: float, row: str) -> str:
-    """Return a time with the decimal sign of its row."""
-    return f"{time:.12g}".replace(".", "," if "," in row and "." not in row else ".")
+def _labview_time(where: str, row: str, segment: Mapping[str, Sequence[str]], k: int) -> str:
+    """Return the time that steps give to row k of a part, with the decimal sign of its row."""
+    first, step = (segment.get(key, [""])[0] for key in ("X0", "Delta_X"))
+    start = _number(first) if first else 0.0
+    time = f"{start + k * _positive(where, 'Delta_X', step):.12g}"
+    return time.replace(".", ",") if "," in row and "." not in row else time
 
 
 def _number(text: str) -> float:

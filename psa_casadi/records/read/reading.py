@@ -26,8 +26,6 @@ from psa_casadi.records.read import apart
 from psa_casadi.records.read.choose import rises
 from psa_casadi.records.read.columns import (
     ALL,
-    COLUMNS,
-    SI_UNITS,
     TABLE,
     ColumnMap,
     Source,
@@ -146,7 +144,7 @@ def _channels(
 def _numbers(cells: Cells) -> FloatArray:
     if isinstance(cells, np.ndarray):
         return cells.astype(np.float64)
-    return numbers_in(cells, decimal_sign(cells), "").values
+    return numbers_in(cells, decimal_sign(cells), "")[0]
 
 
 _NAME = re.compile(r"[a-z]\w*(?:\.\w+)* \[(?P<unit>[^\[\]]+)\]", re.IGNORECASE)
@@ -163,7 +161,10 @@ def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, Ar
         InputError: a key is not `name [unit]`, a unit is unknown, the columns differ in length or
             there are none, or the file cannot be written.
     """
-    named = _columns_of(columns) if isinstance(columns, Record) else columns
+    named: Any = columns
+    if isinstance(columns, Record):
+        held = {"time": columns.time, **columns.recorded}
+        named = {f"{name} [{columns.units[name]}]": values for name, values in held.items()}
     arrays = {name: np.asarray(values, dtype=np.float64) for name, values in named.items()}
     problems = Problems()
     if not arrays:
@@ -180,12 +181,6 @@ def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, Ar
     cells = [map(_cell, array.tolist()) for array in arrays.values()]
     lines = [",".join(arrays), *map(",".join, zip(*cells, strict=True)), ""]
     atomic_write(path, "\n".join(lines))
-
-
-def _columns_of(record: Record) -> dict[str, ArrayLike]:
-    units = {**SI_UNITS, "displacement": record.displacement_unit, "displacement_2": "m"}
-    columns = {name: getattr(record, name) for name in COLUMNS}
-    return {f"{name} [{units[name]}]": v for name, v in columns.items() if v is not None}
 
 
 def _check_name(name: str, problems: Problems) -> None:

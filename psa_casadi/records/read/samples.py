@@ -13,7 +13,6 @@ from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.table import (
     Cells,
     Columns,
-    Parsed,
     Table,
     as_times,
     decimal_sign,
@@ -34,6 +33,9 @@ from psa_casadi.records.record import (
     check_time,
 )
 from psa_casadi.units import FloatArray
+
+#: A sample time [s] to show where a file has no time.
+_EXAMPLE_STEP = 1e-3
 
 #: The most tables and segments that are named in one sentence.
 MOST_NAMED = 8
@@ -77,214 +79,6 @@ class Samples:
     units: Mapping[str, str]
     values: FloatArray
     notes: Sequence[str] = ()
-
-
-class SegmentsOfTime(Exception):  # noqa: N818 - not an error yet: one of them may be asked for
-    """A table whose time begins anew: each part is a record."""
-
-    def __init__(self, sentence: str, keys: Sequence[str]) -> None:
-        super().__init__(sentence)
-        self.keys = tuple(keys)
-
-
-class NoTimeOfTheirOwn(Exception):  # noqa: N818 - a part of a sentence
-    """The times of a table are those of packets."""
-
-
-def converted(
-    table: Table,
-    fields: Mapping[str, Field],
-    request: Request,
-    segment: str,
-    problems: Problems,
-    notes: list[str],
-) -> Samples | None:
-    """Return the samples of chosen columns, checked; None where their lengths differ.
-
-    `segment` takes a part of a time that begins anew. Mistakes are added to `problems` with their
-    place, and to `notes` what was taken for what.
-
-    Raises:
-        SegmentsOfTime, NoTimeOfTheirOwn: the time begins anew.
-        InputError: the sample time is none, or there is more than a record may hold.
-    """
-    fields = dict(fields)
-    if request.sample_time is not None and fields.pop("time", None) is not None:
-        notes.append("the times of the file are left out for the sample time that was given.")
-    columns = table.load([f.index for f in fields.values()], None, problems)
-    if _lengths_differ(table, fields, columns, problems):
-        return None
-    point = decimal_sign(c for row in zip(*_texts(columns), strict=False) for c in row)
-    found = {
-        name: _numbers(table, name, own.unit, cells, columns.lines, point, problems)
-        for (name, own), cells in zip(fields.items(), columns.cells, strict=True)
-    }
-    lines = columns.lines
-    if request.sample_time is not None:
-        if not 0.0 < request.sample_time < 1e9:
-            raise InputError(
-                f"{table.path}: the sample time {request.sample_time} s is no time; give seconds."
-            )
-        even = np.asarray(request.sample_time * np.arange(len(lines)), dtype=np.float64)
-        if request.sample_time != table.step:
-            notes.append(
-                f"{request.sample_time:g} s from sample to sample is what was given; if it is"
-                " invented, as for a curve without time, rates, creep and lags mean nothing."
-            )
-        clear = np.zeros(len(lines), dtype=np.bool_)
-        found = {"time": Parsed(even, clear, 0), **found}
-        fields = {"time": Field(-1, "s"), **fields}
-    elif "time" in found:
-        part = _timed(table, found, lines, segment, notes)
-        found = {n: Parsed(p.values[part], p.wrong[part], p.missing) for n, p in found.items()}
-        lines = lines[part]
-    for name, parsed in found.items():
-        if parsed.missing and name == "displacement":
-            notes.append(f"{parsed.missing} readings of the {name} are missing; they are masked.")
-    check_size(table.path, 8 * len(lines) * len(found), "its columns hold")
-    if request.voltage:
-        _check(table, found, lines, problems, request)
-    scales = [request.columns[n].scale if n in request.columns else None for n in found]
-    values = np.column_stack([
-        p.values if scale is None else p.values * scale
-        for p, scale in zip(found.values(), scales, strict=True)
-    ])  # fmt: skip
-    return Samples({n: f.unit for n, f in fields.items()}, values, tuple(notes))
-
-
-def _texts(columns: Columns) -> list[Sequence[str]]:
-    return [cells for cells in columns.cells if not isinstance(cells, np.ndarray)]
-
-
-def _numbers(
-    table: Table, name: str, unit: str, cells: Cells, lines: NDArray[np.int64], point: str,
-    problems: Problems,
-) -> Parsed:  # fmt: skip
-    """Return a column as numbers; what is none is told with its place."""
-    values = as_times(cells, unit) if name == "time" else None
-    if values is None and isinstance(cells, np.ndarray):
-        values = cells.astype(np.float64)
-    if values is not None:
-        return without_overload(values)
-    texts = [str(cell) for cell in cells]
-    parsed = numbers_in(texts, point, unit)
-    if table.sizes and parsed.wrong.all():
-        problems.add(
-            f"{table.path}: column '{name}': holds texts such as '{texts[0][:40]}', expected"
-            " numbers; convert the column before the file is written."
-        )
-        return Parsed(parsed.values, parsed.wrong, 0)
-    for line, cell in zip(lines[parsed.wrong], np.array(texts)[parsed.wrong], strict=True):
-        hint = "correct it, or leave the cell empty where the sample is missing"
-        if name in ("time", "voltage"):
-            hint = f"correct it or remove the {table.place}"
-        if is_number(cell) and decimal_sign([cell]) != point:
-            other = "comma" if point == "," else "point"
-            hint = f"other numbers of this file have a decimal {other}, write this one so too"
-        problems.add(
-            f"{table.path}: {table.place} {line}, column '{name}': found '{cell.strip()[:40]}',"
-            f" expected a number; {hint}."
-        )
-    return parsed
-
-
-def _timed(
-    table: Table,
-    found: dict[str, Parsed],
-    lines: NDArray[np.int64],
-    segment: str,
-    notes: list[str],
-) -> slice:
-    """Return the part of the samples that is the record; mend a time with too few digits.
-
-    Raises:
-        SegmentsOfTime: the time begins anew, and each part is long enough for a record.
-        NoTimeOfTheirOwn: it begins anew after every few samples.
-    """
-    time = found["time"].values
-    starts = starts_of(np.nan_to_num(time, nan=-np.inf) if np.isnan(time).any() else time)
-    ends = [*starts[1:], time.size]
-    sizes = np.diff([*starts, time.size])
-    part = slice(0, time.size)
-    if len(starts) > 1 and sizes[:-1].min() >= FEWEST_SAMPLES:
-        keys = [f"{table.name}.{k}".strip(".") for k in range(1, len(starts) + 1)]
-        if segment not in [str(k) for k in range(1, len(starts) + 1)]:
-            listed = ", ".join(
-                f"{key} ({table.place}s {lines[a]} to {lines[b - 1]})"
-                for key, a, b in list(zip(keys, starts, ends, strict=True))[:MOST_NAMED]
-            )
-            raise SegmentsOfTime(
-                f"{table.path}: the time begins anew {len(starts) - 1} times, so it holds"
-                f" {len(starts)} records: {listed}; take one of them, such as"
-                f" {ready_line({}, None, keys[0])}, or each as a record:"
-                f" {ready_line({}, None, ALL)}.",
-                keys,
-            )
-        part = slice(int(starts[int(segment) - 1]), int(ends[int(segment) - 1]))
-    elif len(starts) > 2 and len(set(sizes[:-1].tolist())) == 1 and np.isfinite(time).all():
-        packet = time[: sizes[0]]
-        if np.array_equal(packet, time[sizes[0] : 2 * sizes[0]]):
-            raise NoTimeOfTheirOwn(
-                f"{table.path}: the time begins anew every {sizes[0]} {table.place}s: these packets"
-                " have no time of their own"
-            )
-    elif segment and segment != "1":
-        raise InputError(f"{table.path}: there is no table '{segment}'; it holds one.")
-    even = None if _repeats(found, part) else evened(time[part])
-    if even is not None:
-        found["time"].values[part] = even[0]
-        notes.append(
-            "the time has too few digits, so that it repeats; it is taken to be even, with steps of"
-            f" {even[1]:.6g} of its unit."
-        )
-    return part
-
-
-def _repeats(found: Mapping[str, Parsed], part: slice) -> bool:
-    """Whether whole samples are repeated where the time is: then lines are double, not rounded."""
-    same = np.diff(found["time"].values[part]) == 0.0
-    others = [p.values[part] for n, p in found.items() if n != "time"]
-    return bool(same.any() and all((np.diff(v)[same] == 0.0).all() for v in others))
-
-
-def _lengths_differ(
-    table: Table, fields: Mapping[str, Field], columns: Columns, problems: Problems
-) -> bool:
-    sizes = [len(cells) for cells in columns.cells]
-    if not sizes:
-        return True
-    first, kind = next(iter(fields)), "array" if table.sizes else "column"
-    for (name, own), size in zip(fields.items(), sizes, strict=True):
-        if size != sizes[0]:
-            problems.add(
-                f"{table.path}: {kind} '{table.labels[own.index]}' ({name}) has {size} values,"
-                f" '{first}' has {sizes[0]}; give every column one value for each instant."
-            )
-    return len(set(sizes)) > 1
-
-
-def _check(
-    table: Table,
-    found: Mapping[str, Parsed],
-    lines: NDArray[np.int64],
-    problems: Problems,
-    request: Request,
-) -> None:
-    check_length(table.path, len(lines), problems)
-    for name, parsed in found.items():
-        column = Located(table.path, name, parsed.values, lines, parsed.wrong, table.place)
-        if name == "time":
-            check_time(column, problems)
-        elif name == "displacement":
-            check_displacement(column, problems)
-        else:
-            check_complete(column, problems)
-        if name == "voltage" and request.excitation and not parsed.wrong.any():
-            check_excitation(column, problems)
-
-
-#: A sample time [s] to show where a file has no time.
-_EXAMPLE_STEP = 1e-3
 
 
 @dataclass
@@ -357,22 +151,22 @@ def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
 
 def _of_one(table: Table, request: Request, segment: str) -> Outcome:
     """Return the samples of one table; what it leaves open ends with an option that reads it."""
-    outcome, choice, told = _tried(table, request, segment)
-    if not told:
-        return outcome
-    said = [f"{q.what}; {q.cure}" if q.cure else q.what for q in told]
-    offer, key = _offer(table, request, choice, segment)
+    tried = _Try(table, request, segment)
+    if not tried.open:
+        return tried.outcome
+    said = [f"{q.what}; {q.cure}" if q.cure else q.what for q in tried.open]
+    offer, key = _offer(table, request, tried.choice, segment)
     if offer:
-        last = told[-1]
+        last = tried.open[-1]
         how = last.ask if offer[0] else "give the time between samples"
         join = ", or" if last.cure else ";"
         said[-1] += f"{join} {how}: {ready_line(*offer, key or request.table)}"
     elif len(table.header) == 2 and not table.sizes:
         said[-1] += "; files of one channel each are joined as FILE+FILE"
     whole = Problems()
-    for sentence in (*(f"{s}." for s in said), *outcome.problems.sentences()):
+    for sentence in (*(f"{s}." for s in said), *tried.problems.sentences()):
         whole.add(sentence)
-    return Outcome(outcome.samples, whole, outcome.tables, offer)
+    return replace(tried.outcome, problems=whole, offer=offer)
 
 
 def _offer(
@@ -388,33 +182,203 @@ def _offer(
         trial = replace(request, columns=sources, sample_time=step)
         shown = sources if sources != request.columns else {}
         offer = (shown, None if request.sample_time is not None else step)
-        found, _, told = _tried(table, trial, segment)
-        if found.is_read and not told:
+        found = _Try(table, trial, segment)
+        if found.open:
+            continue
+        if found.outcome.is_read:
             return offer, ""
-        if found.tables and not told and _tried(table, trial, "1")[0].is_read:
-            return offer, found.tables[0]
+        if found.outcome.tables and _Try(table, trial, "1").outcome.is_read:
+            return offer, found.outcome.tables[0]
     return None, ""
 
 
-def _tried(table: Table, request: Request, segment: str) -> tuple[Outcome, Choice, list[Question]]:
-    """Return what a table is read to, the choice of its columns, and what that leaves open."""
-    problems = Problems()
-    notes: list[str] = []
-    choice = choose(table, request.required, request.columns, problems)
-    if table.step and "time" not in choice.fields and request.sample_time is None:
-        again = replace(request, sample_time=table.step)
-        notes.append(f"the time is that of the sample time that the file states, {table.step:g} s.")
-        problems = Problems()
-        request, choice = again, choose(table, again.required, request.columns, problems)
-    told = list(choice.open)
-    outcome = Outcome(None, problems)
-    if choice.fields:
-        try:
-            outcome.samples = converted(table, choice.fields, request, segment, problems, notes)
-        except SegmentsOfTime as several:
-            outcome.tables = several.keys
-            if not told:  # what is open is asked first: no table alone would be read
-                problems.add(str(several))
-        except NoTimeOfTheirOwn as error:
-            told.append(Question(str(error), Ask.UNIT))
-    return outcome, choice, told
+class _Try:
+    """A table that is read: the choice of its columns, what that leaves `open`, and the outcome."""
+
+    def __init__(self, table: Table, request: Request, segment: str) -> None:
+        self.table, self.segment, self.notes = table, segment, list[str]()
+        self.problems, self.outcome = Problems(), Outcome()
+        self.choice = choose(table, request.required, request.columns, self.problems)
+        if table.step and "time" not in self.choice.fields and request.sample_time is None:
+            step = table.step
+            self.notes.append(
+                f"the time is that of the sample time that the file states, {step:g} s."
+            )
+            request, self.problems = replace(request, sample_time=step), Problems()
+            self.choice = choose(table, request.required, request.columns, self.problems)
+        self.request, self.open = request, list(self.choice.open)
+        self.outcome = Outcome(None, self.problems)
+        if self.choice.fields:
+            self.outcome.samples = self._converted(dict(self.choice.fields))
+
+    def _converted(self, fields: dict[str, Field]) -> Samples | None:
+        """Return the samples of chosen columns, checked; None where they make no record."""
+        table, request = self.table, self.request
+        step = request.sample_time
+        if step is not None and fields.pop("time", None) is not None:
+            self.notes.append(
+                "the times of the file are left out for the sample time that was given."
+            )
+        columns = table.load([f.index for f in fields.values()], None, self.problems)
+        if self._lengths_differ(fields, columns):
+            return None
+        texts = [cells for cells in columns.cells if not isinstance(cells, np.ndarray)]
+        point = decimal_sign(c for row in zip(*texts, strict=False) for c in row)
+        found = {
+            name: self._numbers(name, own.unit, cells, columns.lines, point)
+            for (name, own), cells in zip(fields.items(), columns.cells, strict=True)
+        }
+        units = {name: own.unit for name, own in fields.items()}
+        if step is not None:
+            units = {"time": "s", **units}
+            found = {"time": self._even_time(step, columns.lines), **found}
+        elif "time" in found:
+            part = self._timed(found)
+            if part is None:
+                return None
+            found = {n: c.part(part) for n, c in found.items()}
+        check_size(table.path, 8 * len(columns.lines) * len(found), "its columns hold")
+        self._check(found)
+        scales = [request.columns[n].scale if n in request.columns else None for n in found]
+        values = np.column_stack([
+            c.values if scale is None else c.values * scale
+            for c, scale in zip(found.values(), scales, strict=True)
+        ])  # fmt: skip
+        return Samples(units, values, tuple(self.notes))
+
+    def _even_time(self, step: float, lines: NDArray[np.int64]) -> Located:
+        if not 0.0 < step < 1e9:
+            raise InputError(
+                f"{self.table.path}: the sample time {step} s is no time; give seconds."
+            )
+        if step != self.table.step:
+            self.notes.append(
+                f"{step:g} s from sample to sample is what was given; if it is invented, as for a"
+                " curve without time, rates, creep and lags mean nothing."
+            )
+        return self._located("time", step * np.arange(len(lines), dtype=np.float64), lines)
+
+    def _located(
+        self, name: str, values: FloatArray, lines: NDArray[np.int64],
+        wrong: NDArray[np.bool_] | None = None,
+    ) -> Located:  # fmt: skip
+        told = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
+        return Located(self.table.path, name, values, lines, told, self.table.place)
+
+    def _numbers(
+        self, name: str, unit: str, cells: Cells, lines: NDArray[np.int64], point: str
+    ) -> Located:
+        """Return a column as numbers; what is none is told with its place."""
+        table = self.table
+        values = as_times(cells, unit) if name == "time" else None
+        if values is None and isinstance(cells, np.ndarray):
+            values = cells.astype(np.float64)
+        if values is not None:
+            return self._located(name, without_overload(values), lines)
+        texts = [str(cell) for cell in cells]
+        values, wrong = numbers_in(texts, point, unit)
+        if table.sizes and wrong.all():
+            self.problems.add(
+                f"{table.path}: column '{name}': holds texts such as '{texts[0][:40]}', expected"
+                " numbers; convert the column before the file is written."
+            )
+            return self._located(name, values, lines, wrong)
+        for k in np.flatnonzero(wrong):
+            hint = "correct it, or leave the cell empty where the sample is missing"
+            if name in ("time", "voltage"):
+                hint = f"correct it or remove the {table.place}"
+            if is_number(texts[k]) and decimal_sign([texts[k]]) != point:
+                other = "comma" if point == "," else "point"
+                hint = f"other numbers of this file have a decimal {other}, write this one so too"
+            self.problems.add(
+                f"{table.path}: {table.place} {lines[k]}, column '{name}': found"
+                f" '{texts[k].strip()[:40]}', expected a number; {hint}."
+            )
+        return self._located(name, values, lines, wrong)
+
+    def _timed(self, found: Mapping[str, Located]) -> slice | None:
+        """Return the part of the samples that is the record; mend a time with too few digits.
+
+        None where the time begins anew: each part is a record, or packets have no time of their
+        own.
+        """
+        table, time, lines = self.table, found["time"].values, found["time"].lines
+        starts = starts_of(np.nan_to_num(time, nan=-np.inf) if np.isnan(time).any() else time)
+        ends = [*starts[1:].tolist(), time.size]
+        sizes = np.diff([*starts, time.size])
+        part = slice(0, time.size)
+        if len(starts) > 1 and sizes[:-1].min() >= FEWEST_SAMPLES:
+            numbers = [str(k) for k in range(1, len(starts) + 1)]
+            if self.segment not in numbers:
+                keys = [f"{table.name}.{k}".strip(".") for k in numbers]
+                self._tell_segments(
+                    keys, [(lines[a], lines[b - 1]) for a, b in zip(starts, ends, strict=True)]
+                )
+                return None
+            k = int(self.segment) - 1
+            part = slice(int(starts[k]), ends[k])
+        elif len(starts) > 2 and len(set(sizes[:-1].tolist())) == 1 and np.isfinite(time).all():
+            if np.array_equal(time[: sizes[0]], time[sizes[0] : 2 * sizes[0]]):
+                told = (
+                    f"{table.path}: the time begins anew every {sizes[0]} {table.place}s: these"
+                    " packets have no time of their own"
+                )
+                self.open.append(Question(told, Ask.UNIT))
+                return None
+        elif self.segment not in ("", "1"):
+            raise InputError(f"{table.path}: there is no table '{self.segment}'; it holds one.")
+        same = np.diff(time[part]) == 0.0
+        others = [np.diff(c.values[part])[same] for n, c in found.items() if n != "time"]
+        repeats = same.any() and all((moves == 0.0).all() for moves in others)
+        even = None if repeats else evened(time[part])  # lines that are double are not rounded
+        if even is not None:
+            time[part] = even[0]
+            self.notes.append(
+                "the time has too few digits, so that it repeats; it is taken to be even, with"
+                f" steps of {even[1]:.6g} of its unit."
+            )
+        return part
+
+    def _tell_segments(
+        self, keys: Sequence[str], ends: Sequence[tuple[np.int64, np.int64]]
+    ) -> None:
+        """Name the parts of a time that begins anew; what is open is asked first, as of no part."""
+        self.outcome.tables = tuple(keys)
+        if self.open:
+            return
+        listed = ", ".join(
+            f"{key} ({self.table.place}s {first} to {last})"
+            for key, (first, last) in list(zip(keys, ends, strict=True))[:MOST_NAMED]
+        )
+        self.problems.add(
+            f"{self.table.path}: the time begins anew {len(keys) - 1} times, so it holds"
+            f" {len(keys)} records: {listed}; take one of them, such as"
+            f" {ready_line({}, None, keys[0])}, or each as a record: {ready_line({}, None, ALL)}."
+        )
+
+    def _lengths_differ(self, fields: Mapping[str, Field], columns: Columns) -> bool:
+        sizes = [len(cells) for cells in columns.cells]
+        first, kind = next(iter(fields), ""), "array" if self.table.sizes else "column"
+        for (name, own), size in zip(fields.items(), sizes, strict=True):
+            if size != sizes[0]:
+                self.problems.add(
+                    f"{self.table.path}: {kind} '{self.table.labels[own.index]}' ({name}) has"
+                    f" {size} values, '{first}' has {sizes[0]}; give every column one value for"
+                    " each instant."
+                )
+        return len(set(sizes)) != 1
+
+    def _check(self, found: Mapping[str, Located]) -> None:
+        """Check the samples of a record; those of a path to follow are checked elsewhere."""
+        missing = found.get("displacement")
+        count = int((np.isnan(missing.values) & ~missing.reported).sum()) if missing else 0
+        if count:
+            self.notes.append(f"{count} readings of the displacement are missing; they are masked.")
+        if not self.request.voltage:
+            return
+        check_length(self.table.path, len(next(iter(found.values())).lines), self.problems)
+        checks = {"time": check_time, "displacement": check_displacement}
+        for name, column in found.items():
+            checks.get(name, check_complete)(column, self.problems)
+            if name == "voltage" and self.request.excitation and not column.reported.any():
+                check_excitation(column, self.problems)

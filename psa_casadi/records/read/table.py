@@ -1,9 +1,10 @@
-"""What every file is read to: tables of named columns, whose cells are numbers or text."""
+"""What every file is read to: tables of named columns, whose cells are numbers, text or times."""
 
 import calendar
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date
 from decimal import Decimal
@@ -97,15 +98,6 @@ _WITH_UNIT = re.compile(r"(?P<number>[+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*(?P<unit>[
 SWAPPED = str.maketrans(".,", ",.")
 
 
-@dataclass
-class Parsed:
-    """Numbers of one column, nan where there is none; which cells are no numbers or no reading."""
-
-    values: FloatArray
-    wrong: NDArray[np.bool_]
-    missing: int
-
-
 def is_number(text: str) -> bool:
     """Whether a text is a number as it may stand in a table, or an empty cell's word."""
     text = text.strip().strip('"').strip()
@@ -144,27 +136,27 @@ def decimal_sign(cells: Iterable[str]) -> str:
     return "."
 
 
-def without_overload(values: FloatArray) -> Parsed:
-    """Return numbers as a column, nan where an instrument sent that there is no reading."""
+def without_overload(values: FloatArray) -> FloatArray:
+    """Return numbers, nan where an instrument sent that there is no reading."""
     over = np.isin(np.abs(values), _SCPI)
-    values = np.where(over, math.nan, values) if over.any() else values
-    return Parsed(values, np.zeros(values.size, np.bool_), int(np.isnan(values).sum()))
+    return np.where(over, math.nan, values) if over.any() else values
 
 
-def numbers_in(cells: Sequence[str], point: str, unit: str) -> Parsed:
-    """Return the numbers in texts with a decimal `point`; a cell's own unit is turned to `unit`."""
+def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the numbers in texts, nan where there is none, and which texts are no numbers.
+
+    A word for a missing reading is no such text. The decimal sign is `point`; a cell's own unit is
+    turned to `unit`.
+    """
     plain = cells if point == "." else [c.translate(SWAPPED) for c in cells]
-    try:
-        values = np.array(list(map(float, plain)))
-    except ValueError:
-        values = np.zeros(0)
-    if values.size == len(cells) and "_" not in "".join(cells):
-        return without_overload(values)
+    with suppress(ValueError):
+        values = np.array([float(cell or "nan") for cell in plain])
+        if "_" not in "".join(cells):
+            return without_overload(values), np.zeros(values.size, dtype=np.bool_)
     known = {cell: _number(cell, point, unit) for cell in set(cells)}
     found = [known[cell] for cell in cells]
-    parsed = without_overload(np.array([math.nan if v is None else v for v in found]))
-    wrong = np.array([v is None for v in found], dtype=np.bool_)
-    return Parsed(parsed.values, wrong, parsed.missing - int(wrong.sum()))
+    numbers = np.array([math.nan if v is None else v for v in found])
+    return without_overload(numbers), np.array([v is None for v in found], dtype=np.bool_)
 
 
 def _number(cell: str, point: str, unit: str) -> float | None:

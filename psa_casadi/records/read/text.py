@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
-    COLUMNS,
     columns_known,
     measures,
     stated_unit,
@@ -33,7 +32,7 @@ from psa_casadi.records.read.table import (
     unit_in,
     unit_of_times,
 )
-from psa_casadi.records.record import FEWEST_SAMPLES
+from psa_casadi.records.record import COLUMNS, FEWEST_SAMPLES
 from psa_casadi.units import units_of
 
 #: Lines in which the first header is looked for, and the most that are asked for further ones.
@@ -375,15 +374,7 @@ class _Part:
         if body.count(mark) != len(rows) * (width - 1):
             return None
         if point == ",":
-            body = body.translate(SWAPPED)
-        body = f"\n{body}\n"
-        if point == "," or any(gap in body for gap in (mark * 2, f"{mark}\n", f"\n{mark}")):
-            for gap, filled in (
-                (mark * 2, f"{mark}nan{mark}"), (mark * 2, f"{mark}nan{mark}"),
-                (f"{mark}\n", f"{mark}nan\n"), (f"\n{mark}", f"\nnan{mark}"),
-            ):  # fmt: skip
-                body = body.replace(gap, filled)
-            rows = body[1:-1].split("\n")
+            rows = body.translate(SWAPPED).split("\n")
         del body  # of a long record it is as large as the rows
         try:
             values = np.loadtxt(rows, delimiter=mark, comments=None, usecols=asked, ndmin=2)
@@ -428,7 +419,7 @@ def _with_unit(text: str, cells: Cells) -> str:
         own = unit_in(filled)
         if own:
             return f"{text.strip()} [{own}]"
-        filled = numbers_in(filled[:9], decimal_sign(filled[:9]), "s").values
+        filled = numbers_in(filled[:9], decimal_sign(filled[:9]), "s")[0]
     own = unit_of_times(filled[:9]) if name and name.column == "time" else None
     return f"{text.strip()} [{own}]" if own else text
 

@@ -1,1 +1,0 @@
-"""What becomes of an original: each conversion is deterministic to the byte."""
