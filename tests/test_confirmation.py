@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.held_out.confirmation import unconfirmed
 from psa_casadi.diagnosis.held_out.coverage import coverage_notes
 from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.start.other_quantities import doubtful_quantity
+from psa_casadi.identification.start.doubts import doubtful_quantity
 from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole

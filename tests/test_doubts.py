@@ -10,15 +10,16 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.start.doubts import (
+    doubtful_quantity,
     doubtful_sign,
+    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
+    refuse_few,
     refuse_unusable,
+    refuse_wrapped,
 )
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
-from psa_casadi.identification.start.readings import refuse_few
-from psa_casadi.identification.start.time_unit import doubtful_time
 from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray

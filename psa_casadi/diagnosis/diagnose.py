@@ -22,11 +22,15 @@ from psa_casadi.identification.search.measured_load import LOAD, is_measured, lo
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress, relevelled
 from psa_casadi.identification.start.columns import columns_of, with_levels
+from psa_casadi.identification.start.doubts import (
+    refuse_few,
+    refuse_other_time,
+    refuse_still,
+    refuse_stuck,
+    refuse_wrapped,
+)
 from psa_casadi.identification.start.form import Hysteresis, forms_of
 from psa_casadi.identification.start.ordinary import chosen_start
-from psa_casadi.identification.start.other_quantities import refuse_wrapped
-from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
-from psa_casadi.identification.start.time_unit import refuse_other_time
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model

@@ -16,11 +16,11 @@ from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.search.refitting import Progress
 from psa_casadi.identification.start.doubts import (
     correlation,
+    doubtful_quantity,
+    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
 )
-from psa_casadi.identification.start.other_quantities import doubtful_quantity
-from psa_casadi.identification.start.time_unit import doubtful_time
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 

@@ -18,17 +18,20 @@ from psa_casadi.identification.search.multistart import Search, StartOutcome
 from psa_casadi.identification.search.refitting import Progress, record_rms, refit, relevelled
 from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.doubts import (
+    doubtful_quantity,
     doubtful_sign,
+    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
+    refuse_few,
+    refuse_other_time,
+    refuse_still,
+    refuse_wrapped,
 )
 from psa_casadi.identification.start.electrical import capacitance_of
 from psa_casadi.identification.start.form import Hysteresis, forms_of
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import chosen_start
-from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
-from psa_casadi.identification.start.readings import refuse_few, refuse_still
-from psa_casadi.identification.start.time_unit import doubtful_time, refuse_other_time
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 from psa_casadi.diagnosis.held_out.errors import Gain
 from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.identification.start.doubts import doubtful_voltage
-from psa_casadi.identification.start.other_quantities import doubtful_quantity
+from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage
 from psa_casadi.records.checks import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment
 
