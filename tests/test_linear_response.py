@@ -6,13 +6,14 @@ from scipy.signal import lsim
 
 from psa_casadi.identification.start.linear import arrangements
 from psa_casadi.identification.start.linear_response import (
+    Response,
     mechanics_poles,
     numerator_time,
     plays,
     respond,
     transfer,
+    vector_fit,
 )
-from psa_casadi.identification.start.vector_fitting import Response, vector_fit
 
 
 def test_the_response_is_exact_between_samples() -> None:

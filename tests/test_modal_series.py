@@ -13,7 +13,7 @@ from psa_casadi.diagnosis.search.hypothesis import hypothesis, root_of
 from psa_casadi.diagnosis.search.modes import one_mode
 from psa_casadi.effects.modal_series import MODAL_SERIES
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.identification.start.modes import Shaken, modes_of
+from psa_casadi.identification.start.linear_response import Shaken, modes_of
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine

@@ -14,7 +14,7 @@ from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.start.modes import MOST_DAMPED, Mode, Shaken, modes_of
+from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Shaken, modes_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment

@@ -29,8 +29,12 @@ from psa_casadi.identification.search.refitting import (
 from psa_casadi.identification.start.excerpts import Excerpt, fastest_part
 from psa_casadi.identification.start.linear import arrangements, different
 from psa_casadi.identification.start.linear_fit import LinearFit, cost_of, fit_linear
-from psa_casadi.identification.start.linear_response import FloatArray
-from psa_casadi.identification.start.vector_fitting import Response, contributions, vector_fit
+from psa_casadi.identification.start.linear_response import (
+    FloatArray,
+    Response,
+    contributions,
+    vector_fit,
+)
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.simulate import record_inputs, simulate_record

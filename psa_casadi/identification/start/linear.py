@@ -17,8 +17,13 @@ import numpy as np
 from psa_casadi.components import BASE
 from psa_casadi.identification.start.excerpts import Excerpt, excerpts
 from psa_casadi.identification.start.linear_fit import COORDINATES, LinearFit, cost_of, fit_linear
-from psa_casadi.identification.start.linear_response import ComplexArray, FloatArray
-from psa_casadi.identification.start.vector_fitting import Response, contributions, vector_fit
+from psa_casadi.identification.start.linear_response import (
+    ComplexArray,
+    FloatArray,
+    Response,
+    contributions,
+    vector_fit,
+)
 from psa_casadi.records.record import Record
 
 #: Number of candidates at most, and of poles that vector fitting looks for.
