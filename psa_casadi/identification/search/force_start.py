@@ -26,9 +26,14 @@ from psa_casadi.identification.search.refitting import (
     refit,
     residual_noise,
 )
-from psa_casadi.identification.start.excerpts import Excerpt, fastest_part
 from psa_casadi.identification.start.linear import arrangements, different
-from psa_casadi.identification.start.linear_fit import LinearFit, cost_of, fit_linear
+from psa_casadi.identification.start.linear_fit import (
+    Excerpt,
+    LinearFit,
+    cost_of,
+    fastest_part,
+    fit_linear,
+)
 from psa_casadi.identification.start.linear_response import (
     FloatArray,
     Response,

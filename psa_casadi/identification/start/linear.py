@@ -15,8 +15,14 @@ from math import log
 import numpy as np
 
 from psa_casadi.components import BASE
-from psa_casadi.identification.start.excerpts import Excerpt, excerpts
-from psa_casadi.identification.start.linear_fit import COORDINATES, LinearFit, cost_of, fit_linear
+from psa_casadi.identification.start.linear_fit import (
+    COORDINATES,
+    Excerpt,
+    LinearFit,
+    cost_of,
+    excerpts,
+    fit_linear,
+)
 from psa_casadi.identification.start.linear_response import (
     ComplexArray,
     FloatArray,
