@@ -12,7 +12,7 @@ from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.identification.start.form import forms_of
+from psa_casadi.identification.start.ordinary import forms_of
 from psa_casadi.model.compose import Model, compose
 from tests.modelica_runs import right_side_error
 from tests.plants.make import make_record

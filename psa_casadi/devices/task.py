@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from psa_casadi.devices.jobs import Job
-from psa_casadi.identification.start.form import Hysteresis
+from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.report.documents.device_file import Status, Work
 from psa_casadi.version import __version__
 

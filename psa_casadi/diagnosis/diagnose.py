@@ -29,8 +29,7 @@ from psa_casadi.identification.start.doubts import (
     refuse_stuck,
     refuse_wrapped,
 )
-from psa_casadi.identification.start.form import Hysteresis, forms_of
-from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.identification.start.ordinary import Hysteresis, chosen_start, forms_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model

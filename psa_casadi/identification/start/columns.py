@@ -7,7 +7,7 @@ import numpy as np
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.further import COLUMNS, with_column
-from psa_casadi.identification.start.electrical import capacitance_of
+from psa_casadi.identification.start.ordinary import capacitance_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.fast_noise import fast_noise
 from psa_casadi.records.record import Record
