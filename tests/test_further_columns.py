@@ -21,7 +21,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.further import COLUMNS, scaled
 from psa_casadi.identification.fitting.minimum import objective
-from psa_casadi.identification.start.columns import columns_of, with_levels
+from psa_casadi.identification.prepare import columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.compose import compose
 from psa_casadi.records.read.reading import read_record
