@@ -17,8 +17,7 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.noise.colour import Colour
 from psa_casadi.diagnosis.screening.screen import Score, Screening, whitened_residuals
 from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.identification.fitting.fitted import Fitted
-from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR, Fitted
 
 FloatArray = npt.NDArray[np.float64]
 

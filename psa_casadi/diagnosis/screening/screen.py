@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.noise.colour import Colour, colour_of
 from psa_casadi.diagnosis.screening.probes import Direction
 from psa_casadi.diagnosis.screening.spans import Span, combined, declared, spans
 from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.identification.fitting.fitted import Fitted
+from psa_casadi.identification.fitting.unknowns import Fitted
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -22,8 +22,7 @@ from psa_casadi.diagnosis.screening.screen import (
     without,
 )
 from psa_casadi.diagnosis.screening.spans import Span, combined, spans
-from psa_casadi.identification.fitting.fitted import Fitted
-from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR, Fitted
 
 FloatArray = npt.NDArray[np.float64]
 
