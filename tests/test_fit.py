@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.fitting.minimum import objective
+from psa_casadi.identification.fitting.fit import Fit, fit, objective
 from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
@@ -261,7 +260,7 @@ def test_a_trial_whose_numbers_overflow_has_failed(monkeypatch: pytest.MonkeyPat
         one = Prediction(np.full(len(weights), 1.0), np.full((len(weights), size), 1e160), "exact")
         return [one]
 
-    monkeypatch.setattr("psa_casadi.identification.fitting.minimum.predict", huge)
+    monkeypatch.setattr("psa_casadi.identification.fitting.fit.predict", huge)
     assert evaluate(found.theta) is None
 
 
@@ -278,7 +277,7 @@ def test_a_loop_that_has_left_the_record_far_behind_has_diverged(
     far = np.full(len(weights), ranges * experiments[0].record.range_m)
     slopes = np.zeros((len(weights), found.unknowns.size))
     monkeypatch.setattr(
-        "psa_casadi.identification.fitting.minimum.predict",
+        "psa_casadi.identification.fitting.fit.predict",
         lambda *_, **__: [Prediction(far, slopes, "exact")],
     )
     assert (evaluate(found.theta) is not None) == evaluated

@@ -18,9 +18,8 @@ from psa_casadi.components.flexure import FLEXURE
 from psa_casadi.diagnosis.columns import decision_sentence
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.fit import fit, objective
 from psa_casadi.identification.fitting.further import COLUMNS, scaled
-from psa_casadi.identification.fitting.minimum import objective
 from psa_casadi.identification.prepare import columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.compose import compose

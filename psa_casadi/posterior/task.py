@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.identification.fitting.fit import FIT_RTOL
+from psa_casadi.identification.fitting.fit import FIT_RTOL, Effort, accurate_minimum, objective
 from psa_casadi.identification.fitting.further import further_of
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum
-from psa_casadi.identification.fitting.minimum import Effort, accurate_minimum, objective
 from psa_casadi.identification.fitting.prediction import measured, motions_of
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels

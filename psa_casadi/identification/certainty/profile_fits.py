@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.fit import Fit, objective
 from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
-from psa_casadi.identification.fitting.minimum import objective
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]

@@ -1,31 +1,312 @@
-"""Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives."""
+"""Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives.
+
+Where records begin that are held out whole, of which no fit sees a sample.
+
+The stack begins as in the fitted records of the device that begin at the same voltage: what the
+first tenth of a record tells of its memories is mostly the model's own error there. A loop that is
+simulated from it drifts off by a tenth of the range, where one that begins as the device's other
+records do stays within a hundredth. Where no fitted record begins alike, the first tenth finds the
+whole start. States of drive, sensor and environment belong to the record, and the first tenth finds
+them, too; but it hardly tells a charge that leaks slowly from the sensor's offset, and what it
+leaves open grows along the record. So such a state is looked for within the size that it has where
+the fitted records begin which begin alike (their root mean square is its prior).
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.beginnings import beginnings
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.further import Further, further_of, scaled
-from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS
-from psa_casadi.identification.fitting.minimum import Effort, accurate_minimum
+from psa_casadi.identification.fitting.levenberg_marquardt import (
+    FIRST_RADIUS,
+    LEAST_RADIUS,
+    Evaluate,
+    Minimum,
+    minimise,
+)
 from psa_casadi.identification.fitting.prediction import (
     Prediction,
     Simulated,
     measured,
     motions_of,
     predict,
+    simulated,
+    trace_record,
 )
 from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
+from psa_casadi.interruption import current_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way
 
 FloatArray = npt.NDArray[np.float64]
+
+#: First voltages that differ by less than this share of the records' range are the same.
+_SAME = 0.01
+#: Coordinates of a start are of order 1: smaller than this none is known.
+_LEAST = 1e-6
+#: How far the start is sought in the first tenth.
+_EVALUATIONS, _TOLERANCE = 30, 1e-5
+
+
+def beginnings(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiments: Sequence[Experiment],
+    level: float,
+    way: Way,
+) -> FloatArray:
+    """Return theta with start and offset of the records that are held out whole; others stay.
+
+    `model` has the values of theta; `level` [m] is that of white noise which tells as little as
+    what the model misses. Raises PsaError where a record cannot be simulated.
+    """
+    found = theta.copy()
+    own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
+    for k, experiment in enumerate(experiments):
+        if not experiment.held_out_whole or not experiment.known.any():
+            continue
+        first, last = unknowns.first(k), unknowns.first(k + 1)
+        found[first:last] = 0.0
+        told = _told(unknowns, theta, experiments, k)
+        shared = {c: told[c] for c in told if unknowns.started[k][c - first] not in own}
+        found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
+        sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
+        for c in sizes.keys() & told.keys():
+            size = float(np.sqrt(np.mean(np.square(told[c]))))
+            sizes[c] = min(sizes[c], max(size, _LEAST))
+        found[list(sizes)] = _sought(model, unknowns, found, experiment, k, level, sizes, way)
+    return found
+
+
+def _told(
+    unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
+) -> dict[int, list[float]]:
+    """Return what the fitted records that begin as record k does tell of its start's coordinates.
+
+    One value for each of these records, by the coordinate's place.
+    """
+    first = unknowns.first(k)
+    size = max(float(np.ptp(e.record.voltage)) for e in experiments)
+    begins = [float(e.record.voltage[0]) for e in experiments]
+    alike = [
+        j
+        for j, other in enumerate(experiments)
+        if not other.held_out_whole and abs(begins[j] - begins[k]) <= _SAME * size
+    ]
+    found = {
+        first + place: [
+            float(theta[_place(unknowns, j, name)]) for j in alike if name in unknowns.started[j]
+        ]
+        for place, name in enumerate(unknowns.started[k])
+    }
+    return {c: values for c, values in found.items() if values}
+
+
+def _place(unknowns: Unknowns, record: int, name: str) -> int:
+    return unknowns.first(record) + unknowns.started[record].index(name)
+
+
+def _sought(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiment: Experiment,
+    k: int,
+    level: float,
+    sizes: Mapping[int, float],
+    way: Way,
+) -> FloatArray:
+    """Return the coordinates of record k with which its first tenth fits best, of such sizes."""
+    known, columns = np.flatnonzero(experiment.known), list(sizes)
+    stop = int(known[-1]) + 1
+    y, prior = measured(experiment.record)[known], 1.0 / np.array(list(sizes.values()))
+
+    def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        there = theta.copy()
+        there[columns] = own
+        try:
+            run = trace_record(
+                model, experiment.record, unknowns.start(there, k), (), stop=stop, way=way
+            )
+        except PsaError:
+            return None
+        by_start, by_offset = unknowns.place_slopes(there, k)
+        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / level
+        missed = (run.output[known] + unknowns.offset(there, k) - y) / level
+        return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
+
+    return _minimum(evaluate, len(columns))
+
+
+def _minimum(evaluate: Evaluate, size: int) -> FloatArray:
+    """Return where the search ends; the last coordinate is the offset, exactly linear."""
+    free = np.full(size, np.inf)
+    found = minimise(
+        evaluate,
+        np.zeros(size),
+        (-free, free),
+        tolerance=_TOLERANCE,
+        evaluations=_EVALUATIONS,
+        linear=(size - 1,),
+    )
+    if found is None:
+        raise PsaError("A held-out record cannot be simulated from where the others begin.")
+    return found.theta
+
+
+#: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
+#: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
+#: then the stepper is taken.
+_OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
+#: Multiple of the whole range that is missed (rms) where a loop has diverged. It would come down by
+#: decades a step, each of which takes a hundred times as long as one of a loop that is stable.
+_DIVERGED = 1e6
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How far a minimum is sought: see `minimise`."""
+
+    tolerance: float
+    evaluations: int
+    goal: float
+    linear: tuple[int, ...]
+    radius: float
+    patient: bool = False
+
+
+def accurate_minimum(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    weights: FloatArray,
+    theta: FloatArray,
+    sigma: Sequence[float],
+    rtol: float,
+    effort: Effort,
+) -> tuple[Minimum, Way, list[Simulated]]:
+    """Return the minimum, found by a simulation that is accurate there, and how that was done."""
+    allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
+    goal = min(effort.goal, _missing_all(experiments, sigma))
+    ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
+    ways.append(Way(rtol, 0.1 * rtol, stepped=True))
+    spent, before = 0, None
+    for way in ways:
+        evaluate = objective(model, experiments, unknowns, weights, way)
+        try:
+            found = minimise(
+                evaluate,
+                theta,
+                unknowns.bounds(),
+                tolerance=effort.tolerance,
+                evaluations=max(effort.evaluations - spent, 2),
+                goal=goal,
+                linear=effort.linear,
+                patient=effort.patient,
+                radius=effort.radius if before is None else max(before[0].radius, LEAST_RADIUS),
+            )
+        except KeyboardInterrupt:
+            if before is None:  # nothing was evaluated yet
+                raise
+            current_work().stop()
+            minimum, rougher = before
+            ended = replace(minimum, evaluations=spent, interrupted=True, converged=False)
+            return ended, rougher, []
+        if found is None:
+            raise SimulationError(
+                "The model cannot be simulated at the start of the fit; start from other values."
+            )
+        minimum, theta = found, found.theta
+        before = minimum, way
+        spent += found.evaluations
+        if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
+            current_work().stop()
+            return replace(minimum, evaluations=spent), way, []
+        if minimum.cost > goal:  # of no use, however accurate
+            return replace(minimum, evaluations=spent), way, []
+        told = simulated(model, experiments, unknowns, theta, way=way)
+        if not any(t.error > a for t, a in zip(told, allowed, strict=True)):
+            break
+    return replace(minimum, evaluations=spent), way, told
+
+
+def _missing_all(experiments: Sequence[Experiment], sigma: Sequence[float]) -> float:
+    """Return the cost of missing every sample by the whole range: a loop that diverges misses more.
+
+    Infinite where a further column counts as well.
+    """
+    if any(e.further for e in experiments):
+        return np.inf
+    parts = [(measured(e.record)[e.used], s) for e, s in zip(experiments, sigma, strict=True)]
+    return sum(y.size * float(np.ptp(y) / s) ** 2 for y, s in parts if y.size)
+
+
+def _allowed(experiment: Experiment, sigma: float) -> float:
+    """Return the rms error [m] that a record's simulation may have."""
+    y = measured(experiment.record)[experiment.used]
+    return max(_OF_NOISE * sigma, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0)
+
+
+def objective(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    weights: FloatArray,
+    way: Way,
+) -> Evaluate:
+    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian.
+
+    Those of the displacement, then those of the further columns. None where the model diverges.
+    """
+    return _Objective(model, tuple(experiments), unknowns, weights, way)
+
+
+class _Objective:
+    """What `objective` returns; it can be pickled with the posterior that it is part of."""
+
+    def __init__(
+        self, model: Model, experiments: tuple[Experiment, ...], unknowns: Unknowns,
+        weights: FloatArray, way: Way,
+    ) -> None:  # fmt: skip
+        self._of, self._way = (model, experiments, unknowns), way
+        self._target = np.concatenate([measured(e.record)[e.used] for e in experiments])
+        span = float(np.ptp(self._target))
+        self._reach = float(np.max(span / weights)) if span > 0.0 else np.inf
+        self._used = [e.used[: e.stop] for e in experiments]
+        self._prior, self._share = 1.0 / unknowns.prior, 1.0 / weights
+
+    def __call__(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        try:
+            parts = predict(*self._of, theta, way=self._way)
+            beside = further_of(*self._of, theta, way=self._way)
+        except PsaError:
+            return None
+        used, samples = self._used, len(self._target)
+        y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
+        more = [b.jacobian / b.level for b in beside]
+        given = (-b.residuals / b.level for b in beside)
+        residual = np.concatenate([(y - self._target) * self._share, *given, theta * self._prior])
+        jacobian = np.empty((len(residual), len(theta)))
+        first = 0
+        for part, u in zip(parts, used, strict=True):  # no copy but this one
+            last = first + int(np.count_nonzero(u))
+            np.compress(u, part.jacobian, axis=0, out=jacobian[first:last])
+            first = last
+        jacobian[:samples] *= self._share[:, None]
+        jacobian[samples:] = np.vstack([*more, np.diag(self._prior)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
+            far = _DIVERGED * self._reach * np.sqrt(samples)
+            near = np.linalg.norm(residual[:samples]) < far
+        return (residual, jacobian) if finite and near else None
+
 
 #: Correlation of neighbouring residuals that counts at most: a hundred samples are then one.
 _MOST_ALIKE = 0.98
