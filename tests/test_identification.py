@@ -7,9 +7,9 @@ import pytest
 
 from psa_casadi import reference
 from psa_casadi.components import BASE
+from psa_casadi.identification import refitting
 from psa_casadi.identification.identify import identify
-from psa_casadi.identification.search import refitting
-from psa_casadi.identification.search.refitting import refit_or_keep
+from psa_casadi.identification.refitting import refit_or_keep
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, multisine, read_record, time_grid
@@ -173,8 +173,8 @@ def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
 def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any("cut off" in w for w in identified(2).warnings)
     record = plant(2)[1].slice(0, 600)
-    monkeypatch.setattr("psa_casadi.identification.search.refitting.POLISH", 1)
-    monkeypatch.setattr("psa_casadi.identification.search.refinement._LAST", 1)
+    monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 1)
+    monkeypatch.setattr("psa_casadi.identification.refitting._LAST", 1)
     found = identify([record])
     assert found.warnings[0].startswith("The fit was cut off before it converged")
 

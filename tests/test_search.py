@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import psa_casadi.identification.fitting.fit as fitting
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.prepare import prepared
-from psa_casadi.identification.search.exchanges import exchanges
+from psa_casadi.identification.refitting import exchanges
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from tests.benchmarks.coverage import Run, one_run

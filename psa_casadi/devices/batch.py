@@ -17,7 +17,7 @@ from psa_casadi.devices.submission import Executor, outcomes
 from psa_casadi.devices.summary import write_summary
 from psa_casadi.devices.task import DeviceTask, Options, key_of
 from psa_casadi.errors import InputError
-from psa_casadi.identification.search.refitting import Progress
+from psa_casadi.identification.refitting import Progress
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding

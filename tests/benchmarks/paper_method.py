@@ -24,7 +24,7 @@ from psa_casadi.identification.paper.moments import (
     moment_coefficients,
 )
 from psa_casadi.identification.paper.shapes import find_loops, find_steps
-from psa_casadi.identification.search.refitting import noise_levels
+from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record

@@ -22,7 +22,7 @@ from psa_casadi.diagnosis.search.quick_fits import (
 from psa_casadi.diagnosis.search.worth import near_end
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
-from psa_casadi.identification.search.refitting import quick_rtol, refit
+from psa_casadi.identification.refitting import quick_rtol, refit
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side

@@ -8,7 +8,7 @@ from psa_casadi.component import Component
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
-from psa_casadi.identification.search.refitting import quick_rtol
+from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.records.split import Experiment
 
 #: Evaluations of a quick fit from a direction; with what it held, free again.

@@ -19,7 +19,7 @@ from psa_casadi.identification.paper.forces import in_forces
 from psa_casadi.identification.paper.hysteresis import Bends, HysteresisPart, hysteresis_part
 from psa_casadi.identification.paper.moments import linear_part
 from psa_casadi.identification.paper.shapes import Loop, find_loops, find_steps
-from psa_casadi.identification.search.refitting import noise_levels
+from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record

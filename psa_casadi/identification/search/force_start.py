@@ -19,7 +19,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.search.refitting import (
+from psa_casadi.identification.refitting import (
     Progress,
     quick_from,
     record_rms,

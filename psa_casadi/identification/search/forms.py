@@ -6,8 +6,8 @@ import numpy as np
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.refitting import Progress, record_rms
 from psa_casadi.identification.search.multistart import Search, search
-from psa_casadi.identification.search.refitting import Progress, record_rms
 from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.ordinary import FORMS
 from psa_casadi.model.compose import Model
