@@ -17,8 +17,8 @@ from psa_casadi.diagnosis.search.view import examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.refitting import quick_rtol
-from psa_casadi.identification.search.force_start import retuned
 from psa_casadi.identification.search.multistart import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.read.reading import read_record

@@ -21,7 +21,7 @@ from psa_casadi.diagnosis.noise.colour import residual_colour
 from psa_casadi.diagnosis.screening.screen import independent, without
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.search.force_start import force_of
+from psa_casadi.identification.force_start import force_of
 from psa_casadi.records.quality.filtering import filtered
 from psa_casadi.records.split import Experiment, fitted
 

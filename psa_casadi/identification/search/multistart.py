@@ -10,6 +10,7 @@ import numpy as np
 from psa_casadi.components import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.refitting import (
     Progress,
     differing,
@@ -23,7 +24,6 @@ from psa_casadi.identification.refitting import (
     with_fast,
     without_blur,
 )
-from psa_casadi.identification.search.force_start import retuned
 from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.starting_points import resolved, starting_points
 from psa_casadi.model.compose import Model
