@@ -15,7 +15,7 @@ from psa_casadi.identification.fitting.prediction import Prediction, motions_of,
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.refitting import same_place
-from psa_casadi.identification.search.multistart import fit_base, free_parameters
+from psa_casadi.identification.search import fit_base, free_parameters
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid

@@ -23,7 +23,7 @@ from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import compose
 from psa_casadi.records.read.reading import read_record

@@ -147,7 +147,7 @@ def rivals(
     from psa_casadi.design.experiment.experiment import rival_of_effect
     from psa_casadi.design.experiment.rivals import noise_of_fit, rival_of_fit
     from psa_casadi.diagnosis.search.contenders import fit_contenders
-    from psa_casadi.identification.search.multistart import CORE
+    from psa_casadi.identification.search import CORE
 
     if not records:
         plain = model.without(e.name for e in effects)
@@ -162,7 +162,7 @@ def rivals(
 def whole(model: "Model", wanted: "Sequence[str]") -> "Rival":
     """Return the model with what records of loops determine as its unknowns, and what is wanted."""
     from psa_casadi.design.experiment.rivals import rival_of_model
-    from psa_casadi.identification.search.multistart import CORE
+    from psa_casadi.identification.search import CORE
 
     own = [n for e in model.effects for n in e.fitted]
     free = [n for n in CORE if n in model.parameter_names]

@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.diagnosis.verdict import NAMING
 from psa_casadi.identification.fitting.further import COLUMNS
-from psa_casadi.identification.search.measured_load import LOAD, is_measured, without_column
+from psa_casadi.identification.search import LOAD, is_measured, without_column
 
 #: What the places are called that effects belong to.
 PLACES = {

@@ -18,9 +18,13 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import unfinished
 from psa_casadi.identification.prepare import averaged, columns_of, with_levels
 from psa_casadi.identification.refitting import Progress, relevelled
-from psa_casadi.identification.search.forms import search_forms
-from psa_casadi.identification.search.measured_load import LOAD, is_measured, loads_as_curves
-from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search import (
+    LOAD,
+    fit_base,
+    is_measured,
+    loads_as_curves,
+    search_forms,
+)
 from psa_casadi.identification.start.doubts import (
     refuse_few,
     refuse_other_time,

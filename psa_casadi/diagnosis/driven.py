@@ -13,7 +13,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.refitting import Progress
-from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.doubts import (
     correlation,
     doubtful_quantity,

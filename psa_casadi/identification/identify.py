@@ -13,9 +13,7 @@ from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import Progress, record_rms, refit, relevelled
-from psa_casadi.identification.search.forms import search_forms
-from psa_casadi.identification.search.measured_load import loads_as_curves
-from psa_casadi.identification.search.multistart import Search, StartOutcome
+from psa_casadi.identification.search import Search, StartOutcome, loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
     doubtful_quantity,
     doubtful_sign,

@@ -15,7 +15,7 @@ from psa_casadi.identification.fitting.prediction import measured, motions_of
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import noise_levels
-from psa_casadi.identification.search.multistart import free_parameters
+from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.density import Block, Density

@@ -31,7 +31,7 @@ from psa_casadi.diagnosis.search.view import examine
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
-from psa_casadi.identification.search.multistart import CORE, fit_base
+from psa_casadi.identification.search import CORE, fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model

@@ -12,7 +12,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.refitting import Progress, quick_from, refit, without_blur
-from psa_casadi.identification.search.multistart import search
+from psa_casadi.identification.search import search
 from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.identification.start.starting_points import resolved
