@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import psa_casadi.identification.fitting.fit as fitting
+from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.refitting import exchanges

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.certainty.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
@@ -21,9 +20,8 @@ from psa_casadi.records.quality.runs import runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval
-
-FloatArray = npt.NDArray[np.float64]
 
 #: The most samples of a reference run, and what straight lines between them may miss the voltage
 #: by, over its range.

@@ -34,15 +34,11 @@ from psa_casadi.identification.start.linear_fit import (
     fastest_part,
     fit_linear,
 )
-from psa_casadi.identification.start.linear_response import (
-    FloatArray,
-    Response,
-    contributions,
-    vector_fit,
-)
+from psa_casadi.identification.start.linear_response import Response, contributions, vector_fit
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
+from psa_casadi.units import FloatArray
 
 #: Samples that one record and all together may have, and the fewest that count.
 _MOST, _ALL, _FEWEST = 6_000, 12_000, 16

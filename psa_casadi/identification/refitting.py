@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.certainty.determinacy import covariance_of
@@ -26,6 +25,7 @@ from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, Level
+from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
 
@@ -55,8 +55,6 @@ def exchanges(p: Values) -> Iterator[tuple[str, dict[str, float]]]:
             slowed = {f"c_{part}": drive * p[f"k_{part}"]}
             yield f"drive lag and {what}", slowed | {"R_s": lag / p["C_p"]}
 
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Evaluations that a fit gets to its end.
 POLISH = 100

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.components import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
@@ -43,6 +42,7 @@ from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.timings import stage
+from psa_casadi.units import FloatArray
 
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = (
@@ -305,8 +305,6 @@ def _criterion(found: Fit, experiments: Sequence[Experiment]) -> float:
     likely = sum(n * np.log(level**2) for n, level in zip(samples, levels, strict=True))
     return float(likely + len(found.unknowns.names) * np.log(sum(samples)))
 
-
-FloatArray = npt.NDArray[np.float64]
 
 #: The column, and the highest order of the curve.
 LOAD, _ORDER = "load_force", 8

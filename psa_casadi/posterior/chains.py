@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from psa_casadi.interruption import current_work
 from psa_casadi.posterior.packages import sampler_and_arviz
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str], None]
 
 #: Spread of the chains' starts, in standard deviations of the fit.

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.prediction import measured, predict
 from psa_casadi.posterior.task import Task
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

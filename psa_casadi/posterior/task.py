@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Effort, accurate_minimum, objective
@@ -25,8 +24,7 @@ from psa_casadi.records.quality.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level, whole
 from psa_casadi.simulation.ways import Way
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 _EVALUATIONS, _TOLERANCE, _ROUNDS = 60, 1e-6, 2
 #: A start nearer to a bound than this share of a standard deviation is moved inwards.

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import Unknowns
@@ -13,9 +12,8 @@ from psa_casadi.posterior.chains import Chains
 from psa_casadi.posterior.packages import sampler_and_arviz
 from psa_casadi.posterior.predictive import Predictive
 from psa_casadi.posterior.task import Task
+from psa_casadi.units import FloatArray
 from psa_casadi.version import __version__
-
-FloatArray = npt.NDArray[np.float64]
 
 _RECORD = "record"
 

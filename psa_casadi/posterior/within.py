@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.components.prestress import (
     PRESTRESS_MECHANISM,
@@ -30,6 +29,7 @@ from psa_casadi.design.mechanism.loop import (
 from psa_casadi.design.mechanism.search import Wish, search
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Provenance
 
 __all__ = [
@@ -38,7 +38,6 @@ __all__ = [
     "mechanism_model", "mounted_model", "port_model", "root_locus", "step_response", "stroke_loss",
 ]  # fmt: skip
 
-FloatArray = npt.NDArray[np.float64]
 
 #: A goal counts as reached if it is missed by less than this share.
 _REACHED = 1e-3

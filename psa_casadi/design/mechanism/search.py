@@ -20,7 +20,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.design.mechanism.force import Loop, force_history
 from psa_casadi.design.mechanism.loop import (
@@ -31,8 +30,7 @@ from psa_casadi.design.mechanism.loop import (
 )
 from psa_casadi.design.mechanism.polynomials import log_square, product, total
 from psa_casadi.interruption import raise_if_stopped
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Parts of w_b at which |X/F| is held above -3 dB, and the cost of a shortfall.
 _PARTS = np.linspace(0.05, 1.0, 20)

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping
 from math import copysign, exp, sqrt
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
+
 Values = Mapping[str, float]
 
 _SHAPES = ("A", "beta", "gamma", "delta", "n", "k_L")

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.design.online.drifting_stack import DriftingStack
 from psa_casadi.design.online.observer import FeedForward, stack_values
@@ -17,8 +16,8 @@ from psa_casadi.design.online.recursive_least_squares import (
     identifier_for,
 )
 from psa_casadi.model.compose import Model
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float]
 Drift = Callable[[float], Values]
 

@@ -11,15 +11,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Expression
 from psa_casadi.design.tracking.dynamics import Dynamics
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import Steps, run
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 NODES = (1.0 / 3.0, 1.0)
 _WEIGHTS = ((5.0 / 12.0, -1.0 / 12.0), (3.0 / 4.0, 1.0 / 4.0))

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
@@ -28,8 +27,7 @@ from psa_casadi.design.tracking.zero_phase import zero_phase_inverse
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.linear_part import LinearPart, linear_part
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 _PARTS = 4  # sub-intervals of a sample for the hysteresis inverse
 _LEAST_SLOPE = 0.05  # of k_L; a stack whose force falls with rising voltage has no inverse

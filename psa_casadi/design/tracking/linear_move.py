@@ -4,15 +4,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.linear_part import slopes_at_rest
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 _SLACK = 1e-7  # sum of the distances from rest, over nominal, that counts as arrived
 _PRECISION = 1e-3  # of the length

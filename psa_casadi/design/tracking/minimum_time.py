@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.dynamics import move_ends
@@ -25,8 +24,7 @@ from psa_casadi.design.tracking.linear_move import LinearMove, Offsets, linear_m
 from psa_casadi.design.tracking.verification import Response, respond
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Intervals of the move, and length of the hold behind it over that of the move.
 INTERVALS, HOLD = 120, 4

@@ -5,15 +5,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Expression
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.collocation import Chain, Interval, chain
 from psa_casadi.errors import PsaError
 from psa_casadi.interruption import raise_if_stopped
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Price of the voltage's second differences over the voltage scale, beside errors over the range.
 PRICE = 1e-2

@@ -9,8 +9,8 @@ from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.verification import Response
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Share of the largest current that a held voltage aims at: the lag's own part needs the rest.

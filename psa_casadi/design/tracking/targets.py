@@ -4,14 +4,11 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.convert import Request
-from psa_casadi.units import parse_unit, to_si
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray, parse_unit, to_si
 
 #: Fewest samples of a path.
 _FEWEST = 10

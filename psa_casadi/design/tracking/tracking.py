@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
@@ -39,8 +38,7 @@ from psa_casadi.design.tracking.verification import (
 )
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Rounding of the kinks at u' = 0, over the largest voltage rate of the inverted model.
 WIDTH = 0.02

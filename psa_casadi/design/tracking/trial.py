@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.dynamics import demand_stack
@@ -14,8 +13,7 @@ from psa_casadi.design.tracking.verification import Response, TrackingError, err
 from psa_casadi.errors import Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Steps of a path that differ by more than this share of their median are not uniform.
 _UNIFORM = 1e-3

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.targets import Target
@@ -12,8 +11,7 @@ from psa_casadi.simulation.linear_part import linear_part
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import run
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Relative tolerance of the simulations that judge a design.
 RTOL = 1e-7

@@ -1,11 +1,9 @@
 """The zero-phase inverse of a stack's linear part."""
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.simulation.linear_part import LinearPart
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Response over that at rest, below which the inverse rolls off.
 ROLL_OFF = 0.03

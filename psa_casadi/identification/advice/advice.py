@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.advice.plans import Plan, plans
@@ -21,8 +20,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: A plan with its information in every scenario (s, k, k), and with what it determines.
 _Option = tuple[Plan, FloatArray]

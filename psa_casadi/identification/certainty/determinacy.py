@@ -4,16 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.records.quality.filtering import convolved
 from psa_casadi.records.quality.noise import autocovariance
 from psa_casadi.records.split import Experiment
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval
-
-FloatArray = npt.NDArray[np.float64]
 
 #: A parameter with a standard error above this, in ordinary changes or ln units, is undetermined.
 DETERMINED_WIDTH = 0.5

@@ -15,8 +15,7 @@ from psa_casadi.identification.fitting.unknowns import (
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 def sizes_of(model: Model, names: Sequence[str]) -> FloatArray:

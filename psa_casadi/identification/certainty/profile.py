@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.certainty.determinacy import covariance_of, weighted_rows
@@ -12,9 +11,7 @@ from psa_casadi.identification.certainty.profile_fits import HeldFits, Point, Pr
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import convert
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray, convert
 
 #: The 95 % quantile of chi-square with one degree of freedom.
 PROFILE_LIMIT = 3.841458820694124

@@ -4,13 +4,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import Fit, objective
 from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
 from psa_casadi.records.split import Experiment
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _EVALUATIONS = 40

@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.further import Further, further_of, scaled
@@ -43,8 +42,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: First voltages that differ by less than this share of the records' range are the same.
 _SAME = 0.01

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.components import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
@@ -19,8 +18,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.ways import Way
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True)

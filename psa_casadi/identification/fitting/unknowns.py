@@ -9,9 +9,8 @@ import numpy.typing as npt
 
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import State, nominal_value
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Standard deviations of the weak priors: in natural logarithms, and in ordinary changes.
 LOG_PRIOR = 3.0

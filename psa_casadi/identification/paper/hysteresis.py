@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from psa_casadi.identification.paper.rates import Rates, rates_of
 from psa_casadi.identification.paper.shapes import Loop
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Samples count in (31), (34) where h and |u'| exceed this share of their largest values.

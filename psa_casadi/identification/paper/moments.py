@@ -4,12 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.paper.shapes import STEADY_SHARE, Step
 from psa_casadi.records.quality.noise import high_frequency_noise
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: The coefficients of eq. (15) in the order in which arrays hold them.
 COEFFICIENTS = ("a_1", "a_2", "a_3", "a_4", "a_5", "b_1")

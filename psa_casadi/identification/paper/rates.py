@@ -10,8 +10,8 @@ import scipy
 
 from psa_casadi.identification.paper.shapes import Loop
 from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 #: Order of the local polynomial, and its shortest window in samples.

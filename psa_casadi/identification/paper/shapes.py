@@ -9,8 +9,7 @@ import scipy
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.record import Record
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: How far the voltage may stray from its two levels, and how long the rise may take of the hold.
 _LEVEL, _RISE = 0.05, 0.05

@@ -25,12 +25,12 @@ from psa_casadi.identification.start.linear_fit import (
 )
 from psa_casadi.identification.start.linear_response import (
     ComplexArray,
-    FloatArray,
     Response,
     contributions,
     vector_fit,
 )
 from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
 
 #: Number of candidates at most, and of poles that vector fitting looks for.
 CANDIDATES, ORDERS = 4, (1, 2, 3, 4, 5)

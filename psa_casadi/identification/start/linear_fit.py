@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, minimise
 from psa_casadi.identification.start.linear_response import (
-    FloatArray,
     first_order,
     mechanics_poles,
     numerator_time,
@@ -27,6 +26,7 @@ from psa_casadi.identification.start.linear_response import (
 from psa_casadi.records.drive import turns
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -35,7 +35,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
+
 ComplexArray = npt.NDArray[np.complex128]
 
 #: Least relative distance of two poles.

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.identification.fitting.prediction import measured
@@ -24,8 +23,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.record import Record
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Loops that take part, samples of each, and how much faster than the slowest they may be.
 _LOOPS, _SAMPLES, _FASTER = 4, 2000, 5.0

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.components import BASE, BOUC_WEN, MEMORY_SPECTRUM
 from psa_casadi.errors import InputError
@@ -33,6 +32,7 @@ from psa_casadi.identification.start.doubts import (
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.records.quality.filtering import filtered
 from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval
 
 #: Forms of the hysteresis by name; `best` is the one that the records prefer.
@@ -63,8 +63,6 @@ def _in_form(model: Model, name: str) -> Model:
     there = {c.name for c in own}
     return model.with_components(c for c in own if set(c.needs) <= there)
 
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Times T that are tried, over the sampling interval, and how often the grid closes in.
 _TIMES, _ROUNDS = np.geomspace(0.1, 200.0, 25), 3

@@ -27,8 +27,7 @@ import numpy.typing as npt
 from psa_casadi.identification.start.linear_response import orthonormal, plays
 from psa_casadi.records.quality.filtering import filtered
 from psa_casadi.records.record import Record
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Beats that a record may hold; phases that are tried, and how much finer than 1/T the rates.
 FEWEST, MOST = 2.0, 24.0
