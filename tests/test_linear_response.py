@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from psa_casadi.identification.start.linear import arrangements
 from psa_casadi.identification.start.linear_response import (
     Response,
     mechanics_poles,
@@ -14,6 +13,7 @@ from psa_casadi.identification.start.linear_response import (
     transfer,
     vector_fit,
 )
+from psa_casadi.identification.start.starting_points import arrangements
 
 
 def test_the_response_is_exact_between_samples() -> None:

@@ -9,9 +9,9 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.start.linear import LinearStart, linear_start
 from psa_casadi.identification.start.linear_response import transfer
 from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.start.starting_points import LinearStart, linear_start
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record

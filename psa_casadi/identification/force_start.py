@@ -26,7 +26,6 @@ from psa_casadi.identification.refitting import (
     refit,
     residual_noise,
 )
-from psa_casadi.identification.start.linear import arrangements, different
 from psa_casadi.identification.start.linear_fit import (
     Excerpt,
     LinearFit,
@@ -35,6 +34,7 @@ from psa_casadi.identification.start.linear_fit import (
     fit_linear,
 )
 from psa_casadi.identification.start.linear_response import Response, contributions, vector_fit
+from psa_casadi.identification.start.starting_points import arrangements, different
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.simulate import record_inputs, simulate_record

@@ -25,13 +25,13 @@ from psa_casadi.identification.start.doubts import (
     refuse_still,
     refuse_wrapped,
 )
-from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import (
     Hysteresis,
     capacitance_of,
     chosen_start,
     forms_of,
 )
+from psa_casadi.identification.start.starting_points import linear_start
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence

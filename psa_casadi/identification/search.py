@@ -34,9 +34,12 @@ from psa_casadi.identification.refitting import (
     with_fast,
     without_blur,
 )
-from psa_casadi.identification.start.linear import LinearCandidate
 from psa_casadi.identification.start.ordinary import FORMS
-from psa_casadi.identification.start.starting_points import resolved, starting_points
+from psa_casadi.identification.start.starting_points import (
+    LinearCandidate,
+    resolved,
+    starting_points,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.record import Record

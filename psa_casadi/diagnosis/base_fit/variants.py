@@ -13,9 +13,8 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.refitting import Progress, quick_from, refit, without_blur
 from psa_casadi.identification.search import search
-from psa_casadi.identification.start.linear import linear_start
 from psa_casadi.identification.start.ordinary import ordinary_values
-from psa_casadi.identification.start.starting_points import resolved
+from psa_casadi.identification.start.starting_points import linear_start, resolved
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage
