@@ -9,7 +9,7 @@ import numpy as np
 
 from psa_casadi.diagnosis.evidence import diagnosis_evidence
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model

@@ -10,7 +10,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured

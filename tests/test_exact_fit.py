@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.identification.certainty.determinacy import covariance_of
+from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured, simulated
 from psa_casadi.identification.search import free_parameters

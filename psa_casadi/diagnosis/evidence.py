@@ -10,7 +10,7 @@ from psa_casadi.diagnosis.budget import Budget
 from psa_casadi.diagnosis.held_out.errors import errors_of, held_out_parts
 from psa_casadi.diagnosis.held_out.parts import jackknife
 from psa_casadi.diagnosis.held_out.shares import Share
-from psa_casadi.identification.certainty.determinacy import Determinacy
+from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.evidence import ErrorBudget, ErrorShare, Evidence, HeldOut

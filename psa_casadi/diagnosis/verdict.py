@@ -49,7 +49,7 @@ from psa_casadi.diagnosis.task import same_curves
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.diagnosis.weighing import Balance
 from psa_casadi.errors import InputError
-from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
+from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psa_casadi.identification.certainty.determinacy import Determinacy
+from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import OUTPUT, measured, record_start
 from psa_casadi.model.compose import Model

@@ -8,7 +8,7 @@ import numpy as np
 
 from psa_casadi.identification.advice.advice import Advice, advice
 from psa_casadi.identification.certainty.combinations import Combination, free_combinations
-from psa_casadi.identification.certainty.determinacy import Determinacy, assumed_ratio, determinacy
+from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels

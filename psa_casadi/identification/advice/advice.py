@@ -8,8 +8,9 @@ import numpy as np
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.advice.plans import Plan, plans
 from psa_casadi.identification.advice.scenarios import SEARCHABLE, scenarios
-from psa_casadi.identification.certainty.determinacy import DETERMINED_WIDTH, Determinacy
-from psa_casadi.identification.certainty.information import (
+from psa_casadi.identification.determinacy import (
+    DETERMINED_WIDTH,
+    Determinacy,
     prior_information,
     record_information,
     sizes_of,

@@ -6,8 +6,8 @@ from math import nan
 
 import numpy as np
 
-from psa_casadi.identification.certainty.determinacy import Determinacy
 from psa_casadi.identification.certainty.formulas import Formula, monomials, physical_formulas
+from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.model.compose import Model
 
 #: A combination is known if its relative standard error is below this ...

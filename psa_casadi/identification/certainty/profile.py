@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from psa_casadi.errors import InputError
-from psa_casadi.identification.certainty.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.certainty.profile_fits import HeldFits, Point, Progress
+from psa_casadi.identification.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.identify import Identification, with_provenance
 from psa_casadi.identification.paper.conditions import loop_conditions, missing

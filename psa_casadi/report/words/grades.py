@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from psa_casadi.identification.certainty.determinacy import DETERMINED_WIDTH
+from psa_casadi.identification.determinacy import DETERMINED_WIDTH
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 
