@@ -10,14 +10,9 @@ from scipy.signal import lfilter
 
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.certainty.profile import (
-    PROFILE_LIMIT,
-    Profile,
-    profile,
-    profile_sentences,
-)
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.profile import PROFILE_LIMIT, Profile, profile, profile_sentences
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid

@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from psa_casadi.identification.certainty.profile import Profile
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.profile import Profile
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.grades import Degree, grade
 from psa_casadi.version import __version__

@@ -7,8 +7,8 @@ import numpy as np
 
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.files import atomic_write
-from psa_casadi.identification.certainty.profile import Profile, profile_sentences
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.profile import Profile, profile_sentences
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import LiveModel, add_live, live_fit
 from psa_casadi.report.page.own_model_page import write_own_fit_report

@@ -3,7 +3,7 @@
 import numpy as np
 import plotly.graph_objects as go
 
-from psa_casadi.identification.certainty.profile import PROFILE_LIMIT, Profile
+from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.report.plots.theme import INK, Plot, logarithmic, styled
 from psa_casadi.report.words.series import EXTENDED_COLOUR, HELD_OUT_COLOUR, NOISE_COLOUR
 from psa_casadi.units import convert
