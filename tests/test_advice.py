@@ -2,9 +2,14 @@
 
 import pytest
 
-from psa_casadi.identification.advice.advice import FORCE_ADVICE, Advice, advice
-from psa_casadi.identification.advice.plans import plans, quantity
-from psa_casadi.identification.advice.scenarios import scenarios
+from psa_casadi.identification.advice import (
+    FORCE_ADVICE,
+    Advice,
+    advice,
+    plans,
+    quantity,
+    scenarios,
+)
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.records import Record

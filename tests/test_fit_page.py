@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.identification.advice.advice import Advice
+from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import fit_page, write_fit_report

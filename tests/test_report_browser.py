@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from psa_casadi.identification.advice.advice import Advice
+from psa_casadi.identification.advice import Advice
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.fit_page import write_fit_report
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone

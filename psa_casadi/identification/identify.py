@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.identification.advice.advice import Advice, advice
+from psa_casadi.identification.advice import Advice, advice
 from psa_casadi.identification.combinations import Combination, free_combinations
 from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.evidence import evidence_of
