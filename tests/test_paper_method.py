@@ -9,17 +9,18 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.identification.paper.factors import mechanics_of
 from psa_casadi.identification.paper.hysteresis import hysteresis_part
-from psa_casadi.identification.paper.method import identify_by_paper, paper_method
-from psa_casadi.identification.paper.moments import (
+from psa_casadi.identification.paper.linear import (
     COEFFICIENTS,
     coefficients_of_limits,
     coefficients_of_values,
+    find_loops,
+    find_steps,
     linear_part,
+    mechanics_of,
     moment_coefficients,
 )
-from psa_casadi.identification.paper.shapes import find_loops, find_steps
+from psa_casadi.identification.paper.method import identify_by_paper, paper_method
 from psa_casadi.model.model_file import load_model
 from psa_casadi.records import (
     Record,

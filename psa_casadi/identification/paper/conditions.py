@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psa_casadi.identification.paper.moments import LinearPart
-from psa_casadi.identification.paper.shapes import Loop, Step
+from psa_casadi.identification.paper.linear import LinearPart, Loop, Step
 
 #: The paper's loops are slower than this [Hz], and their lag should stay below this angle [rad].
 _SLOW, _QUASI_STATIC = 1.0, 0.01

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.paper.factors import mechanics_of
 from psa_casadi.identification.paper.hysteresis import HysteresisPart
+from psa_casadi.identification.paper.linear import mechanics_of
 from psa_casadi.model.compose import Model
 
 

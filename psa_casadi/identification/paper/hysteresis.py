@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.identification.paper.linear import Loop
 from psa_casadi.identification.paper.rates import Rates, rates_of
-from psa_casadi.identification.paper.shapes import Loop
 from psa_casadi.units import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]

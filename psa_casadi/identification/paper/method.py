@@ -17,8 +17,7 @@ from psa_casadi.identification.identify import Identification, with_provenance
 from psa_casadi.identification.paper.conditions import loop_conditions, missing
 from psa_casadi.identification.paper.forces import in_forces
 from psa_casadi.identification.paper.hysteresis import Bends, HysteresisPart, hysteresis_part
-from psa_casadi.identification.paper.moments import linear_part
-from psa_casadi.identification.paper.shapes import Loop, find_loops, find_steps
+from psa_casadi.identification.paper.linear import Loop, find_loops, find_steps, linear_part
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model

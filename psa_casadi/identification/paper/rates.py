@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.identification.paper.shapes import Loop
+from psa_casadi.identification.paper.linear import Loop
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.units import FloatArray
 
