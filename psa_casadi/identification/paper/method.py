@@ -13,16 +13,173 @@ import numpy as np
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.identify import Identification, with_provenance
-from psa_casadi.identification.paper.conditions import loop_conditions, missing
-from psa_casadi.identification.paper.forces import in_forces
 from psa_casadi.identification.paper.hysteresis import Bends, HysteresisPart, hysteresis_part
-from psa_casadi.identification.paper.linear import Loop, find_loops, find_steps, linear_part
+from psa_casadi.identification.paper.linear import (
+    LinearPart,
+    Loop,
+    Step,
+    find_loops,
+    find_steps,
+    linear_part,
+    mechanics_of,
+)
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
+
+#: The paper's loops are slower than this [Hz], and their lag should stay below this angle [rad].
+_SLOW, _QUASI_STATIC = 1.0, 0.01
+
+
+def missing(step: Step | None, loops: Sequence[Loop]) -> list[str]:
+    """Say what the records lack."""
+    sentences = []
+    if step is None:
+        rest = (
+            " k is taken from the slope of the largest loop near its tip, which is not the paper's."
+            if loops
+            else ""
+        )
+        sentences.append(
+            "No record is a step (a jump of the voltage that is then held), so the linear part"
+            " cannot be found by this method: the lag, masses and dampings keep ordinary values."
+            f"{rest} Give the response to a step as a record."
+        )
+    if not loops:
+        sentences.append(
+            "No record is a loop (a voltage that goes up and down at even intervals), so A, delta,"
+            " n, beta and gamma cannot be found by this method: the model has no loop (f_H = 0)."
+            " Give two periods of a slow sine or triangle from rest at 0 V."
+        )
+    return sentences
+
+
+def loop_conditions(loops: Sequence[Loop], linear: LinearPart | None) -> list[str]:
+    """Say where the loops are too fast, do not begin at 0 V, or have gaps."""
+    if not loops:
+        return []
+    sentences, frequency = [], loops[0].frequency
+    if frequency > 1.001 * _SLOW:
+        sentences.append(
+            f"The slowest loops have {frequency:.3g} Hz; the paper asks for less than 1 Hz, so that"
+            " mechanics and lag do not widen the loop. Give slower loops."
+        )
+    if linear is not None:
+        delay = linear.coefficients["a_1"] - linear.coefficients["b_1"]
+        angle = 2.0 * np.pi * frequency * delay
+        if angle > _QUASI_STATIC:
+            sentences.append(
+                f"The step lags by {1e3 * delay:.3g} ms, {angle:.2g} rad of"
+                f" the loops at {frequency:.3g} Hz, which the method counts as hysteresis: A,"
+                " delta, n, beta and gamma are off. Give slower loops."
+            )
+    away = [
+        loop.name for loop in loops if abs(loop.first_volts) > 0.02 * float(np.ptp(loop.voltage))
+    ]
+    if away:
+        sentences.append(
+            f"{_names(away)} do not begin at 0 V, though the method needs h = 0 at the start; their"
+            " first sample is taken for rest. Give loops from rest at 0 V."
+        )
+    gaps = [f"{loop.name} ({loop.missing})" for loop in loops if loop.missing]
+    if gaps:
+        sentences.append(
+            f"Missing samples were bridged by straight lines in {_names(gaps)}; derivatives there"
+            " are not measured."
+        )
+    return sentences
+
+
+def _names(names: Sequence[str]) -> str:
+    return ", ".join(f"'{n}'" for n in names)
+
+
+@dataclass(frozen=True, eq=False)
+class Translated:
+    """The model, the names of its parameters that were found, and what could not be taken over."""
+
+    model: Model
+    found: tuple[str, ...]
+    sentences: tuple[str, ...]
+
+
+def in_forces(
+    start: Model,
+    k: float | None,
+    coefficients: Mapping[str, float] | None,
+    bend: HysteresisPart,
+) -> Translated:
+    """Return `start` with everything that was found, k_P and k_B being those of `start`.
+
+    k_L = k/C with C = 1/k_P + 1/k_B [m/N]; lag, masses and dampings are factors of the denominator.
+    Without a loop f_H is 0; without factors the parts are damped critically, c >= 2 sqrt(k m),
+    since nothing is known to ring. A value out of its bounds is refused, n is clipped.
+    """
+    compliance = static_compliance(start.values)
+    usual = _still(start)
+    motion: dict[str, float] = {}
+    sentences: tuple[str, ...] = ()
+    if coefficients is not None:
+        motion, sentences = mechanics_of(coefficients, start.values["k_P"], start.values["k_B"])
+    wanted = {**motion, **_loop(bend, compliance, start.values["h_ref"])}
+    if k is not None:
+        wanted["k_L"] = k / compliance
+    kept, refused = _inside(usual, wanted)
+    return Translated(
+        model=usual.with_values(kept),
+        found=tuple(name for name in start.parameter_names if name in kept),
+        sentences=(*sentences, *refused),
+    )
+
+
+def _still(start: Model) -> Model:
+    """Return the model without a loop and with both parts damped critically at least."""
+    p = start.values
+    critical = {f"c_{q}": 2.0 * float(np.sqrt(p[f"k_{q}"] * p[f"m_{q}"])) for q in "PB"}
+    loop = dict.fromkeys(("A", "beta", "gamma", "delta"), 0.0)
+    return start.with_values({**loop, **{c: max(v, p[c]) for c, v in critical.items()}})
+
+
+def _loop(bend: HysteresisPart, compliance: float, h_ref: float) -> dict[str, float]:
+    """Return the loop in forces, {} where it is not complete.
+
+    h = C f_H gives A/C and delta/C. As eq. (8) is in r = |f_H|/h_ref here, beta becomes
+    beta C^(n-1) h_ref^n, and gamma likewise.
+    """
+    if bend.A is None or bend.delta is None or bend.bends is None:
+        return {}
+    n = bend.bends.n
+    unit = compliance ** (n - 1.0) * h_ref**n
+    return {
+        "A": bend.A / compliance,
+        "delta": bend.delta / compliance,
+        "n": n,
+        "beta": bend.bends.beta * unit,
+        "gamma": bend.bends.gamma * unit,
+    }
+
+
+def _inside(model: Model, wanted: Mapping[str, float]) -> tuple[dict[str, float], list[str]]:
+    """Return the values that the parameters' bounds allow, and a sentence for each other one."""
+    kept, refused = {}, []
+    for name, value in wanted.items():
+        p = model.parameter(name)
+        low, high = p.bounds
+        within = low <= value <= high
+        if within or (name == "n" and np.isfinite(value)):
+            kept[name] = float(np.clip(value, low, high))
+        if not within:
+            instead = kept.get(name, model.values[name])
+            refused.append(
+                f"{name} = {value:.3g} {p.unit} is outside of its range, {low:g} to {high:g};"
+                f" {instead:.3g} stands in the model, and the rest does not belong to it."
+            )
+    return kept, refused
+
 
 #: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
 _TIP = (0.8, 0.97)
