@@ -14,9 +14,7 @@ import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.posterior import packages
 from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.density import Block, Density
-from psa_casadi.posterior.task import Task, task_of
-from psa_casadi.posterior.within import Within
+from psa_casadi.posterior.task import Block, Density, Task, Within, task_of
 from psa_casadi.report.documents.schemas import schema_texts
 from tests.stack_models import stack
 

@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Effort, accurate_minimum, objective
 from psa_casadi.identification.fitting.further import further_of
-from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum
+from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Evaluate, Minimum
 from psa_casadi.identification.fitting.prediction import measured, motions_of
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
@@ -17,14 +18,121 @@ from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
-from psa_casadi.posterior.density import Block, Density
-from psa_casadi.posterior.within import Within
 from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level, whole
 from psa_casadi.simulation.ways import Way
 from psa_casadi.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Within:
+    """theta within `low` and `high` (size,) as a function of z on the whole line, one by one.
+
+    Between two bounds theta = low + (high - low) / (1 + exp(-z)), beyond one alone theta = low +
+    exp(z) or high - exp(z), elsewhere theta = z.
+    """
+
+    low: FloatArray
+    high: FloatArray
+
+    @property
+    def bounded(self) -> npt.NDArray[np.bool_]:
+        """Which coordinates have a bound (size,)."""
+        return np.isfinite(self.low) | np.isfinite(self.high)
+
+    def z(self, theta: FloatArray) -> FloatArray:
+        """Return z (size,) of a theta strictly within the bounds."""
+        below, above = np.isfinite(self.low), np.isfinite(self.high)
+        from_low, to_high = theta - self.low, self.high - theta
+        with np.errstate(all="ignore"):  # of the branches that are not taken
+            return np.where(
+                below & above,
+                np.log(from_low) - np.log(to_high),
+                np.where(below, np.log(from_low), np.where(above, np.log(to_high), theta)),
+            )
+
+    def theta(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return theta, d theta / d z and d ln |d theta / d z| / d z, each (size,)."""
+        below, above = np.isfinite(self.low), np.isfinite(self.high)
+        share = 0.5 * (1.0 + np.tanh(0.5 * z))
+        with np.errstate(over="ignore", invalid="ignore"):
+            size, grown = self.high - self.low, np.exp(z)
+            both, one = below & above, below ^ above
+            theta = np.where(both, self.low + size * share, z)
+            theta = np.where(one & below, self.low + grown, theta)
+            theta = np.where(one & above, self.high - grown, theta)
+            slope = np.where(both, size * share * (1.0 - share), 1.0)
+            slope = np.where(one, np.where(below, grown, -grown), slope)
+        bend = np.where(both, 1.0 - 2.0 * share, np.where(one, 1.0, 0.0))
+        return theta, slope, bend
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """The weighted residuals `rows` of one record, whose noise level is unknown.
+
+    `count` is how many independent samples they are worth: fewer than rows where they are coloured.
+    """
+
+    rows: slice
+    count: float
+
+
+@dataclass(frozen=True, eq=False)
+class Density:
+    """ln p(u | records), up to a constant, with its gradient, in whitened coordinates u.
+
+    ln p = -sum_b (m_b / 2) ln |r_b|^2 - |r_p|^2 / 2 + ln |d theta / d z|, with the weighted
+    residuals r_b of every block and m_b the samples that they are worth: each record's noise level
+    has Jeffreys' prior 1 / sigma and is integrated out. r_p are the rows outside the blocks: weak
+    priors and further columns, whose levels are known. theta lies within its bounds (`Within`), and
+    z = z_0 + L u, with the factor L of the covariance at the fit, so that u has nearly the
+    covariance 1. The gradient is that of J^T r, with the sensitivities' exact Jacobian.
+    """
+
+    evaluate: Evaluate
+    blocks: tuple[Block, ...]
+    within: Within
+    centre: FloatArray
+    factor: FloatArray
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.centre)
+
+    def theta(self, u: FloatArray) -> FloatArray:
+        """Return the fit's coordinates (size,) at u."""
+        return self.within.theta(self.centre + self.factor @ u)[0]
+
+    def __call__(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """Return ln p and its gradient (size,) at u; -inf where the model cannot be simulated."""
+        z = self.centre + self.factor @ u
+        theta, slope, bend = self.within.theta(z)
+        with np.errstate(all="ignore"):
+            found = self.evaluate(theta) if np.isfinite(theta).all() else None
+            value, by_theta = (-np.inf, np.zeros_like(u)) if found is None else self._sum(*found)
+            value += float(np.sum(np.log(np.abs(slope))))
+            gradient = self.factor.T @ (by_theta * slope + bend)
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            return -np.inf, np.zeros_like(u)
+        return value, gradient
+
+    def _sum(self, residual: FloatArray, jacobian: FloatArray) -> tuple[float, FloatArray]:
+        rest = np.ones(len(residual), dtype=bool)
+        value, pull = 0.0, np.zeros_like(residual)
+        for block in self.blocks:
+            own = residual[block.rows]
+            power = float(own @ own)
+            value -= 0.5 * block.count * float(np.log(power))
+            pull[block.rows] = own * (block.count / power)
+            rest[block.rows] = False
+        pull[rest] = residual[rest]
+        value -= 0.5 * float(residual[rest] @ residual[rest])
+        return value, -(jacobian.T @ pull)
+
 
 _EVALUATIONS, _TOLERANCE, _ROUNDS = 60, 1e-6, 2
 #: A start nearer to a bound than this share of a standard deviation is moved inwards.

@@ -136,7 +136,7 @@ def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
 
 
 def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
-    """Return `psa_casadi.posterior.density`'s ln p of theta, with PyMC's solution.
+    """Return `psa_casadi.posterior.task`'s ln p of theta, with PyMC's solution.
 
     x = C (k_L u + f_H) + x_0 at rest of the mechanics, with C = 1/k_P + 1/k_B; f_H by its equation.
     """
