@@ -8,7 +8,7 @@ import numpy as np
 
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model
-from psa_casadi.posterior.packages import sampler_and_arviz
+from psa_casadi.posterior.chains import sampler_and_arviz
 from psa_casadi.posterior.task import Task
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.shown import Shown, frame

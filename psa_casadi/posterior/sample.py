@@ -7,12 +7,15 @@ import numpy as np
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
-from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.packages import sampler_and_arviz
-from psa_casadi.posterior.predictive import predictive, prior_draws
+from psa_casadi.posterior.chains import (
+    chains_of,
+    data_tree,
+    predictive,
+    prior_draws,
+    sampler_and_arviz,
+)
 from psa_casadi.posterior.result import Posterior, figures_of, warnings_of
 from psa_casadi.posterior.task import task_of
-from psa_casadi.posterior.tree import data_tree
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.side_by_side import one_thread

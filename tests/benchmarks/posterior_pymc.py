@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 import psa_casadi as psa
-from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.packages import sampler_and_arviz
+from psa_casadi.posterior.chains import chains_of, sampler_and_arviz
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
