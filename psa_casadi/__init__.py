@@ -66,8 +66,7 @@ if TYPE_CHECKING:
     from psa_casadi.model.system.nanopositioner import nanopositioner
     from psa_casadi.model.system.system import System, connect
     from psa_casadi.model.system.tuning import controller_for, margins_of
-    from psa_casadi.posterior.result import Posterior
-    from psa_casadi.posterior.sample import sample
+    from psa_casadi.posterior.sample import Posterior, sample
     from psa_casadi.records import (
         Record,
         read_record,
@@ -182,7 +181,7 @@ _HOMES = {
     "psa_casadi.any_model.result": ("OdeDiagnosis",),
     "psa_casadi.identification.identify": ("Identification",),
     "psa_casadi.posterior.sample": ("sample",),
-    "psa_casadi.posterior.result": ("Posterior",),
+    "psa_casadi.posterior.sample": ("Posterior",),
     "psa_casadi.diagnosis.verdict": ("patched_model",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),
     "psa_casadi.report.words.text": ("story",),

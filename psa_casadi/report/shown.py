@@ -15,7 +15,7 @@ from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
-from psa_casadi.posterior.result import Posterior
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.record import Record
 from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
 from psa_casadi.report.documents.own_model_file import OwnModelFile

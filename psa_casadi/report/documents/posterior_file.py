@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from psa_casadi.posterior.result import Figures, Posterior
+from psa_casadi.posterior.sample import Figures, Posterior
 from psa_casadi.version import __version__
 
 FORMAT: Literal["psa_casadi.posterior/1"] = "psa_casadi.posterior/1"

@@ -12,7 +12,7 @@ from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import Identification
-from psa_casadi.posterior.result import Posterior
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.record import Record
 from psa_casadi.report.plots.figure import draw_residual, draw_time, style
 from psa_casadi.report.plots.posterior_figure import draw_parameter

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.posterior.chains import columns_of_records
-from psa_casadi.posterior.result import HDI, Figures, Posterior
+from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.report.plots.figure import DPI, FONT, SIZE_INCHES, style
 from psa_casadi.report.words.phrases import length_scale, number, shown_in
 from psa_casadi.report.words.series import (

@@ -1,6 +1,6 @@
 """A posterior in words and a table, for the terminal and a notebook."""
 
-from psa_casadi.posterior.result import Posterior
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.report.words.phrases import number, shown_in
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.text import labelled, records_text
