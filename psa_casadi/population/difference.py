@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from psa_casadi.population.finding import Finding
-from psa_casadi.population.mixed_regression import mixed_regression
 from psa_casadi.population.parameters import Estimates, estimates, names_of
-from psa_casadi.population.several_tests import LIMIT, adjusted
+from psa_casadi.population.statistics import LIMIT, adjusted, mixed_regression
 
 
 @dataclass(frozen=True, eq=False)

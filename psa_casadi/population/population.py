@@ -9,11 +9,21 @@ import scipy
 
 from psa_casadi.errors import InputError
 from psa_casadi.population.finding import Finding
-from psa_casadi.population.groups import BatchTest, Drift, batch_test, drift
-from psa_casadi.population.mixed_regression import MixedFit, mixed_regression
-from psa_casadi.population.outliers import FEWEST, Outliers, outliers
 from psa_casadi.population.parameters import Estimates, estimates, names_of
-from psa_casadi.population.several_tests import LIMIT, Adjustment, adjusted
+from psa_casadi.population.statistics import (
+    FEWEST,
+    LIMIT,
+    Adjustment,
+    BatchTest,
+    Drift,
+    MixedFit,
+    Outliers,
+    adjusted,
+    batch_test,
+    drift,
+    mixed_regression,
+    outliers,
+)
 
 #: Days in a year, the unit of time of drifts.
 YEAR = 365.25

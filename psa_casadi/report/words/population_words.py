@@ -4,11 +4,9 @@ import math
 from collections.abc import Sequence
 
 from psa_casadi.population.finding import NORMAL_95
-from psa_casadi.population.groups import Batch
-from psa_casadi.population.mixed_regression import MixedFit
-from psa_casadi.population.outliers import FEWEST
 from psa_casadi.population.parameters import Estimates, display_unit
 from psa_casadi.population.population import Frequency, Outlier, Population, Spread
+from psa_casadi.population.statistics import FEWEST, Batch, MixedFit
 from psa_casadi.report.words.phrases import listing, number, percent, plain, with_unit
 from psa_casadi.report.words.tables import Table
 from psa_casadi.units import convert
