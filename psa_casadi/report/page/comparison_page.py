@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
-from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import Finding
+from psa_casadi.population.population import Difference, differences
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.device_plots import budget_plot, difference_plot, error_plots

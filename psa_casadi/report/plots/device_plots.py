@@ -8,10 +8,8 @@ import numpy as np
 import plotly.graph_objects as go
 
 from psa_casadi.characters import plain as carried
-from psa_casadi.population.difference import Difference
 from psa_casadi.population.finding import NORMAL_95, Finding, Trace
-from psa_casadi.population.parameters import display_unit
-from psa_casadi.population.population import Population, Spread
+from psa_casadi.population.population import Difference, Population, Spread, display_unit
 from psa_casadi.population.statistics import mixed_regression
 from psa_casadi.report.plots.theme import BOUND_COLOUR, GRID, INK, WEAK_COLOUR, Plot, styled
 from psa_casadi.report.words.phrases import handy_scale, length_scale, plain

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 from psa_casadi.diagnosis.held_out.shares import Share
-from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import BudgetShare, Finding
-from psa_casadi.population.parameters import Estimates, display_unit
+from psa_casadi.population.population import Difference, Estimates, differences, display_unit
 from psa_casadi.report.words.phrases import (
     Scale,
     either,

@@ -4,8 +4,14 @@ import math
 from collections.abc import Sequence
 
 from psa_casadi.population.finding import NORMAL_95
-from psa_casadi.population.parameters import Estimates, display_unit
-from psa_casadi.population.population import Frequency, Outlier, Population, Spread
+from psa_casadi.population.population import (
+    Estimates,
+    Frequency,
+    Outlier,
+    Population,
+    Spread,
+    display_unit,
+)
 from psa_casadi.population.statistics import FEWEST, Batch, MixedFit
 from psa_casadi.report.words.phrases import listing, number, percent, plain, with_unit
 from psa_casadi.report.words.tables import Table
