@@ -19,8 +19,8 @@ from psa_casadi.population.finding import (
     Found,
     HeldOutErrors,
     NamedCause,
+    replayed,
 )
-from psa_casadi.population.replay import replayed
 from psa_casadi.report.documents.device_file import FORMAT as DEVICE
 from psa_casadi.report.documents.device_file import DeviceFile, damage
 from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
