@@ -43,8 +43,7 @@ if TYPE_CHECKING:
         identifier_for,
     )
     from psa_casadi.devices.batch import BatchRun, batch
-    from psa_casadi.devices.jobs import Job
-    from psa_casadi.devices.task import Options
+    from psa_casadi.devices.jobs import Job, Options
     from psa_casadi.diagnosis.result import Diagnosis
     from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
@@ -189,7 +188,7 @@ _HOMES = {
     "psa_casadi.report.page.diagnosis": ("write_report",),
     "psa_casadi.devices.batch": ("BatchRun", "batch"),
     "psa_casadi.devices.jobs": ("Job",),
-    "psa_casadi.devices.task": ("Options",),
+    "psa_casadi.devices.jobs": ("Options",),
     "psa_casadi.report.documents.findings": ("read_findings",),
     "psa_casadi.report.documents.load_diagnosis": ("load_diagnosis",),
     "psa_casadi.report.page.comparison_page": ("write_comparison",),

@@ -23,10 +23,9 @@ from typer.testing import CliRunner
 from psa_casadi.cli.app import app
 from psa_casadi.devices import dask_client, device
 from psa_casadi.devices.batch import batch
-from psa_casadi.devices.jobs import Job, jobs_given
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options, jobs_given, key_of
 from psa_casadi.devices.processes import Processes
 from psa_casadi.devices.submission import outcomes
-from psa_casadi.devices.task import DeviceOutcome, DeviceTask, Options, key_of
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.model.model_file import load_model

@@ -9,13 +9,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from psa_casadi.devices.jobs import Job, Jobs, jobs_given
+from psa_casadi.devices.jobs import DeviceTask, Job, Jobs, Options, jobs_given, key_of
 from psa_casadi.devices.processes import Processes
 from psa_casadi.devices.ready import make_ready
 from psa_casadi.devices.results import Results
 from psa_casadi.devices.submission import Executor, outcomes
 from psa_casadi.devices.summary import write_summary
-from psa_casadi.devices.task import DeviceTask, Options, key_of
 from psa_casadi.errors import InputError
 from psa_casadi.identification.refitting import Progress
 from psa_casadi.interruption import interruptible_work

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from psa_casadi.component import Component
-from psa_casadi.devices.task import DeviceOutcome, DeviceTask
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.identify import identify

@@ -15,7 +15,7 @@ from typing import BinaryIO, cast
 
 from psa_casadi.children import Child, close_pipes, kill, started_python
 from psa_casadi.devices.device import work_on
-from psa_casadi.devices.task import DeviceOutcome, DeviceTask
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask
 from psa_casadi.devices.worker import receive, send
 from psa_casadi.errors import MachineError
 from psa_casadi.simulation.side_by_side import VARIABLE

@@ -2,8 +2,7 @@
 
 from contextlib import suppress
 
-from psa_casadi.devices.jobs import Job
-from psa_casadi.devices.task import Options
+from psa_casadi.devices.jobs import Job, Options
 from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.own_effects import known_effects, own_effects

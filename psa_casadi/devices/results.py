@@ -14,8 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from psa_casadi.component import Component
-from psa_casadi.devices.jobs import Job
-from psa_casadi.devices.task import DeviceOutcome, Options
+from psa_casadi.devices.jobs import DeviceOutcome, Job, Options
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.population.finding import Finding

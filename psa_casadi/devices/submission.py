@@ -12,7 +12,7 @@ from concurrent.futures import BrokenExecutor, CancelledError
 from typing import Any, Protocol
 
 from psa_casadi.devices.device import stop, work_on
-from psa_casadi.devices.task import DeviceOutcome, DeviceTask
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask
 from psa_casadi.errors import MachineError
 from psa_casadi.interruption import raise_if_stopped
 
