@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from psa_casadi.devices.device import make_ready
 from psa_casadi.devices.jobs import DeviceTask, Job, Jobs, Options, jobs_given, key_of
 from psa_casadi.devices.processes import Processes
-from psa_casadi.devices.ready import make_ready
 from psa_casadi.devices.results import Results
 from psa_casadi.devices.submission import Executor, outcomes
 from psa_casadi.devices.summary import write_summary

@@ -3,13 +3,14 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from psa_casadi.component import Component
-from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.errors import InputError, MachineError, PsaError
 from psa_casadi.identification.identify import identify
+from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.interruption import Work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, loads
@@ -17,6 +18,7 @@ from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.records import Record, read_records
 from psa_casadi.report.documents.device_file import Status
 from psa_casadi.report.documents.identification_file import identification_file
+from psa_casadi.simulation.ahead import compiled
 from psa_casadi.simulation.side_by_side import one_thread
 from psa_casadi.strict_json import json_text
 
@@ -132,3 +134,19 @@ def _diagnosed(
         records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis, effects=table
     )
     return DIAGNOSIS, found.to_json(), found.model
+
+
+def make_ready(job: Job, options: Options) -> None:
+    """Compile what the first device will need; what fails is told by the device's own work.
+
+    They lie in the cache of the user, where every process on this machine finds them.
+    """
+    with suppress(PsaError, MachineError):
+        records = read_records(job.files, columns=options.columns, sample_time=options.sample_time)
+        start = starting_model(records, options.stiffness)
+        models = [start]
+        if options.work == "diagnose":
+            own = [c for module in options.modules for c in own_effects(module).values()]
+            table = known_effects(own).values()
+            models += [start.with_effect(e) for e in table if not e.needs_column]
+        compiled(models)
