@@ -21,11 +21,10 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
-from psa_casadi.devices import dask_client, device
+from psa_casadi.devices import device, executors
 from psa_casadi.devices.batch import batch
+from psa_casadi.devices.executors import Processes, outcomes
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options, jobs_given, key_of
-from psa_casadi.devices.processes import Processes
-from psa_casadi.devices.submission import outcomes
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.model.model_file import load_model
@@ -366,9 +365,9 @@ def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
         raise ImportError(name)
 
-    monkeypatch.setattr(dask_client, "import_module", missing)
+    monkeypatch.setattr(executors, "import_module", missing)
     with pytest.raises(InputError, match=r"pip install 'psa-casadi\[dask\]'"):
-        dask_client.dask_client("local").__enter__()
+        executors.dask_client("local").__enter__()
 
 
 @slow
@@ -399,7 +398,7 @@ def test_processes_of_the_standard_library_do_it_too(records: Path, tmp_path: Pa
 @slow
 def test_a_cluster_of_dask_does_it_too(records: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    with dask_client.dask_client("local", 2) as client:
+    with executors.dask_client("local", 2) as client:
         found = batch(records, tmp_path / "out", executor=client)
     assert found.counts == {"done": 2, "refused": 1}
     assert load_model(tmp_path / "out" / "first" / "model.json").provenance.free

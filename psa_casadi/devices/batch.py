@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from psa_casadi.devices.device import make_ready
+from psa_casadi.devices.executors import Executor, Processes, outcomes
 from psa_casadi.devices.jobs import DeviceTask, Job, Jobs, Options, jobs_given, key_of
-from psa_casadi.devices.processes import Processes
 from psa_casadi.devices.results import Results
-from psa_casadi.devices.submission import Executor, outcomes
 from psa_casadi.devices.summary import write_summary
 from psa_casadi.errors import InputError
 from psa_casadi.identification.refitting import Progress

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from psa_casadi.devices.batch import BatchRun, batch
-from psa_casadi.devices.dask_client import LOCAL, dask_client
+from psa_casadi.devices.executors import LOCAL, dask_client
 from tests.benchmarks.outcome import Progress
 
 
