@@ -7,7 +7,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from psa_casadi import reference
-from psa_casadi.design.experiment.candidates import KINDS, Kind, draw, rest_of
 from psa_casadi.design.experiment.chances import naming_probability, plays_of
 from psa_casadi.design.experiment.criterion import Criterion, Point
 from psa_casadi.design.experiment.experiment import (
@@ -17,7 +16,7 @@ from psa_casadi.design.experiment.experiment import (
     usual_records,
 )
 from psa_casadi.design.experiment.information import Information, Optimality
-from psa_casadi.design.experiment.limits import Limits, excess
+from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, draw, excess, rest_of
 from psa_casadi.design.experiment.rivals import Rival, SensorNoise, rival_of_model
 from psa_casadi.design.experiment.search import Effort, search
 from psa_casadi.design.experiment.separation import Separation

@@ -8,10 +8,9 @@ if TYPE_CHECKING:
 
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
-    from psa_casadi.design.experiment.candidates import Kind
     from psa_casadi.design.experiment.designs import Informative, Separated
     from psa_casadi.design.experiment.information import Optimality
-    from psa_casadi.design.experiment.limits import Limits
+    from psa_casadi.design.experiment.limits import Kind, Limits
     from psa_casadi.design.experiment.rivals import Rival, SensorNoise
     from psa_casadi.design.experiment.search import Effort
     from psa_casadi.model.compose import Model
@@ -33,7 +32,7 @@ class Plan:
     @property
     def kinds(self) -> "tuple[Kind, ...]":
         """The families to search."""
-        from psa_casadi.design.experiment.candidates import KINDS
+        from psa_casadi.design.experiment.limits import KINDS
 
         return KINDS if self.family == "any" else tuple(k for k in KINDS if k == self.family)
 

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.design.experiment.candidates import KINDS, Kind, rest_of
 from psa_casadi.design.experiment.chances import chances_of, plays_of, tells
 from psa_casadi.design.experiment.designs import Informative, Pair, Separated
 from psa_casadi.design.experiment.information import Information, Optimality
-from psa_casadi.design.experiment.limits import Limits, limits_of
+from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
 from psa_casadi.design.experiment.rivals import (
     Rival,
     SensorNoise,
