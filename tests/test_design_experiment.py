@@ -8,18 +8,24 @@ from scipy.optimize import least_squares
 
 from psa_casadi import reference
 from psa_casadi.design.experiment.chances import naming_probability, plays_of
-from psa_casadi.design.experiment.criterion import Criterion, Point
+from psa_casadi.design.experiment.criteria import (
+    Criterion,
+    Information,
+    Optimality,
+    Point,
+    Rival,
+    SensorNoise,
+    Separation,
+    rival_of_model,
+)
 from psa_casadi.design.experiment.experiment import (
     informative_experiment,
     rival_of_effect,
     separating_experiment,
     usual_records,
 )
-from psa_casadi.design.experiment.information import Information, Optimality
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, draw, excess, rest_of
-from psa_casadi.design.experiment.rivals import Rival, SensorNoise, rival_of_model
 from psa_casadi.design.experiment.search import Effort, search
-from psa_casadi.design.experiment.separation import Separation
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model

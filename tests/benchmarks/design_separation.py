@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from psa_casadi.design.experiment.criteria import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.designs import ASKED, PLAYS, Separated
 from psa_casadi.design.experiment.experiment import (
     informative_experiment,
@@ -20,7 +21,6 @@ from psa_casadi.design.experiment.experiment import (
     usual_records,
 )
 from psa_casadi.design.experiment.limits import Limits
-from psa_casadi.design.experiment.rivals import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.search import GRID
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis

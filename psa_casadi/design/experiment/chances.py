@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
+from psa_casadi.design.experiment.criteria import LEAST, Rival, Separation
 from psa_casadi.design.experiment.designs import ASKED, PLAYS
-from psa_casadi.design.experiment.rivals import Rival
-from psa_casadi.design.experiment.separation import LEAST, Separation
 from psa_casadi.diagnosis.screening.evidence import temperature
 from psa_casadi.diagnosis.thresholds import thresholds
 from psa_casadi.errors import PsaError

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from psa_casadi.design.experiment.information import Optimality
+from psa_casadi.design.experiment.criteria import Optimality
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.records.record import Record
 

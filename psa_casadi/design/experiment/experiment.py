@@ -7,18 +7,20 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.design.experiment.chances import chances_of, plays_of, tells
-from psa_casadi.design.experiment.designs import Informative, Pair, Separated
-from psa_casadi.design.experiment.information import Information, Optimality
-from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
-from psa_casadi.design.experiment.rivals import (
+from psa_casadi.design.experiment.criteria import (
+    Information,
+    Optimality,
     Rival,
     SensorNoise,
+    Separation,
     noise_of_fit,
+    overall,
     rival_of_fit,
     rival_of_model,
 )
+from psa_casadi.design.experiment.designs import Informative, Pair, Separated
+from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
 from psa_casadi.design.experiment.search import BRIEF, GRID, Best, Effort, Progress, coarse, search
-from psa_casadi.design.experiment.separation import Separation, overall
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.search.contenders import one_of_each, same_curve_note
 from psa_casadi.diagnosis.task import FAST

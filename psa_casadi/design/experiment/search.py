@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from psa_casadi.design.experiment.criterion import Criterion, Point
+from psa_casadi.design.experiment.criteria import Criterion, Point
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, Waveform, draw
 from psa_casadi.errors import PsaError
 from psa_casadi.records.record import Record
