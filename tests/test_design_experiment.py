@@ -7,7 +7,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from psa_casadi import reference
-from psa_casadi.design.experiment.chances import naming_probability, plays_of
 from psa_casadi.design.experiment.criteria import (
     Criterion,
     Information,
@@ -20,6 +19,8 @@ from psa_casadi.design.experiment.criteria import (
 )
 from psa_casadi.design.experiment.experiment import (
     informative_experiment,
+    naming_probability,
+    plays_of,
     rival_of_effect,
     separating_experiment,
     usual_records,

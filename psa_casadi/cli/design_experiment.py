@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from psa_casadi.design.experiment.criteria import Rival
-    from psa_casadi.design.experiment.designs import Informative, Separated
+    from psa_casadi.design.experiment.experiment import Informative, Separated
     from psa_casadi.model.compose import Model
 
 

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
     from psa_casadi.design.experiment.criteria import Optimality, Rival, SensorNoise
-    from psa_casadi.design.experiment.designs import Informative, Separated
+    from psa_casadi.design.experiment.experiment import Informative, Separated
     from psa_casadi.design.experiment.limits import Kind, Limits
     from psa_casadi.design.experiment.search import Effort
     from psa_casadi.model.compose import Model

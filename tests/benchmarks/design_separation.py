@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from psa_casadi.design.experiment.criteria import SensorNoise, rival_of_model
-from psa_casadi.design.experiment.designs import ASKED, PLAYS, Separated
 from psa_casadi.design.experiment.experiment import (
+    ASKED,
+    PLAYS,
+    Separated,
     informative_experiment,
     resolving_experiment,
     rival_of_effect,

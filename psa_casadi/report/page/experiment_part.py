@@ -9,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from psa_casadi.design.experiment.criteria import Rival
-from psa_casadi.design.experiment.designs import ASKED, PLAYS, Informative, Separated
+from psa_casadi.design.experiment.experiment import ASKED, PLAYS, Informative, Separated
 from psa_casadi.model.compose import Model
 from psa_casadi.records import write_record
 from psa_casadi.records.record import Record
