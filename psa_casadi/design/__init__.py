@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     )
     from psa_casadi.design.experiment.limits import Limits
     from psa_casadi.design.mechanism.mechanism import design_mechanism
-    from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
     from psa_casadi.design.tracking.minimum_time import quickest_move
+    from psa_casadi.design.tracking.targets import AmplifierLimits
     from psa_casadi.design.tracking.tracking import track
 
 _HOME_OF = {

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.minimum_time import QuickMove, quickest_move
-from psa_casadi.design.tracking.verification import Response, respond
+from psa_casadi.design.tracking.targets import AmplifierLimits, Response, respond
 from psa_casadi.examples.raster_scan import scanner
 
 BEGIN, END = 2e-6, 10e-6

@@ -11,9 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import psa_casadi as psa
-from psa_casadi.design.tracking.targets import raster_scan
+from psa_casadi.design.tracking.targets import Response, error_of, raster_scan, uncompensated
 from psa_casadi.design.tracking.tracking import TrackedInput, track
-from psa_casadi.design.tracking.verification import Response, error_of, uncompensated
 from psa_casadi.simulation.linear_part import linear_part
 
 #: Lines of the scan, samples, and its stroke [m].

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Expression
-from psa_casadi.design.tracking.dynamics import Dynamics
+from psa_casadi.design.tracking.targets import Dynamics
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import Steps, run

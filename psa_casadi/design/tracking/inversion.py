@@ -18,11 +18,17 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.dynamics import demand_stack, rest_at
-from psa_casadi.design.tracking.saturation import held
-from psa_casadi.design.tracking.targets import Target
-from psa_casadi.design.tracking.verification import Response, TrackingError, error_of, respond
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Response,
+    Target,
+    TrackingError,
+    demand_stack,
+    error_of,
+    held,
+    respond,
+    rest_at,
+)
 from psa_casadi.design.tracking.zero_phase import zero_phase_inverse
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
+from psa_casadi.design.tracking.targets import AmplifierLimits
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.linear_part import slopes_at_rest

@@ -18,10 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.dynamics import move_ends
 from psa_casadi.design.tracking.linear_move import LinearMove, Offsets, linear_move
-from psa_casadi.design.tracking.verification import Response, respond
+from psa_casadi.design.tracking.targets import AmplifierLimits, Response, move_ends, respond
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.units import FloatArray

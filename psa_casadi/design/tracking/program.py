@@ -7,8 +7,8 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Expression
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.collocation import Chain, Interval, chain
+from psa_casadi.design.tracking.targets import AmplifierLimits
 from psa_casadi.errors import PsaError
 from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.units import FloatArray

@@ -12,29 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.collocation import (
     interval_of,
     nodes_of,
     simulated_displacement,
     simulated_states,
 )
-from psa_casadi.design.tracking.dynamics import (
-    Dynamics,
-    demand_stack,
-    dynamics_of,
-    rest_at,
-    smooth_form,
-)
 from psa_casadi.design.tracking.inversion import InvertedInput, invert
 from psa_casadi.design.tracking.program import NoSolutionError, Problem, Program, Solution
-from psa_casadi.design.tracking.targets import Target
-from psa_casadi.design.tracking.verification import (
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Dynamics,
     Response,
+    Target,
     TrackingError,
     broken,
+    demand_stack,
+    dynamics_of,
     error_of,
     respond,
+    rest_at,
+    smooth_form,
 )
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model

@@ -4,12 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.dynamics import demand_stack
 from psa_casadi.design.tracking.inversion import correct
-from psa_casadi.design.tracking.saturation import held
-from psa_casadi.design.tracking.targets import Target
-from psa_casadi.design.tracking.verification import Response, TrackingError, error_of, respond
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Response,
+    Target,
+    TrackingError,
+    demand_stack,
+    error_of,
+    held,
+    respond,
+)
 from psa_casadi.errors import Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record

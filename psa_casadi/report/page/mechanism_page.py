@@ -16,7 +16,7 @@ from psa_casadi.design.mechanism.mechanism import (
     root_locus,
     step_response,
 )
-from psa_casadi.design.tracking.verification import respond
+from psa_casadi.design.tracking.targets import respond
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.report.page.design_page import write_design_page
