@@ -10,6 +10,7 @@ import numpy as np
 
 from psa_casadi.cli.interrupts import kept
 from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
 from psa_casadi.design.tracking.minimum_time import QuickMove, quickest_move
 from psa_casadi.design.tracking.targets import (
@@ -23,7 +24,6 @@ from psa_casadi.design.tracking.targets import (
 )
 from psa_casadi.design.tracking.tracking import TrackedInput
 from psa_casadi.design.tracking.tracking import track as tracked
-from psa_casadi.design.tracking.trial import corrected
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record, write_record
 from psa_casadi.report.page.design_input_part import (

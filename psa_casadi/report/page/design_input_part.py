@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
-from psa_casadi.design.tracking.inversion import InvertedInput
+from psa_casadi.design.tracking.inversion import CorrectedInput, InvertedInput
 from psa_casadi.design.tracking.minimum_time import QuickMove
 from psa_casadi.design.tracking.targets import (
     AmplifierLimits,
@@ -15,7 +15,6 @@ from psa_casadi.design.tracking.targets import (
     usage,
 )
 from psa_casadi.design.tracking.tracking import TrackedInput
-from psa_casadi.design.tracking.trial import CorrectedInput
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.theme import INK, Plot, styled
 from psa_casadi.report.words.phrases import number
