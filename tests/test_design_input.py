@@ -12,10 +12,8 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.design.tracking.collocation import interval_of
 from psa_casadi.design.tracking.inversion import correct, invert
 from psa_casadi.design.tracking.minimum_time import quickest_move
-from psa_casadi.design.tracking.program import NoSolutionError, Program
 from psa_casadi.design.tracking.targets import (
     AmplifierLimits,
     Target,
@@ -26,7 +24,13 @@ from psa_casadi.design.tracking.targets import (
     read_target,
     uncompensated,
 )
-from psa_casadi.design.tracking.tracking import TrackedInput, track
+from psa_casadi.design.tracking.tracking import (
+    NoSolutionError,
+    Program,
+    TrackedInput,
+    interval_of,
+    track,
+)
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
 from tests.benchmarks.creeping_reference import creeping_displacement
 from tests.benchmarks.design_tracking import LIMITS, own_bang_bang, scan, scanner, wrong_values
