@@ -185,7 +185,7 @@ def design_mechanism(
     damping: float | None = None,
     bandwidth: float | None = None,
     poles: Sequence[complex] = (),
-    limits: Limits = Limits(),  # noqa: B008
+    limits: Limits = Limits(),
     acts_on: str = "wafers",
     starts: int = 6,
 ) -> MechanismDesign:
