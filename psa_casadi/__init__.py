@@ -35,13 +35,6 @@ if TYPE_CHECKING:
         mechanism_model,
         port_model,
     )
-    from psa_casadi.design.online.observer import FeedForward, HysteresisObserver, stack_values
-    from psa_casadi.design.online.part_for import part_for
-    from psa_casadi.design.online.recursive_least_squares import (
-        AdaptiveFeedForward,
-        OnlineIdentification,
-        identifier_for,
-    )
     from psa_casadi.devices.batch import BatchRun, batch
     from psa_casadi.devices.jobs import Job, Options
     from psa_casadi.diagnosis.result import Diagnosis
@@ -65,6 +58,15 @@ if TYPE_CHECKING:
     from psa_casadi.model.system.nanopositioner import nanopositioner
     from psa_casadi.model.system.system import System, connect
     from psa_casadi.model.system.tuning import controller_for, margins_of
+    from psa_casadi.online import (
+        AdaptiveFeedForward,
+        FeedForward,
+        HysteresisObserver,
+        OnlineIdentification,
+        identifier_for,
+        part_for,
+        stack_values,
+    )
     from psa_casadi.posterior.sample import Posterior, sample
     from psa_casadi.records import (
         Record,
@@ -125,13 +127,13 @@ _HOMES = {
         "mechanism_model",
         "port_model",
     ),
-    "psa_casadi.design.online.observer": (
+    "psa_casadi.online": (
         "FeedForward",
         "HysteresisObserver",
         "stack_values",
     ),
-    "psa_casadi.design.online.part_for": ("part_for",),
-    "psa_casadi.design.online.recursive_least_squares": (
+    "psa_casadi.online": ("part_for",),
+    "psa_casadi.online": (
         "AdaptiveFeedForward",
         "OnlineIdentification",
         "identifier_for",

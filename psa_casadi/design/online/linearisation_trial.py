@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from psa_casadi.design.online.drifting_stack import DriftingStack
-from psa_casadi.design.online.observer import FeedForward, stack_values
-from psa_casadi.design.online.recursive_least_squares import (
+from psa_casadi.model.compose import Model
+from psa_casadi.online import (
     AdaptiveFeedForward,
     Estimate,
+    FeedForward,
     identifier_for,
+    stack_values,
 )
-from psa_casadi.model.compose import Model
 from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
