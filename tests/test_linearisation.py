@@ -6,14 +6,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from psa_casadi import reference
-from psa_casadi.design.online.linearisation_trial import (
-    DriftingStack,
-    Drive,
-    ageing,
-    driven,
-    off_values,
-)
 from psa_casadi.errors import InputError
+from psa_casadi.examples.linearisation_trial import DriftingStack, Drive, ageing, driven, off_values
 from psa_casadi.model.parts import compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.online import (

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.design.online.linearisation_trial import Drive, driven, off_values
+from psa_casadi.examples.linearisation_trial import Drive, driven, off_values
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text

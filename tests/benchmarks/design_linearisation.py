@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from psa_casadi.design.mechanism.mechanism import Limits, design_mechanism
-from psa_casadi.design.online.linearisation_trial import (
+from psa_casadi.examples.linearisation_trial import (
     Drive,
     ageing,
     driven,
