@@ -131,9 +131,7 @@ _HOMES = {
         "FeedForward",
         "HysteresisObserver",
         "stack_values",
-    ),
-    "psa_casadi.online": ("part_for",),
-    "psa_casadi.online": (
+        "part_for",
         "AdaptiveFeedForward",
         "OnlineIdentification",
         "identifier_for",

@@ -22,6 +22,16 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.parts import PARTS, compensator_for, part_model
 from psa_casadi.model.system.nanopositioner import nanopositioner
 
+__all__ = [
+    "AdaptiveFeedForward",
+    "FeedForward",
+    "HysteresisObserver",
+    "OnlineIdentification",
+    "identifier_for",
+    "part_for",
+    "stack_values",
+]
+
 #: A displacement beyond so many strokes of the stack is no wish in metres.
 _STROKES = 10.0
 

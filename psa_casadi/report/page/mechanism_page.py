@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
-from psa_casadi.design.mechanism.loop import response_times
+from psa_casadi.design.mechanism.loop import Mounting, response_times, step_response
 from psa_casadi.design.mechanism.mechanism import (
     MechanismDesign,
-    Mounting,
     Reached,
     mounted_model,
     root_locus,
-    step_response,
 )
 from psa_casadi.design.tracking.targets import respond
 from psa_casadi.errors import InputError
