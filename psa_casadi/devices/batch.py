@@ -17,7 +17,7 @@ import os
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
@@ -38,7 +38,7 @@ from psa_casadi.devices.jobs import (
     key_of,
 )
 from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.files import atomic_path, atomic_write, make_folder
 from psa_casadi.identification.refitting import Progress
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
@@ -65,7 +65,7 @@ class Results:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        _make(folder)
+        make_folder(folder)
 
     def kept(self, job: Job, key: str) -> DeviceFile | None:
         """Return how a device ended if that holds for the same files and options, else None."""
@@ -91,7 +91,7 @@ class Results:
             InputError: they cannot be written.
         """
         here = self.folder / job.device
-        _make(here)
+        make_folder(here)
         (here / DEVICE_FILE).unlink(missing_ok=True)
         for name, text in outcome.files:
             atomic_write(here / name, text)
@@ -130,14 +130,13 @@ class Results:
         A device whose files are damaged has failed, with what is wrong among its problems.
         """
         for told in devices:
-            found = None
-            if told.status == "done":
-                try:
+            try:
+                found = None
+                if told.status == "done":
                     found = device_finding(self.folder / told.device, told, effects)
-                except ValueError as error:
-                    yield replace(told, status="failed", problems=(str(error),)), None
-                    continue
-            yield told, found
+                yield told, found
+            except ValueError as error:
+                yield replace(told, status="failed", problems=(str(error),)), None
 
 
 def read_results(
@@ -150,29 +149,20 @@ def read_results(
     """
     results = Results(folder)
     names = sorted(d.name for d in folder.iterdir() if (d / DEVICE_FILE).is_file())
-    devices = {name: results.told(name) for name in names}
-    if not devices:
+    if not names:
         raise InputError(
             f"{folder}: holds no results of devices; give the folder that `psa batch` wrote to, or"
             " two files or more."
         )
+    devices = {name: results.told(name) for name in names}
     rows = list(results.findings([d for d in devices.values() if d is not None], effects))
-    unknown = [
+    lost = [(d.device, d.status, " ".join(d.problems)) for d, f in rows if f is None]
+    lost += [
         (n, "failed", f"{folder / n / DEVICE_FILE}: is damaged; run `psa batch` again.")
         for n, d in devices.items()
         if d is None
     ]
-    lost = [(d.device, d.status, " ".join(d.problems)) for d, f in rows if f is None]
-    return tuple(f for _, f in rows if f is not None), tuple(sorted(lost + unknown))
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be created ({error.strerror}); name another folder."
-        ) from error
+    return tuple(f for _, f in rows if f is not None), tuple(sorted(lost))
 
 
 CSV, PARQUET = "summary.csv", "summary.parquet"
@@ -191,46 +181,25 @@ def write_summary(
     table = [_row(told, found) for told, found in rows]
     columns = list(dict.fromkeys(name for row in table for name in row))
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([_cell(row.get(name)) for name in columns] for row in table)
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
     atomic_write(folder / CSV, text.getvalue())
     if find_spec("pyarrow") is None:
         return (folder / CSV,)
-    _write_parquet(folder / PARQUET, columns, table)
+    arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+    kinds = {n: arrow.string() if n in _TEXTS else arrow.float64() for n in columns}
+    with atomic_path(folder / PARQUET) as temporary:
+        parquet.write_table(
+            arrow.Table.from_pylist(table, schema=arrow.schema(kinds.items())), temporary
+        )
     return (folder / CSV, folder / PARQUET)
 
 
 def _row(told: DeviceFile, found: Finding | None) -> dict[str, Any]:
-    row = {
-        "device": told.device,
-        "batch": told.batch,
-        "date": told.date,
-        "work": told.work,
-        "status": told.status,
-        "seconds": told.seconds,
-        "problems": " ".join(told.problems),
-    }
-    return row if found is None else {**row, **finding_content(found)}
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
-    return repr(value) if isinstance(value, float) else str(value)
-
-
-def _write_parquet(path: Path, columns: Sequence[str], table: Sequence[Mapping[str, Any]]) -> None:
-    arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
-    arrays = {
-        name: arrow.array(
-            [row.get(name) for row in table],
-            type=arrow.string() if name in _TEXTS else arrow.float64(),
-        )
-        for name in columns
-    }
-    with atomic_path(path) as temporary:
-        parquet.write_table(arrow.table(arrays), temporary)
+    names = ("device", "batch", "date", "work", "status", "seconds")
+    row = {name: getattr(told, name) for name in names} | {"problems": " ".join(told.problems)}
+    return row if found is None else row | finding_content(found)
 
 
 #: Devices that are submitted for each that can run at once: none waits for the next.
@@ -290,7 +259,12 @@ def batch(
     given = jobs_given(jobs)
     effects = [c for module in o.modules for c in own_effects(module).values()]
     results = Results(Path(output))
-    keys = _keys(given, o)
+    try:
+        keys = {job.device: key_of(job, o) for job in given}
+    except OSError as error:
+        raise InputError(
+            f"{error.filename}: cannot be read ({error.strerror}); correct its permissions."
+        ) from error
     ended: dict[str, DeviceFile] = {}
     for job in given:
         told = results.kept(job, keys[job.device])
@@ -321,15 +295,6 @@ def batch(
     found = tuple(f for _, f in rows if f is not None)
     devices = tuple(told for told, _ in rows)
     return BatchRun(results.folder, devices, found, kept, time.monotonic() - began, files)
-
-
-def _keys(jobs: Sequence[Job], options: Options) -> dict[str, str]:
-    try:
-        return {job.device: key_of(job, options) for job in jobs}
-    except OSError as error:
-        raise InputError(
-            f"{error.filename}: cannot be read ({error.strerror}); correct its permissions."
-        ) from error
 
 
 @contextmanager
