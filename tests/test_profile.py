@@ -12,12 +12,13 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.profile import PROFILE_LIMIT, Profile, profile, profile_sentences
+from psa_casadi.identification.profile import PROFILE_LIMIT, Profile, profile
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.report.plots.profile_plot import profile_plot
+from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.simulation.simulate import simulate
 
 FloatArray = NDArray[np.float64]

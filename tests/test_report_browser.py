@@ -43,8 +43,7 @@ def of_diagnosis(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _written(kind: str, folder: Path) -> Path:
     path = folder / f"{kind}.html"
     if kind == "fit":
-        said = "Play a voltage that is held for ten times the creep lag at three levels."
-        found = replace(identification(), advice=(Advice(said, ("tau",), None),))
+        found = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))
         write_fit_report(found, path, origin="synthetic")
     else:
         write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")

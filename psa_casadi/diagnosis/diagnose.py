@@ -139,7 +139,8 @@ def _in_form(
     if len(forms) == 1:
         return forms[0], ()
     found, why = search_forms(forms, experiments, progress=progress)
-    return next(m for m in forms if m.components == found.best.model.components), (why,)
+    preferred = () if why is None else (why.sentence,)
+    return next(m for m in forms if m.components == found.best.model.components), preferred
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]:

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
+from typing import Literal
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from psa_casadi.records.excitation import decaying_triangle, multisine, sine, ti
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.records.turns import reversals
+from psa_casadi.shown import Worded
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import settling_time
 from psa_casadi.units import FloatArray
@@ -45,16 +47,24 @@ _LONGEST_HOLD = 7200.0
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A planned record (no displacement), the words for it, and the sampling rate [Hz] it needs."""
+    """A planned record (no displacement) of a kind, and the sampling rate [Hz] it needs.
 
-    kind: str
-    words: str
+    From `low` to `high` [V]; `frequency` [Hz] is the highest tone of a multisine or that of loops,
+    of which there are `cycles`; `length` [s] is that of the plan.
+    """
+
+    kind: Literal["step", "multisine", "loop", "minor loops", "hold"]
     record: Record
     rate: float
+    low: float
+    high: float
+    length: float
+    frequency: float = 0.0
+    cycles: int = 0
 
     @property
     def duration(self) -> float:
-        """Length [s]."""
+        """Length from the first sample to the last [s]."""
         return self.record.duration
 
 
@@ -73,19 +83,11 @@ def plans(models: Sequence[Model], records: Sequence[Record]) -> list[Plan]:
     if models[0].effects:
         longest = max(r.duration for r in records)
         lengths = [longest * k for k in (10.0, 100.0) if longest * k <= _LONGEST_HOLD]
-        found += [_hold(length, low, high) for length in lengths]
+        found += [
+            _stepped("hold", HOLD_SAMPLES / n, HOLD_SAMPLES, low, high, HOLD_SAMPLES)
+            for n in lengths
+        ]
     return found
-
-
-def quantity(value: float, unit: str) -> str:
-    """Return a value with three digits at most and a prefix, such as "200 kHz"."""
-    if value == 0.0:
-        return f"0 {unit}"
-    prefixes = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-    power = int(np.clip(3 * floor(log10(abs(value) * 1.0005) / 3), -9, 6))
-    if unit == "s" and value >= 1.0:
-        power = 0
-    return f"{value / 10.0**power:.3g} {prefixes[power]}{unit}"
 
 
 def _round(value: float) -> float:
@@ -121,68 +123,40 @@ def _loop_frequency(settling: float, records: Sequence[Record]) -> float:
 
 
 def _fast(rate: float, low: float, high: float) -> Iterator[Plan]:
-    between = f"{quantity(low, 'V')} to {quantity(high, 'V')}"
-
-    def sampled(length: float) -> str:
-        return f"(sampled at {quantity(rate, 'Hz')} or faster for {quantity(length, 's')})"
-
-    time = time_grid(STEP_SAMPLES / rate, 1.0 / rate)
-    voltage = np.full(time.shape, low)
-    voltage[STEP_SAMPLES // 100 : STEP_SAMPLES // 2] = high
-    words = f"a step from {between} and back {sampled(STEP_SAMPLES / rate)}"
-    yield Plan("step", words, Record(name="step", time=time, voltage=voltage), rate)
+    yield _stepped("step", rate, STEP_SAMPLES, low, high, STEP_SAMPLES // 2)
     length = MULTISINE_SAMPLES / rate
     time = time_grid(length, 1.0 / rate)
     tones = multisine(time, low, high, (2.0 / length, _BAND * rate), seed=1)
     voltage = low + (tones - low) * np.minimum(10.0 * time / length, 1.0)
-    band = quantity(_BAND * rate, "Hz")
-    words = f"a multisine from {between} up to {band} {sampled(length)}"
-    yield Plan("multisine", words, Record(name="multisine", time=time, voltage=voltage), rate)
+    record = Record(name="multisine", time=time, voltage=voltage)
+    yield Plan("multisine", record, rate, low, high, length, _BAND * rate)
+
+
+def _stepped(
+    kind: Literal["step", "hold"], rate: float, samples: int, low: float, high: float, stop: int
+) -> Plan:
+    """Return a step up after a hundredth of the samples, and down again at sample `stop`."""
+    time = time_grid(samples / rate, 1.0 / rate)
+    voltage = np.full(time.shape, low)
+    voltage[samples // 100 : stop] = high
+    record = Record(name=kind, time=time, voltage=voltage)
+    return Plan(kind, record, rate, low, high, samples / rate)
 
 
 def _loops(frequency: float, settling: float, low: float, high: float) -> Iterator[Plan]:
-    middle = 0.5 * (low + high)
     cases = [(k * frequency, high) for k in (0.01, 0.1, 1.0) if k * frequency > _SLOWEST]
-    cases.append((frequency, middle))
+    cases.append((frequency, 0.5 * (low + high)))
     if 10.0 * frequency * settling <= _QUASI_STATIC:
         cases.append((10.0 * frequency, high))
     for f, top in cases:
         time = time_grid(2.0 / f, 1.0 / (LOOP_SAMPLES * f))
-        words = (
-            f"two loops (a sine) from {quantity(low, 'V')} to {quantity(top, 'V')} at"
-            f" {quantity(f, 'Hz')}"
-        )
-        yield Plan(
-            "loop",
-            words,
-            Record(name="loop", time=time, voltage=sine(time, low, top, f)),
-            LOOP_SAMPLES * f,
-        )
-    time = time_grid(_CYCLES / frequency, 1.0 / (LOOP_SAMPLES * frequency))
+        record = Record(name="loop", time=time, voltage=sine(time, low, top, f))
+        yield Plan("loop", record, LOOP_SAMPLES * f, low, top, 2.0 / f, f, 2)
+    rate, length = LOOP_SAMPLES * frequency, _CYCLES / frequency
+    time = time_grid(length, 1.0 / rate)
     voltage = decaying_triangle(time, low, high, _CYCLES)
-    words = (
-        f"nested minor loops (a triangle of {_CYCLES} cycles from {quantity(low, 'V')} to"
-        f" {quantity(high, 'V')} that closes in on the middle) at {quantity(frequency, 'Hz')}"
-    )
-    yield Plan(
-        "minor loops",
-        words,
-        Record(name="loops", time=time, voltage=voltage),
-        LOOP_SAMPLES * frequency,
-    )
-
-
-def _hold(length: float, low: float, high: float) -> Plan:
-    time = time_grid(length, length / HOLD_SAMPLES)
-    voltage = np.full(time.shape, high)
-    voltage[: HOLD_SAMPLES // 100] = low
-    words = (
-        f"a step from {quantity(low, 'V')} to {quantity(high, 'V')} held for"
-        f" {quantity(length, 's')}"
-    )
-    return Plan(
-        "hold", words, Record(name="hold", time=time, voltage=voltage), HOLD_SAMPLES / length
-    )
+    record = Record(name="loops", time=time, voltage=voltage)
+    yield Plan("minor loops", record, rate, low, high, length, frequency, _CYCLES)
 
 
 #: Parameters that only fast records determine; a fit leaves them at their start where it must.
@@ -245,16 +219,26 @@ _REPEATS = (1, 2, 5, 10)
 
 
 @dataclass(frozen=True, eq=False)
-class Advice:
-    """A sentence, the parameters that the advised record determines, and the record's voltage.
+class Advice(Worded):
+    """A record to measure next, `repeats` times, and the parameters that it determines.
 
-    The record has no displacement yet; it is None where the advice is none to measure one.
+    `single` does so by itself, as well as those `instead` of it, `together` with what is advised
+    before it. `plan` is None where the advice is none to measure a record: masses that show if the
+    mechanics ring (`ringing`), parameters that none of the plans `tried` determines (`nothing`),
+    and the scale of `force`, which no record tells.
     """
 
-    sentence: str
-    parameters: tuple[str, ...]
-    record: Record | None
+    kind: Literal["single", "together", "ringing", "nothing", "force"]
+    parameters: tuple[str, ...] = ()
+    plan: Plan | None = None
     repeats: int = 1
+    instead: tuple[Plan, ...] = ()
+    tried: int = 0
+
+    @property
+    def record(self) -> Record | None:
+        """The record's voltage, without a displacement; None where none is to be measured."""
+        return None if self.plan is None else self.plan.record
 
 
 def advice(
@@ -333,29 +317,29 @@ class _Adviser:
     def all(self, force_scale_given: bool) -> tuple[Advice, ...]:
         """Return the whole advice in its order."""
         results: list[Advice] = []
-        left, known, counts = set(self._open), self._known, dict[str, int]()
+        left, known, counts = set(self._open), self._known, dict[Plan, int]()
         options = self._options() if left else []
         for plan, information, gain in self._cover(options, left):
-            known, counts[plan.words] = known + information, 1
-            results.append(self._single(plan, gain, options))
+            known, counts[plan] = known + information, 1
+            instead = self._instead(plan, gain, options)
+            results.append(Advice("single", gain, plan, instead=instead))
         wanted = left & set(self._found.names)
         while wanted and (more := self._more(options, known, wanted)) is not None:
             plan, information, repeats = more
             known = known + repeats * information
             gain = self._gain(known, left)
-            counts[plan.words] = counts.get(plan.words, 0) + repeats
-            results.append(self._together(plan, gain, counts[plan.words], bool(results)))
+            counts[plan] = counts.get(plan, 0) + repeats
+            kind: Literal["together", "single"] = "together" if results else "single"
+            results.append(Advice(kind, gain, plan, counts[plan]))
             left, wanted = left - set(gain), wanted - set(gain)
-        ringing = self._ringing(known, left) if results else ()
-        if ringing:
-            left -= set(ringing)
-            text = f"If the mechanics ring, {_listing(ringing)} would be determined as well."
-            results.append(Advice(text, ringing, None))
-        if left:
-            rest = tuple(n for n in self._names if n in left)
-            results.append(Advice(_nothing(rest, len(options)), rest, None))
-        if not force_scale_given:
-            results.append(Advice(FORCE_ADVICE, (), None))
+        # masses that are sure where the mechanics ring, the last scenario
+        sure = self._gain(known[-1:], left) if results else ()
+        ringing = tuple(n for n in sure if n[0] == "m")
+        left -= set(ringing)
+        rest = tuple(n for n in self._names if n in left)
+        results += [Advice("ringing", ringing)] if ringing else []
+        results += [Advice("nothing", rest, tried=len(options))] if rest else []
+        results += [] if force_scale_given else [Advice("force")]
         return tuple(results)
 
     def _options(self) -> list[_Option]:
@@ -379,10 +363,6 @@ class _Adviser:
         """Return the parameters of `left` that are sure with this information in every scenario."""
         errors = np.max([standard_errors(i) for i in information], axis=0)
         return tuple(n for k, n in enumerate(self._names) if n in left and errors[k] < _SURE)
-
-    def _ringing(self, information: FloatArray, left: set[str]) -> tuple[str, ...]:
-        """Return the masses of `left` that are sure where the mechanics ring, the last scenario."""
-        return tuple(n for n in self._gain(information[-1:], left) if n[0] == "m")
 
     def _cover(self, options: Sequence[_Option], left: set[str]) -> list[_Gain]:
         """Choose plans that each determine something alone, and take it out of `left`."""
@@ -411,41 +391,15 @@ class _Adviser:
                 return best[0], best[1], repeats
         return None
 
-    def _single(self, plan: Plan, gain: tuple[str, ...], options: Sequence[_Option]) -> Advice:
-        """Say what a plan determines, with the other fast kind where that does as well."""
-        words = plan.words
-        for other, information in options:
-            same = other.rate == plan.rate and {other.kind, plan.kind} == {"step", "multisine"}
-            if same and set(gain) <= set(self._gain(self._known + information, self._open)):
-                words += f", or {other.words.split(' (sampled')[0]},"
-        return Advice(_sentence(f"{words} would determine {_listing(gain)}."), gain, plan.record)
-
-    def _together(self, plan: Plan, gain: tuple[str, ...], repeats: int, after: bool) -> Advice:
-        """Say what a plan determines beside what was advised before it, or repeated."""
-        times = "" if repeats == 1 else ", twice," if repeats == 2 else f", {repeats} times,"
-        beside = "together with what is advised above, " if after else ""
-        text = f"{beside}{plan.words}{times} would determine {_listing(gain)}."
-        return Advice(_sentence(text), gain, plan.record, repeats)
-
-
-FORCE_ADVICE = (
-    "A stiffness or blocking force, from the data sheet or measured, would fix the scale of force;"
-    " no record of voltage and displacement can."
-)
-
-
-def _nothing(names: Sequence[str], tried: int) -> str:
-    them = "it" if len(names) == 1 else "them"
-    return (
-        f"None of the {tried} steps, multisines, loops and holds that were tried on the model, with"
-        f" the noise of these records, is sure to determine {_listing(names)}; take {them} from"
-        " elsewhere, or use what is known of the combinations."
-    )
-
-
-def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:]
-
-
-def _listing(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    def _instead(
+        self, plan: Plan, gain: tuple[str, ...], options: Sequence[_Option]
+    ) -> tuple[Plan, ...]:
+        """Return plans of the other fast kind that do as well at the same rate."""
+        fast = {"step", "multisine"}
+        return tuple(
+            other
+            for other, information in options
+            if other.rate == plan.rate
+            and {other.kind, plan.kind} == fast
+            and set(gain) <= set(self._gain(self._known + information, self._open))
+        )

@@ -1,110 +1,103 @@
-"""What the data know of parameters that they leave open: combinations, in words."""
+"""What the data know of parameters that they leave open: formulas in which their errors cancel."""
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, product
 from math import nan
+from typing import Any, Literal
 
 import numpy as np
 
 from psa_casadi.identification.determinacy import Determinacy
-from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.model.compose import Model
+from psa_casadi.shown import Worded
 from psa_casadi.variables import Values
+
+#: A combination is known if its relative standard error is below this ...
+KNOWN = 0.1
+#: ... and each parameter that trades off in it would alone give it an error so many times larger.
+SURER = 5.0
+#: Parameters with a relative standard error above this are asked for what they trade off with.
+WEAK = 0.05
+#: Two parameters whose correlation is above this are tied.
+TIED = 0.5
+_STEP = 1e-5
+_FORCES = ("N/V", "N/(V.s)", "N", "kg", "N.s/m", "N/m")
 
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula of parameter values, what it means, and the parameters in it.
+    """A formula of parameter values, as it is written, and what it means.
 
     `physical` is False for products and ratios that were tried only because nothing else fits.
     """
 
     text: str
     meaning: str
-    names: tuple[str, ...]
-    value: Callable[[Values], float]
     physical: bool = True
 
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The parameters in it."""
+        return tuple(dict.fromkeys(re.findall(r"[A-Za-z]\w*", self.text)))
 
-def _quotient(above: str, below: str, meaning: str) -> Formula:
-    return Formula(
-        f"{above}/{below}", meaning, (above, below), lambda p: float(p[above] / p[below])
-    )
+    @cached_property
+    def _code(self) -> Any:
+        """The formula as code: a space between two factors is a product."""
+        product = re.sub(r"(?<=[\w)]) (?=[\w(])", "*", self.text)
+        return compile(product.replace("^", "**"), self.text, "eval")
+
+    def value(self, p: Values) -> float:
+        """Return the formula's value."""
+        return float(eval(self._code, {"__builtins__": {}}, dict(p)))
 
 
-def _bend(name: str) -> Formula:
-    return Formula(
-        f"{name} A/(k_L + A)",
-        "the bend of the loop",
-        (name, "A", "k_L"),
-        lambda p: float(p[name] * p["A"] / (p["k_L"] + p["A"])),
-    )
-
-
-_SUMMANDS = (
-    Formula("tau", "", ("tau",), lambda p: p["tau"]),
-    Formula("R_s C_p", "", ("R_s", "C_p"), lambda p: p["R_s"] * p["C_p"]),
-    _quotient("c", "k", ""),
-    _quotient("c_P", "k_P", ""),
-    _quotient("c_B", "k_B", ""),
-)
-_ZERO = Formula(
-    "(c_P + c_B)/(k_P + k_B)",
-    "the zero of the mechanics",
-    ("c_P", "c_B", "k_P", "k_B"),
-    lambda p: (p["c_P"] + p["c_B"]) / (p["k_P"] + p["k_B"]),
-)
-
+_LAGS = ("tau", "R_s C_p", "c/k", "c_P/k_P", "c_B/k_B")
+_ZERO = "(c_P + c_B)/(k_P + k_B)"
 #: Combinations with a meaning; Yang and Zhu 2015, eqs. (8), (10)-(15), (23), (33), (34).
-FORMULAS: tuple[Formula, ...] = (
-    _quotient("c_P", "k_P", "the wafers' lag"),
-    _quotient("c_B", "k_B", "the bonding layers' lag"),
-    _quotient("m_P", "k_P", "the wafers' resonance"),
-    _quotient("m_B", "k_B", "the bonding layers' resonance"),
-    _quotient("m", "k", "the resonance"),
-    _quotient("m_P", "c_P", "the wafers' quick decay"),
-    _quotient("m_B", "c_B", "the bonding layers' quick decay"),
-    Formula("c_P + c_B", "the sum of the dampings", ("c_P", "c_B"), lambda p: p["c_P"] + p["c_B"]),
-    _ZERO,
-    Formula("k_L + A", "the slope after a reversal", ("k_L", "A"), lambda p: p["k_L"] + p["A"]),
-    Formula(
-        "k_L (1/k_P + 1/k_B)",
-        "the static gain without hysteresis",
-        ("k_L", "k_P", "k_B"),
-        lambda p: p["k_L"] * static_compliance(p),
-    ),
-    Formula(
-        "(k_L + A) (1/k_P + 1/k_B)",
-        "the slope after a reversal",
-        ("k_L", "A", "k_P", "k_B"),
-        lambda p: (p["k_L"] + p["A"]) * static_compliance(p),
-    ),
-    _bend("beta"),
-    _bend("gamma"),
-    Formula(
-        "beta + gamma",
-        "the bend of a growing f_H",
-        ("beta", "gamma"),
-        lambda p: p["beta"] + p["gamma"],
-    ),
-    Formula(
-        "gamma - beta",
-        "the bend of a shrinking f_H",
-        ("beta", "gamma"),
-        lambda p: p["gamma"] - p["beta"],
-    ),
+FORMULAS = tuple(
+    Formula(text, meaning)
+    for text, meaning in {
+        "c_P/k_P": "the wafers' lag",
+        "c_B/k_B": "the bonding layers' lag",
+        "m_P/k_P": "the wafers' resonance",
+        "m_B/k_B": "the bonding layers' resonance",
+        "m/k": "the resonance",
+        "m_P/c_P": "the wafers' quick decay",
+        "m_B/c_B": "the bonding layers' quick decay",
+        "c_P + c_B": "the sum of the dampings",
+        _ZERO: "the zero of the mechanics",
+        "k_L + A": "the slope after a reversal",
+        "k_L (1/k_P + 1/k_B)": "the static gain without hysteresis",
+        "(k_L + A) (1/k_P + 1/k_B)": "the slope after a reversal",
+        "beta A/(k_L + A)": "the bend of the loop",
+        "gamma A/(k_L + A)": "the bend of the loop",
+        "beta + gamma": "the bend of a growing f_H",
+        "gamma - beta": "the bend of a shrinking f_H",
+    }.items()
 )
 
 
 def physical_formulas(values: Values, free: Sequence[str]) -> list[Formula]:
-    """Return the formulas with a meaning that hold two or more free parameters."""
-    declared = [*FORMULAS, *_lag_sums(values, free)]
-    return [
-        f
-        for f in declared
-        if all(n in values for n in f.names) and sum(n in free for n in f.names) > 1
-    ]
+    """Return the formulas with a meaning that hold two or more free parameters.
+
+    Beside `FORMULAS` sums of two and more lags, the mechanics' with and without its zero, eq. (15).
+    A lag without a free parameter is a constant, which would only make the sum look sure.
+    """
+    known = [
+        f for f in (Formula(lag, "") for lag in _LAGS)
+        if set(f.names) <= set(values) and set(f.names) & set(free)
+    ]  # fmt: skip
+    sums = []
+    for count in range(2, len(known) + 1):
+        for chosen in combinations([f.text for f in known], count):
+            sums.append(" + ".join(chosen))
+            if {"c_P/k_P", "c_B/k_B"} <= set(chosen):
+                sums.append(f"{sums[-1]} - {_ZERO}")
+    every = (*FORMULAS, *(Formula(text, "the sum of the lags") for text in sums))
+    return [f for f in every if set(f.names) <= set(values) and len(set(f.names) & set(free)) > 1]
 
 
 def monomials(values: Values, free: Sequence[str]) -> Iterator[Formula]:
@@ -118,68 +111,34 @@ def monomials(values: Values, free: Sequence[str]) -> Iterator[Formula]:
             yield _monomial(triple, (1, second, third))
 
 
-def _lag_sums(values: Values, free: Sequence[str]) -> Iterator[Formula]:
-    """Yield sums of two and more lags, the mechanics' with and without its zero, eq. (15).
-
-    A lag without a free parameter is a constant, which would only make the sum look sure.
-    """
-    known = [
-        f
-        for f in _SUMMANDS
-        if all(n in values for n in f.names) and any(n in free for n in f.names)
-    ]
-    for count in range(2, len(known) + 1):
-        for chosen in combinations(known, count):
-            yield _sum(chosen, ())
-            if {"c_P", "c_B"} <= {n for f in chosen for n in f.names}:
-                yield _sum(chosen, (_ZERO,))
-
-
-def _sum(plus: Sequence[Formula], minus: Sequence[Formula]) -> Formula:
-    def value(p: Values) -> float:
-        return sum(f.value(p) for f in plus) - sum(f.value(p) for f in minus)
-
-    text = " - ".join([" + ".join(f.text for f in plus), *(f.text for f in minus)])
-    names = tuple(dict.fromkeys(n for f in plus for n in f.names))
-    return Formula(text, "the sum of the lags", names, value)
-
-
 def _monomial(names: Sequence[str], powers: Sequence[int]) -> Formula:
-    def value(p: Values) -> float:
-        return float(np.prod([p[n] ** k for n, k in zip(names, powers, strict=True)]))
-
-    above = [n if k == 1 else f"{n}^{k}" for n, k in zip(names, powers, strict=True) if k > 0]
-    below = [n if k == -1 else f"{n}^{-k}" for n, k in zip(names, powers, strict=True) if k < 0]
-    text = " ".join(above)
-    if below:
-        text += f"/{below[0]}" if len(below) == 1 else f"/({' '.join(below)})"
-    meaning = "the ratio" if below else "the product"
-    return Formula(text, meaning, tuple(names), value, physical=False)
-
-
-#: A combination is known if its relative standard error is below this ...
-KNOWN = 0.1
-#: ... and each parameter that trades off in it would alone give it an error so many times larger.
-SURER = 5.0
-#: Parameters with a relative standard error above this are asked for what they trade off with.
-WEAK = 0.05
-#: Two parameters whose correlation is above this are tied.
-TIED = 0.5
-_STEP = 1e-5
+    factors = [n if abs(k) == 1 else f"{n}^{abs(k)}" for n, k in zip(names, powers, strict=True)]
+    above, below = (
+        " ".join(f for f, k in zip(factors, powers, strict=True) if sign * k > 0)
+        for sign in (1, -1)
+    )
+    text = f"{above}/({below})" if " " in below else f"{above}/{below}" if below else above
+    return Formula(text, "the ratio" if below else "the product", physical=False)
 
 
 @dataclass(frozen=True)
-class Combination:
+class Combination(Worded):
     """Parameters that trade off against each other, and what of them is known.
 
     `known` is the formula that the data determine with the relative standard error
-    `relative_error` (nan where it follows from the model's form); None where none was found.
+    `relative_error` (nan where it follows from the model's form), `meaning` what it is; None and ""
+    where none was found. `kind` is `only` where nothing but the formula is determined, `traded`
+    where the parameters are determined worse than it (with the errors `alone`), `group` where no
+    formula of them is known, `tied` where the first trades off with the others, `free` where the
+    data hardly depend on any; `product` and `force` follow from the model's form.
     """
 
+    kind: Literal["only", "traded", "group", "tied", "free", "product", "force"]
     parameters: tuple[str, ...]
-    known: str | None
-    relative_error: float
-    sentence: str
+    known: str | None = None
+    relative_error: float = nan
+    meaning: str = ""
+    alone: tuple[float, ...] = ()
 
 
 def free_combinations(
@@ -198,7 +157,7 @@ def free_combinations(
     judge = _Judge(model, found)
     results: list[Combination] = []
     candidates = [judge.known(f) for f in physical_formulas(model.values, found.names)]
-    open_ones = judge.weak()
+    open_ones = {n for n in found.names if judge.relative(n) > WEAK}
     while True:
         news = [(judge.rank(c, open_ones), c) for c in candidates if c and open_ones & set(c.parts)]
         if not news:
@@ -212,7 +171,13 @@ def free_combinations(
         if simple:
             results.append(judge.combination(simple))
             left = [n for n in left if n not in simple.parts]
-    return (*results, *judge.rest(left), *_from_the_form(model, found.names, force_scale_given))
+    results += judge.rest(left)
+    if "R_s" in found.names and "C_p" in model.values and "C_p" not in found.names:
+        results.append(Combination("product", ("R_s", "C_p"), "R_s C_p"))
+    if not force_scale_given:
+        scaled = tuple(p.name for p in model.structure.parameters if p.unit in _FORCES)
+        results.append(Combination("force", scaled))
+    return tuple(results)
 
 
 @dataclass(frozen=True)
@@ -234,14 +199,11 @@ class _Judge:
     def __init__(self, model: Model, found: Determinacy) -> None:
         self._model, self._found = model, found
 
-    def weak(self) -> set[str]:
-        """Return the parameters whose relative standard error is above `WEAK`."""
-        return {n for n in self._found.names if self._relative(n) > WEAK}
-
     def known(self, formula: Formula) -> _Known | None:
         """Return a formula that is known far better than its parameters, else None."""
         found, names = self._found, self._found.names
-        free = [n for n in formula.names if n in names]
+        order = formula.names if formula.physical else names
+        free = [n for n in order if n in names and n in formula.names]
         gradient = np.array([self._slope(formula, n) if n in free else 0.0 for n in names])
         value = abs(formula.value(self._model.values))
         error = float(np.sqrt(max(float(gradient @ found.covariance @ gradient), 0.0)))
@@ -256,16 +218,12 @@ class _Judge:
         free = sum(n in self._found.names for n in known.formula.names)
         return float(known.cancelled * 2.0**free / len(wanted & set(known.parts)))
 
-    def combination(self, known: _Known) -> Combination:
-        """Say what is known and what trades off."""
-        formula, parts, error = known.formula, known.parts, _percent(known.relative)
-        meaning = f"{formula.meaning}, {formula.text},"
-        if any(n in self._found.undetermined for n in parts):
-            text = f"Only {meaning} is determined, to {error}; {_listing(parts)} trade off in it."
-        else:
-            alone = _listing([f"{n} to {_percent(self._relative(n))}" for n in parts])
-            text = f"{_listing(parts)} trade off: {meaning} is known to {error}, {alone}."
-        return Combination(parts, formula.text, known.relative, text)
+    def combination(self, c: _Known) -> Combination:
+        """Return what is known and what trades off."""
+        only = any(n in self._found.undetermined for n in c.parts)
+        alone = () if only else tuple(self.relative(n) for n in c.parts)
+        kind: Literal["only", "traded"] = "only" if only else "traded"
+        return Combination(kind, c.parts, c.formula.text, c.relative, c.formula.meaning, alone)
 
     def rest(self, names: Sequence[str]) -> Iterator[Combination]:
         """Yield undetermined parameters that no formula explains, with what they are tied to."""
@@ -277,57 +235,26 @@ class _Judge:
                 left = [n for n in left if n not in group]
             others = [n for n in self._found.names if n not in names and self._tied(group[0], n)]
             if len(group) > 1:
-                text = f"{_listing(group)} trade off; no simple formula of them is known."
-                yield Combination(tuple(group), None, nan, text)
+                yield Combination("group", tuple(group))
             elif others:
-                text = f"{group[0]} is free; it trades off with {_listing(others)}."
-                yield Combination((*group, *others), None, nan, text)
+                yield Combination("tied", (*group, *others))
             else:
                 alone += group
         if alone:
-            be, which = ("is", "it") if len(alone) == 1 else ("are", "any of them")
-            text = f"{_listing(alone)} {be} free: these records hardly depend on {which}."
-            yield Combination(tuple(alone), None, nan, text)
+            yield Combination("free", tuple(alone))
+
+    def relative(self, name: str) -> float:
+        """Return a parameter's standard error over its value."""
+        value = self._model.values[name]
+        size = abs(value) or self._model.parameter(name).typical(self._model.values)
+        return self._found.standard_errors[name] / size
 
     def _tied(self, one: str, other: str) -> bool:
         row, column = self._found.names.index(one), self._found.names.index(other)
         return bool(one != other and abs(self._found.correlations[row, column]) > TIED)
-
-    def _relative(self, name: str) -> float:
-        value = self._model.values[name]
-        size = abs(value) or self._model.parameter(name).typical(self._model.values)
-        return self._found.standard_errors[name] / size
 
     def _slope(self, formula: Formula, name: str) -> float:
         values = self._model.values
         step = _STEP * (abs(values[name]) or self._model.parameter(name).typical(values))
         up, down = (formula.value({**values, name: values[name] + h}) for h in (step, -step))
         return (up - down) / (2.0 * step)
-
-
-def _from_the_form(
-    model: Model, free: Sequence[str], force_scale_given: bool
-) -> Iterator[Combination]:
-    """Yield what no record of voltage and displacement can tell."""
-    if "R_s" in free and "C_p" in model.values and "C_p" not in free:
-        text = (
-            "Only the product R_s C_p shows in a displacement; R_s is right for the C_p that the"
-            " model assumes."
-        )
-        yield Combination(("R_s", "C_p"), "R_s C_p", nan, text)
-    if not force_scale_given:
-        units = ("N/V", "N/(V.s)", "N", "kg", "N.s/m", "N/m")
-        scaled = tuple(p.name for p in model.structure.parameters if p.unit in units)
-        text = (
-            f"The scale of force is free: {_listing(scaled)} may all be multiplied by one factor;"
-            " a stiffness or blocking force from outside fixes it."
-        )
-        yield Combination(scaled, None, nan, text)
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %" if share < 0.995 else "no better than its size"
-
-
-def _listing(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

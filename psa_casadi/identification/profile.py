@@ -11,7 +11,7 @@ from psa_casadi.identification.fitting.fit import Fit, objective
 from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray, convert
+from psa_casadi.units import FloatArray
 
 Progress = Callable[[str], None]
 
@@ -314,35 +314,3 @@ def _spread(fit: Fit, experiments: Sequence[Experiment], name: str) -> tuple[flo
     found = max(float(gradient @ covariance_of(fit, experiments) @ gradient), 1e-12 * white)
     # a parameter that the prior holds has no ratio of its own: the residuals' variance stands in
     return float(np.sqrt(found)), max(found / white, variance / samples)
-
-
-def profile_sentences(p: Profile) -> tuple[str, ...]:
-    """Return a profile in words: its interval with open ends, and what is odd about it."""
-    low, high = (None if end is None else _shown(p, end) for end in (p.low, p.high))
-    if low and high:
-        text = f"{p.name} lies between {low} and {high}"
-    elif low:
-        text = f"{p.name} is above {low}; nothing bounds it from above"
-    elif high:
-        text = f"{p.name} is below {high}; nothing bounds it from below"
-    else:
-        text = f"{p.name} is not determined: values from {_span(p)} fit as well as"
-        return (f"{text} {_shown(p, p.estimate)} (profile likelihood, 95 %).",)
-    sentences = [f"{text} (profile likelihood, 95 %); the estimate is {_shown(p, p.estimate)}."]
-    at_estimate = float(np.interp(p.estimate, p.values, p.increase))
-    if at_estimate > 0.1 * PROFILE_LIMIT:
-        best = _shown(p, float(p.values[np.argmin(p.increase)]))
-        sentences.append(
-            f"The fit had not reached its minimum: with {p.name} = {best} the cost is lower by"
-            f" {at_estimate:.2g} (limit {PROFILE_LIMIT:.3g}); start a fit from there."
-        )
-    return tuple(sentences)
-
-
-def _span(p: Profile) -> str:
-    return f"{_shown(p, float(p.values[0]))} to {_shown(p, float(p.values[-1]))}"
-
-
-def _shown(p: Profile, value: float) -> str:
-    number = f"{convert(value, p.unit, p.display_unit):.4g}"
-    return number if p.unit == "1" else f"{number} {p.display_unit}"

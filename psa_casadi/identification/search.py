@@ -44,6 +44,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
+from psa_casadi.shown import Note
 from psa_casadi.simulation.timings import stage
 from psa_casadi.units import FloatArray
 
@@ -269,12 +270,12 @@ def search_forms(
     linear: Sequence[LinearCandidate] = (),
     thorough: bool = False,
     progress: Progress = lambda _: None,
-) -> tuple[Search, str]:
-    """Search from each model, and return the search that the records prefer, and why in words.
+) -> tuple[Search, Note | None]:
+    """Search from each model, and return the search that the records prefer, and why.
 
     That of the smaller Schwarz criterion, sum_r n_r ln S_r + k ln n: S_r the mean square of record
-    r's residual, k the parameters, n the samples (Schwarz, Annals of Statistics 6 (1978) 461). The
-    words are empty for one model. Raises PsaError where no model can be fitted.
+    r's residual, k the parameters, n the samples (Schwarz, Annals of Statistics 6 (1978) 461). None
+    for one model. Raises PsaError where no model can be fitted.
     """
     found: list[Search] = []
     failed: list[PsaError] = []
@@ -291,11 +292,9 @@ def search_forms(
         raise failed[0]
     ranked = sorted(found, key=lambda s: _criterion(s.best, experiments))
     if len(ranked) < 2:
-        return ranked[0], ""
-    (form, rms), (other, more) = ((_form(s.best), 1e9 * s.best.rms) for s in ranked)
-    return ranked[0], (
-        f"hysteresis: {form}, which leaves {rms:.3g} nm rms; {other} would leave {more:.3g} nm."
-    )
+        return ranked[0], None
+    pairs = ((_form(s.best), 1e9 * s.best.rms) for s in ranked)
+    return ranked[0], Note("form", tuple(word for pair in pairs for word in pair))
 
 
 def _form(found: Fit) -> str:

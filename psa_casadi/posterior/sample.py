@@ -21,7 +21,7 @@ from psa_casadi.posterior.chains import (
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.scratch import temporary_folder
-from psa_casadi.shown import Shown, frame
+from psa_casadi.shown import Note, Shown, frame, sentences
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.side_by_side import one_thread
 from psa_casadi.simulation.ways import output_of
@@ -78,8 +78,18 @@ class Posterior(Shown):
     draws: int
     seed: int
     task: Task
-    warnings: tuple[str, ...]
-    sentences: tuple[str, ...]
+    doubts: tuple[Note, ...]
+    notes: tuple[Note | str, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be doubted, in words."""
+        return sentences(self.doubts)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was done to the records and the prior's draws, in words."""
+        return sentences(self.notes)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the data tree as netCDF 4, whole or not at all; `arviz.from_netcdf` reads it.
@@ -139,49 +149,27 @@ def _share(task: Task, name: str, values: Any, spread: float) -> float:
     return float(np.std(moved) / u.prior[k])
 
 
-def warnings_of(task: Task, chains: "Chains", figures: tuple[Figures, ...]) -> tuple[str, ...]:
-    """Say what of the chains, the records and the priors is to be doubted."""
-    count = chains.u.shape[0]
-    said: list[str] = []
+def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple[Note, ...]:
+    """Return what of the chains, the records and the priors is to be doubted."""
+    count, draws, _ = chains.u.shape
+    doubts = []
     if chains.divergences:
-        total = chains.u.shape[0] * chains.u.shape[1]
-        said.append(
-            f"{chains.divergences} of {total} transitions diverged: a part of the posterior may be"
-            " missing. Draw more with another seed, or hold what is open (--free)."
-        )
+        doubts.append(Note("diverged", (chains.divergences, count * draws)))
     apart = [f.name for f in figures if not f.r_hat <= MOST_RHAT]
     if apart:
-        said.append(
-            f"The chains disagree about {_listed(apart)} (r-hat above {MOST_RHAT}); take more draws"
-            " (--draws, --tune)."
-        )
+        doubts.append(Note("chains_disagree", (apart, MOST_RHAT)))
     few = [f.name for f in figures if f.ess < LEAST_ESS * count]
     if few:
-        said.append(
-            f"Fewer than {LEAST_ESS:.0f} effective draws per chain of {_listed(few)}: ends of"
-            " intervals are rough; take more draws (--draws)."
-        )
-    return (*said, *_of_the_records(task, figures))
-
-
-def _of_the_records(task: Task, figures: tuple[Figures, ...]) -> list[str]:
-    said = []
+        doubts.append(Note("few_draws", (few, LEAST_ESS)))
     if not task.converged:
-        said.append("The fit that the chains start from was cut off before it converged.")
+        doubts.append(Note("start_cut_off"))
     for e, worth in zip(task.experiments, task.inflation, strict=True):
         if worth > _COLOURED:
-            said.append(
-                f"Residuals of '{e.record.name}' are correlated: {worth:.3g} samples count as one,"
-                " and the model lacks something there; `psa diagnose` looks for the cause."
-            )
+            doubts.append(Note("coloured", (e.record.name, worth)))
     held = [f.name for f in figures if f.prior_share > _PRIOR_SHARE]
     if held:
-        said.append(f"The records hardly tell {_listed(held)}: the posterior is that of the prior.")
-    return said
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(f"'{n}'" for n in names)
+        doubts.append(Note("of_the_prior", (held,)))
+    return tuple(doubts)
 
 
 Progress = Callable[[str], None]
@@ -253,10 +241,7 @@ def sample(
         after = predictive(task, flat[some], rng, fit_offset=False)
     tree = data_tree(task, found, theta, before, after)
     figures = figures_of(task, tree)
-    failed = (
-        (f"{before.failed} of {_PREDICTED} draws of the prior cannot be simulated; they are left"
-        " out of the prior's groups.",) if before.failed else ()
-    )  # fmt: skip
+    failed = [Note("prior_fails", (before.failed, _PREDICTED))] if before.failed else []
     return Posterior(
         model=task.model.with_values(task.unknowns.values(task.theta)),
         tree=tree,
@@ -266,8 +251,8 @@ def sample(
         draws=draws,
         seed=seed,
         task=task,
-        warnings=warnings_of(task, found, figures),
-        sentences=(*task.sentences, *failed),
+        doubts=doubts_of(task, found, figures),
+        notes=(*task.sentences, *failed),
     )
 
 

@@ -275,7 +275,7 @@ def identify_by_paper(
         fit=best,
         determinacy=nothing,
         experiments=experiments,
-        warnings=sentences,
+        doubts=sentences,
         read_off=found,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import Identification
-from psa_casadi.identification.profile import Profile, profile_sentences
+from psa_casadi.identification.profile import Profile
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_part import LiveModel, add_live, live_fit
 from psa_casadi.report.page.own_model_page import write_own_fit_report
@@ -17,6 +17,7 @@ from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_still
 from psa_casadi.report.plots.finding_plots import correlation_plot, determinacy_plot
 from psa_casadi.report.plots.profile_plot import profile_plot
+from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.report.words.fit_words import (
     determined_sentence,
     error_bar_note,

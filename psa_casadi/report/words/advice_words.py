@@ -1,0 +1,178 @@
+"""What an identification leaves open, in words: notes, combinations, records to measure, profiles.
+
+Results carry codes and figures; every sentence about them is made here.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import singledispatch
+from math import floor, log10
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.identification.advice import Advice, Plan
+from psa_casadi.identification.combinations import Combination
+from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
+from psa_casadi.report.words.phrases import listing
+from psa_casadi.shown import Note
+from psa_casadi.units import convert
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return ", ".join(f"'{n}'" for n in names)
+
+
+#: Sentences by the codes of notes; their figures are put in where the braces stand.
+_NOTES: Mapping[str, str | Callable[..., str]] = {
+    "interrupted": "The search was interrupted; this is the best fit so far, and its values are not"
+    " final.",
+    "cut_off": "The fit was cut off before it converged; its values are not final.",
+    "not_unique": lambda names: (
+        f"Two starts led to equally good fits that differ in {_quoted(names)}: these records cannot"
+        " tell which is right."
+    ),
+    "one_start": "Of {} starts only one led to this minimum; it is the best found, and may not be"
+    " the best there is.",
+    "on_bound": "'{}' sits on a bound of its range; its interval means nothing.",
+    "undetermined": lambda names: (
+        f"{_quoted(names)} {'is' if len(names) == 1 else 'are'} not determined by these records."
+    ),
+    "missed": "Record '{}' is missed by {:.2g} times its noise: the model lacks something there;"
+    " `psa diagnose` looks for the cause.",
+    "form": "hysteresis: {}, which leaves {:.3g} nm rms; {} would leave {:.3g} nm.",
+    "diverged": "{} of {} transitions diverged: a part of the posterior may be missing. Draw more"
+    " with another seed, or hold what is open (--free).",
+    "chains_disagree": lambda names, limit: (
+        f"The chains disagree about {_quoted(names)} (r-hat above {limit}); take more draws"
+        " (--draws, --tune)."
+    ),
+    "few_draws": lambda names, limit: (
+        f"Fewer than {limit:.0f} effective draws per chain of {_quoted(names)}: ends of intervals"
+        " are rough; take more draws (--draws)."
+    ),
+    "start_cut_off": "The fit that the chains start from was cut off before it converged.",
+    "coloured": "Residuals of '{}' are correlated: {:.3g} samples count as one, and the model lacks"
+    " something there; `psa diagnose` looks for the cause.",
+    "of_the_prior": lambda names: (
+        f"The records hardly tell {_quoted(names)}: the posterior is that of the prior."
+    ),
+    "prior_fails": "{} of {} draws of the prior cannot be simulated; they are left out of the"
+    " prior's groups.",
+}
+
+
+@singledispatch
+def sentence_of(result: Any) -> str:
+    """Return a note, a combination or an advice as a sentence."""
+    raise TypeError(f"{type(result).__name__} has no sentence")
+
+
+@sentence_of.register
+def _note(note: Note) -> str:
+    words = _NOTES[note.code]
+    return words.format(*note.of) if isinstance(words, str) else words(*note.of)
+
+
+@sentence_of.register
+def _combination(c: Combination) -> str:
+    names = listing(c.parameters)
+    if c.kind in ("only", "traded"):
+        meaning, error = f"{c.meaning}, {c.known},", _error(c.relative_error)
+        if c.kind == "only":
+            return f"Only {meaning} is determined, to {error}; {names} trade off in it."
+        pairs = zip(c.parameters, c.alone, strict=True)
+        alone = listing([f"{n} to {_error(share)}" for n, share in pairs])
+        return f"{names} trade off: {meaning} is known to {error}, {alone}."
+    if c.kind == "tied":
+        return f"{c.parameters[0]} is free; it trades off with {listing(c.parameters[1:])}."
+    if c.kind == "free":
+        be, which = ("is", "it") if len(c.parameters) == 1 else ("are", "any of them")
+        return f"{names} {be} free: these records hardly depend on {which}."
+    return {
+        "group": f"{names} trade off; no simple formula of them is known.",
+        "product": "Only the product R_s C_p shows in a displacement; R_s is right for the C_p that"
+        " the model assumes.",
+        "force": f"The scale of force is free: {names} may all be multiplied by one factor; a"
+        " stiffness or blocking force from outside fixes it.",
+    }[c.kind]
+
+
+def _error(share: float) -> str:
+    return f"{100.0 * share:.2g} %" if share < 0.995 else "no better than its size"
+
+
+@sentence_of.register
+def _advice(a: Advice) -> str:
+    if a.plan is None:
+        them = "it" if len(a.parameters) == 1 else "them"
+        names = listing(a.parameters) if a.parameters else ""
+        return {
+            "ringing": f"If the mechanics ring, {names} would be determined as well.",
+            "nothing": f"None of the {a.tried} steps, multisines, loops and holds that were tried"
+            f" on the model, with the noise of these records, is sure to determine {names}; take"
+            f" {them} from elsewhere, or use what is known of the combinations.",
+            "force": "A stiffness or blocking force, from the data sheet or measured, would fix the"
+            " scale of force; no record of voltage and displacement can.",
+        }[a.kind]
+    words = plan_words(a.plan)
+    words += "".join(f", or {plan_words(o, sampled=False)}," for o in a.instead)
+    times = {1: "", 2: ", twice,"}.get(a.repeats, f", {a.repeats} times,")
+    beside = "together with what is advised above, " if a.kind == "together" else ""
+    text = f"{beside}{words}{times} would determine {listing(a.parameters)}."
+    return text[0].upper() + text[1:]
+
+
+def plan_words(p: Plan, *, sampled: bool = True) -> str:
+    """Return what to measure, with how it is to be `sampled` where that is fast."""
+    between = f"{quantity(p.low, 'V')} to {quantity(p.high, 'V')}"
+    at, length = quantity(p.frequency, "Hz"), quantity(p.length, "s")
+    how = f" (sampled at {quantity(p.rate, 'Hz')} or faster for {length})" if sampled else ""
+    return {
+        "step": f"a step from {between} and back{how}",
+        "multisine": f"a multisine from {between} up to {at}{how}",
+        "loop": f"two loops (a sine) from {between} at {at}",
+        "minor loops": f"nested minor loops (a triangle of {p.cycles} cycles from {between} that"
+        f" closes in on the middle) at {at}",
+        "hold": f"a step from {between} held for {length}",
+    }[p.kind]
+
+
+def quantity(value: float, unit: str) -> str:
+    """Return a value with three digits at most and a prefix, such as "200 kHz"."""
+    if value == 0.0:
+        return f"0 {unit}"
+    prefixes = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+    power = int(np.clip(3 * floor(log10(abs(value) * 1.0005) / 3), -9, 6))
+    if unit == "s" and value >= 1.0:
+        power = 0
+    return f"{value / 10.0**power:.3g} {prefixes[power]}{unit}"
+
+
+def profile_sentences(p: Profile) -> tuple[str, ...]:
+    """Return a profile in words: its interval with open ends, and what is odd about it."""
+    low, high = (None if end is None else _shown(p, end) for end in (p.low, p.high))
+    estimate = _shown(p, p.estimate)
+    if low and high:
+        text = f"{p.name} lies between {low} and {high}"
+    elif low:
+        text = f"{p.name} is above {low}; nothing bounds it from above"
+    elif high:
+        text = f"{p.name} is below {high}; nothing bounds it from below"
+    else:
+        first, last = (_shown(p, float(v)) for v in p.values[[0, -1]])
+        text = f"{p.name} is not determined: values from {first} to {last} fit as well as"
+        return (f"{text} {estimate} (profile likelihood, 95 %).",)
+    sentences = [f"{text} (profile likelihood, 95 %); the estimate is {estimate}."]
+    at_estimate = float(np.interp(p.estimate, p.values, p.increase))
+    if at_estimate > 0.1 * PROFILE_LIMIT:
+        best = _shown(p, float(p.values[np.argmin(p.increase)]))
+        sentences.append(
+            f"The fit had not reached its minimum: with {p.name} = {best} the cost is lower by"
+            f" {at_estimate:.2g} (limit {PROFILE_LIMIT:.3g}); start a fit from there."
+        )
+    return tuple(sentences)
+
+
+def _shown(p: Profile, value: float) -> str:
+    number = f"{convert(value, p.unit, p.display_unit):.4g}"
+    return number if p.unit == "1" else f"{number} {p.display_unit}"
