@@ -1,7 +1,5 @@
 """What `identify` finds, against independent plants, the reference, and a real instrument."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,14 +10,13 @@ from psa_casadi.identification.identify import identify
 from psa_casadi.identification.refitting import refit_or_keep
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, multisine, read_record, time_grid
+from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.simulation.stepper import SimulationError
 from tests.identified_plants import (
     combinations,
     identified,
     noise,
     plant,
-    same_as_the_named_stack,
     standard_errors,
     values_of,
 )
@@ -189,18 +186,3 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     first = found.fit
     monkeypatch.setattr(refitting, "fit", fails)
     assert refit_or_keep(first, found.experiments, first.unknowns.names, first.sigma) is first
-
-
-@slow
-@pytest.mark.parametrize(
-    ("record", "limit"), [pytest.param("sine_1hz", 0.49, marks=slow), ("minor_loops", 0.64)]
-)
-def test_the_micromanipulator_is_met_within_its_floors(
-    measured_data: Path, record: str, limit: float
-) -> None:
-    r = read_record(measured_data / "micromanipulator" / f"{record}.csv")
-    found = identify([r])
-    assert found.fit.converged
-    assert 100.0 * found.fit.rms / r.range_m <= limit
-    if record == "minor_loops":
-        same_as_the_named_stack(found.fit.rms, r, "micromanipulator")

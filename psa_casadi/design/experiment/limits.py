@@ -6,9 +6,9 @@ Each waveform is a function of a vector p within bounds; the optimiser changes p
 rest at the lowest voltage and are linear between samples.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -108,20 +108,14 @@ def limits_of(records: Sequence[Record], **changes: float | None) -> Limits:
     `changes` replace fields that are not None.
     """
     longest = max(records, key=lambda r: r.duration)
-    own: dict[str, float] = {
+    own: dict[str, Any] = {
         "low": min(float(np.min(r.voltage)) for r in records),
         "high": max(float(np.max(r.voltage)) for r in records),
         "duration": longest.duration * longest.n / (longest.n - 1),
         "samples": longest.n,
     }
-    own.update({k: v for k, v in changes.items() if v is not None})
-    return _limits(own)
-
-
-def _limits(given: Mapping[str, float]) -> Limits:
-    fields = dict(given)
-    samples = int(fields.pop("samples"))
-    return Limits(fields.pop("low"), fields.pop("high"), fields.pop("duration"), samples, **fields)
+    own |= {name: value for name, value in changes.items() if value is not None}
+    return Limits(**own | {"samples": int(own["samples"])})
 
 
 def excess(record: Record, limits: Limits, capacitance: float | None) -> tuple[str, ...]:

@@ -218,31 +218,16 @@ def usage(
     )
 
 
-def broken(response: Response, limits: AmplifierLimits, slack: float = 1e-3) -> tuple[str, ...]:
-    """Return one sentence for each limit that a response breaks by more than the share `slack`."""
-    rate = np.abs(np.diff(response.voltage) / np.diff(response.time))
+def breaks(response: Response, limits: AmplifierLimits, slack: float = 1e-3) -> bool:
+    """Whether a response breaks a limit by more than the share `slack`."""
+    v, rate = response.voltage, np.diff(response.voltage) / np.diff(response.time)
     span = limits.max_voltage - limits.min_voltage
-    room = slack * span if np.isfinite(span) else slack * max(1.0, np.ptp(response.voltage))
-    checks = (
-        ("highest voltage", response.voltage.max() - limits.max_voltage > room, "V"),
-        ("lowest voltage", limits.min_voltage - response.voltage.min() > room, "V"),
-        ("largest rate", rate.max() > (1.0 + slack) * limits.max_rate, "V/s"),
-        (
-            "largest current",
-            np.abs(response.current).max() > (1.0 + slack) * limits.max_current,
-            "A",
-        ),
-    )
-    values = (
-        response.voltage.max(),
-        response.voltage.min(),
-        rate.max(),
-        np.abs(response.current).max(),
-    )
-    return tuple(
-        f"The {name} would be {value:.4g} {unit}, beyond its limit."
-        for (name, is_broken, unit), value in zip(checks, values, strict=True)
-        if is_broken
+    room = slack * (span if np.isfinite(span) else max(1.0, float(np.ptp(v))))
+    return bool(
+        v.max() > limits.max_voltage + room
+        or v.min() < limits.min_voltage - room
+        or np.abs(rate).max() > (1.0 + slack) * limits.max_rate
+        or np.abs(response.current).max() > (1.0 + slack) * limits.max_current
     )
 
 

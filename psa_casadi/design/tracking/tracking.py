@@ -29,7 +29,7 @@ from psa_casadi.design.tracking.targets import (
     Response,
     Target,
     TrackingError,
-    broken,
+    breaks,
     demand_stack,
     dynamics_of,
     error_of,
@@ -420,10 +420,10 @@ def _chosen(
             if minimax
             else error.rms <= share * cut.error.rms
         )
-        if better or broken(cut.response, limits):
+        if better or breaks(cut.response, limits):
             predicted = np.concatenate([target.displacement[:1], best.displacement[1]])
             return response, error, predicted, True, best.converged
-    elif broken(cut.response, limits):
+    elif breaks(cut.response, limits):
         raise PsaError(
             "No voltage within the limits was found that comes near the path; widen the limits or"
             " slow the path down."
