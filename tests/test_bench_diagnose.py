@@ -4,11 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from tests.benchmarks.hidden import missed, result_tables
-from tests.benchmarks.hidden_cases import Case, Found, Kind
-from tests.benchmarks.hidden_figure import RELIABILITY, in_class, picture
-from tests.benchmarks.hidden_gain import Covered, intervals_table
-from tests.benchmarks.hidden_limits import limits_row
+from tests.benchmarks.hidden import (
+    RELIABILITY,
+    Covered,
+    in_class,
+    intervals_table,
+    missed,
+    picture,
+    result_tables,
+)
+from tests.benchmarks.hidden_cases import Case, Found, Kind, limits_row
 
 KNOWN, FOREIGN = ("slow_creep", "offset_drift"), ("dry_friction",)
 

@@ -9,10 +9,19 @@ import pytest
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.device import run as device
-from tests.benchmarks import ensembles, ensembles_peers
-from tests.benchmarks.ensembles import Case, cases, drawn, loosest, measured
-from tests.benchmarks.ensembles_gpu import on_gpu
-from tests.benchmarks.ensembles_peers import Peer, Solve, Work, peers
+from tests.benchmarks import ensembles
+from tests.benchmarks.ensembles import (
+    Case,
+    Peer,
+    Solve,
+    Work,
+    cases,
+    drawn,
+    loosest,
+    measured,
+    on_gpu,
+    peers,
+)
 from tests.cuda_host import lend
 from tests.tiers import slow
 
@@ -53,7 +62,7 @@ def test_the_loosest_tolerance_is_the_first_that_is_accurate() -> None:
 @slow
 def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight sets of 40 samples, scipy and CVODES beside `simulate_many`."""
-    monkeypatch.setattr(ensembles_peers, "find_spec", lambda _: None)
+    monkeypatch.setattr(ensembles, "find_spec", lambda _: None)
     monkeypatch.setattr(ensembles, "_REPEATS", 1)
     ways, absent = peers()
     whole, beside = measured(told, [short()], 8, 40, ways, absent).tables

@@ -10,17 +10,26 @@ from psa_casadi.errors import PsaError
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import EXACT, STEPPER
-from tests.benchmarks.fits import Point, cheapest, lanes_table, least_times, run_table, time_at
-from tests.benchmarks.fits_diagnosis import Spent, spent_table, stepper_alone
-from tests.benchmarks.fits_figure import picture
+from tests.benchmarks.fits import (
+    Point,
+    cheapest,
+    lanes_table,
+    least_times,
+    picture,
+    run_table,
+    time_at,
+)
 from tests.benchmarks.fits_ways import (
     KINKED,
     MIXED,
     Reached,
+    Spent,
     Trial,
     effects_table,
     errors_table,
     exceeding_table,
+    spent_table,
+    stepper_alone,
     voltage,
     with_one_effect,
 )

@@ -32,9 +32,15 @@ from psa_casadi.design.tracking.tracking import (
     track,
 )
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
-from tests.benchmarks.creeping_reference import creeping_displacement
-from tests.benchmarks.design_tracking import LIMITS, own_bang_bang, scan, scanner, wrong_values
-from tests.benchmarks.linear_bound import bang_bang_bound
+from tests.benchmarks.design_tracking import (
+    LIMITS,
+    bang_bang_bound,
+    creeping_displacement,
+    own_bang_bang,
+    scan,
+    scanner,
+    wrong_values,
+)
 from tests.fmu_models import exported
 from tests.tiers import slow
 

@@ -18,7 +18,7 @@ from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.model.system.system import connect
 from psa_casadi.simulation.stepper import run
-from tests.benchmarks.nonlinearity_plant import Controller, simulate_positioner
+from tests.benchmarks.nonlinearity import Controller, simulate_positioner
 from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,7 @@ from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, time_grid
 from psa_casadi.records.split import whole
 from psa_casadi.simulation.simulate import simulate
-from tests.benchmarks.three_mechanics import two_masses as two_linear_masses
+from tests.benchmarks.verification_cases import two_masses as two_linear_masses
 from tests.plants.base import Run, simulate_base
 from tests.plants.reciprocal_coupling import matrices, two_masses
 from tests.plants.stack import Stack

@@ -20,8 +20,7 @@ from psa_casadi.model.system.tuning import controller_for, margins_of
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output
 from tests.benchmarks import nonlinearity
-from tests.benchmarks.nonlinearity_figure import picture
-from tests.benchmarks.nonlinearity_plant import simulate_positioner
+from tests.benchmarks.nonlinearity import picture, simulate_positioner
 from tests.modelica_runs import simulated
 from tests.tiers import slow
 

@@ -8,15 +8,8 @@ import pytest
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import steps, time_grid
 from tests.benchmarks import verification
-from tests.benchmarks.outcome import Progress
-from tests.benchmarks.three_mechanics import (
-    Match,
-    matches,
-    plant_response,
-    tables,
-    with_single_mass,
-)
-from tests.benchmarks.verification import run, verification_tables
+from tests.benchmarks.table import Progress
+from tests.benchmarks.verification import picture, run, verification_tables
 from tests.benchmarks.verification_cases import (
     FITTED_LOOPS,
     KEPT_LOOPS,
@@ -25,10 +18,14 @@ from tests.benchmarks.verification_cases import (
     OTHER,
     STEPS,
     Comparison,
+    Match,
     instrument,
+    matches,
+    plant_response,
     synthetic,
+    tables,
+    with_single_mass,
 )
-from tests.benchmarks.verification_figure import picture
 from tests.tiers import slow
 
 RATED = STACKS["P-885.51"].values["u_rated"].value

@@ -13,8 +13,7 @@ from psa_casadi.cli.screen import Quiet, show, show_table, tell_written, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path, atomic_write
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome
-from tests.benchmarks.table import BENCHES
+from tests.benchmarks.table import BENCHES, Outcome
 
 
 def bench(

@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.thresholds import Thresholds
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden import diagnose_all
 from tests.benchmarks.hidden_cases import Case, Found, study
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, share
 from tests.plants.table import FOREIGN, KNOWN
 
 #: The first of the seeds, which no other benchmark uses; of those of two and three causes.

@@ -4,11 +4,8 @@ The plant plays the record's own voltage with the effect and without it; the dif
 the record's stroke, is added to what was measured. What the record has by itself stays.
 """
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 
 import numpy as np
 
@@ -18,7 +15,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.turns import reversals
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden_cases import names_of
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
 from tests.plants.base import simulate_base
 from tests.plants.hide import hide
 from tests.plants.stack import FloatArray, draw_stack
@@ -53,6 +50,10 @@ class Added:
         """Whether the effect is in a named set."""
         return called(self.effect) in self.within
 
+    def __str__(self) -> str:
+        """Return case and answer in a line."""
+        return f"{self.record} with {self.effect}: {', '.join(self.within)}"
+
     @property
     def wrong(self) -> tuple[str, ...]:
         """Causes that neither the record has by itself nor the effect is."""
@@ -69,17 +70,13 @@ def run(progress: Progress, quick: bool) -> Outcome:
     effects = [e for e in KNOWN if HIDDEN_EFFECTS[e].room is None]
     pieces = excerpts(1 if quick else EXCERPTS)[: 1 if quick else None]
     effects = effects[::5] if quick else effects
-    found: list[Added] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        plain = list(pool.map(said_of, pieces))
-        jobs = [
-            pool.submit(with_effect, piece, effect, FIRST + 100 * k + j, *own)
-            for k, (piece, own) in enumerate(zip(pieces, plain, strict=True))
-            for j, effect in enumerate(effects)
-        ]
-        for job in jobs:
-            found.append(job.result())
-            progress(f"{found[-1].record} with {found[-1].effect}: {', '.join(found[-1].within)}")
+    plain = on_all_cores(said_of, [(p,) for p in pieces], lambda one: ", ".join(one[0]), progress)
+    jobs = [
+        (piece, effect, FIRST + 100 * k + j, *own)
+        for k, (piece, own) in enumerate(zip(pieces, plain, strict=True))
+        for j, effect in enumerate(effects)
+    ]
+    found = on_all_cores(with_effect, jobs, str, progress)
     return Outcome((summary(found), rows_of(found)))
 
 

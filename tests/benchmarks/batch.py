@@ -5,23 +5,140 @@ All devices are worked on by four workers of Dask, one of which is killed after 
 
 import os
 import resource
+import signal
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from psa_casadi.devices.batch import BatchRun, batch
+from psa_casadi.devices.executors import LOCAL, dask_client
 from psa_casadi.population.population import Population, population
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.batch_dask import on_dask
-from tests.benchmarks.batch_devices import DEFECTS, Device, write_devices
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, share
+from tests.plants.base import simulate_base
+from tests.plants.make import write_csv
+from tests.plants.stack import FloatArray, Stack, draw_stack
+
+
+@dataclass
+class Killer:
+    """Kills a worker, as a machine that is lost would be, when a share of the devices is there."""
+
+    workers: dict[str, int]
+    devices: int
+    share: float = 1.0 / 3.0
+    done: int = 0
+    killed: list[int] = field(default_factory=list)
+
+    def __call__(self, told: str, progress: Progress) -> None:
+        """Count the devices by what is told after each; kill the first worker when it is time."""
+        progress(told)
+        self.done += " devices" in told
+        if self.done >= self.share * self.devices and not self.killed:
+            pid = min(self.workers.values())
+            os.kill(pid, signal.SIGKILL)
+            self.killed.append(pid)
+
+
+def on_dask(
+    records: Path, output: Path, workers: int, progress: Progress, *, kill: bool = False
+) -> tuple[BatchRun, str]:
+    """Return a batch on a new cluster of so many workers, and what became of them."""
+    devices = len(list(records.glob("*.csv"))) - 1  # jobs.csv
+    with dask_client(LOCAL, workers) as client:
+        before = _processes_batch_dask(client)
+        killer = Killer(before, devices)
+        say: Callable[[str], None] = (lambda t: killer(t, progress)) if kill else progress
+        found = batch(records, output, executor=client, progress=say)
+        after = set(_processes_batch_dask(client).values())
+    gone = sorted(set(before.values()) - after)
+    if kill and gone != killer.killed:
+        raise RuntimeError(f"Workers {killer.killed} were killed, and {gone} are gone.")
+    new = len(after - set(before.values()))
+    return found, f"{len(gone)} worker killed, {new} new in its place" if kill else ""
+
+
+def _processes_batch_dask(client: Any) -> dict[str, int]:
+    """Return the process of each worker by its address."""
+    found: dict[str, int] = client.run(os.getpid)
+    return found
+
+
+#: Samples of a record, time between them [s], noise over the stroke.
+SAMPLES, STEP, NOISE = 600, 5e-3, 2e-4
+#: Standard deviation of ln of a sound device's parameters.
+SPREAD = 0.02
+#: What is wrong with a device, and how large: a factor on what is named.
+DEFECTS: dict[str, Callable[[Stack], Stack]] = {
+    "weak (force per volt 0.94)": lambda s: replace(s, k_l=0.94 * s.k_l),
+    "wide loop (hysteresis 1.08)": lambda s: _hysteresis(s, 1.08),
+    "stiff (compliance 0.94)": lambda s: replace(
+        s, k_p=s.k_p / 0.94, k_b=s.k_b / 0.94, m_p=s.m_p / 0.94, m_b=s.m_b / 0.94
+    ),
+    "sharp bend (n 1.08)": lambda s: replace(s, n=1.08 * s.n),
+}
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device of the population and its defect, "" where it has none."""
+
+    name: str
+    defect: str
+
+
+def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> tuple[Device, ...]:
+    """Write a record for each device, and a table of jobs; the same seed gives the same bytes."""
+    rng = np.random.default_rng(seed)
+    usual = draw_stack(np.random.default_rng(7))
+    times: FloatArray = STEP * np.arange(SAMPLES, dtype=np.float64)
+    bad = set(rng.choice(count, defects, replace=False).tolist())
+    kinds = list(DEFECTS)
+    found, rows = [], ["device,batch,date,files"]
+    for k in range(count):
+        stack = _drawn(usual, rng)
+        defect = kinds[len([b for b in bad if b < k]) % len(kinds)] if k in bad else ""
+        stack = DEFECTS[defect](stack) if defect else stack
+        run = simulate_base(stack, times, _voltage(times, usual.u_rated))
+        noise = NOISE * usual.stroke * rng.standard_normal(SAMPLES)
+        name = f"S{k:04d}"
+        write_csv(folder / f"{name}.csv", times, run.command, run.displacement + noise)
+        rows.append(f"{name},B{k * 10 // count},2026-{k * 12 // count + 1:02d}-15,{name}.csv")
+        found.append(Device(name, defect))
+    (folder / "jobs.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return tuple(found)
+
+
+def _drawn(usual: Stack, rng: np.random.Generator) -> Stack:
+    """Return a sound device: its own force, hysteresis, asymmetry and bend."""
+    factors = np.exp(SPREAD * rng.standard_normal(4))
+    stack = _hysteresis(usual, float(factors[1]))
+    return replace(
+        stack,
+        k_l=usual.k_l * float(factors[0]),
+        delta=stack.delta * float(factors[2]),
+        n=usual.n * float(factors[3]) if usual.n > 1.1 else usual.n,
+    )
+
+
+def _hysteresis(s: Stack, factor: float) -> Stack:
+    """Scale the hysteresis force; its reference force too, so that the loop keeps its shape."""
+    a, b, g, h = (factor * x for x in (s.a, s.beta, s.gamma, s.h_ref))
+    return replace(s, a=a, beta=b, gamma=g, h_ref=h)
+
+
+def _voltage(times: FloatArray, span: float) -> FloatArray:
+    """Return loops that shrink: every one turns at voltages of its own."""
+    return np.asarray(0.5 * span * (1.0 - np.cos(4.0 * np.pi * times)) * np.exp(-0.25 * times))
+
 
 #: Devices, of which one in twenty has a defect; devices of the runs with one, two and four workers.
 DEVICES, QUICK, PART = 100, 24, 24

@@ -29,7 +29,7 @@ from psa_casadi.simulation.stepper import run as integrate
 from tests.benchmarks.coupling_figure import picture
 from tests.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
 from tests.benchmarks.coupling_stability import Limit, limits, limits_table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 _END, _FREQUENCY, _TRUTH_STEP, _TRUTH, _TOLERANCE = 4e-3, 250.0, 2.5e-7, 1e-10, 1e-9
 _STEPS = (1e-5, 5e-6, 2.5e-6, 1.25e-6, 6.25e-7)

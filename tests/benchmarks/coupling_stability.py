@@ -20,7 +20,7 @@ from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.model.system.system import System
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import TitledTable
+from tests.benchmarks.table import TitledTable
 
 _STIFFNESSES = (5e6, 2e7, 5e7, 1e8, 2e8, 5e8)
 _KICK, _COUNT, _CLOSE, _LONG, _TOLERANCE = 1.0, 1500, 0.02, 1e-3, 1e-7

@@ -8,25 +8,73 @@ covariance of the fit gives it. Every stack has its own draws. Beside the share 
 stands what these draws alone give (`coverage_control`).
 """
 
-import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.noise.residual_tests import whiteness
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.records import Record
+from psa_casadi.records.split import whole
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.coverage_control import drawn_scores, gradients
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
 from tests.benchmarks.records import Values, clean_set, with_noise
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
 
 FloatArray = npt.NDArray[np.float64]
+_STEP, _RTOL = 1e-5, 1e-8
+
+
+def drawn_scores(
+    model: Model,
+    clean: Sequence[Record],
+    noisy: Sequence[Record],
+    names: Sequence[str],
+    level: float,
+    quantities: Callable[[Values], Values],
+) -> dict[str, float]:
+    """Return by how many standard errors the draws move each quantity, at the truth.
+
+    `model` carries the truth, `names` are the parameters that are fitted, `level` [m] is the
+    noise's; `quantities` makes the compared quantities of parameter values.
+    """
+    experiments = [whole(r) for r in clean]
+    at = fit(model, experiments, names, sigma=[level] * len(clean), evaluations=1, rtol=_RTOL)
+    pairs = zip(noisy, clean, strict=True)
+    noise = np.concatenate([_displacement(n) - _displacement(c) for n, c in pairs])
+    scaled, count = at.jacobian / level, len(names)
+    covariance = np.linalg.pinv(
+        scaled.T @ scaled + np.diag(1.0 / at.unknowns.prior**2), hermitian=True
+    )
+    moved = covariance @ (scaled.T @ (noise / level))
+    slopes = gradients(model.values, names, quantities) @ at.unknowns.slopes(at.theta)
+    errors = np.sqrt(np.einsum("qk,kl,ql->q", slopes, covariance[:count, :count], slopes))
+    scores = slopes @ moved[:count] / errors
+    return dict(zip(quantities(model.values), scores.tolist(), strict=True))
+
+
+def gradients(
+    values: Values, names: Sequence[str], quantities: Callable[[Values], Values]
+) -> FloatArray:
+    """Return d quantity / d parameter (quantities, k), by central differences."""
+    columns = []
+    for name in names:
+        h = _STEP * max(abs(values[name]), 1e-300)
+        up, down = (quantities({**values, name: values[name] + s}) for s in (h, -h))
+        columns.append([(up[q] - down[q]) / (2.0 * h) for q in up])
+    return np.array(columns).T
+
+
+def _displacement(record: Record) -> FloatArray:
+    if record.displacement is None:
+        raise ValueError(f"record '{record.name}' has no displacement")
+    return record.displacement
+
 
 NOISE, SEEDS, QUICK_SEEDS = 1e-3, 50, 2
 QUICK_STACKS = ("P-885.51", "PTBS200")
@@ -91,13 +139,8 @@ def run_sized(progress: Progress, count: int) -> Outcome:
 
 def _over(names: Sequence[str], seeds: int, progress: Progress) -> Outcome:
     """Identify the named stacks from `seeds` sets of records each, on all cores."""
-    runs: list[Run] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        for name in names:
-            jobs = [pool.submit(one_run, name, seed) for seed in range(seeds)]
-            for k, job in enumerate(jobs):
-                runs.append(job.result())
-                progress(f"{name}: {k + 1} of {seeds}")
+    jobs = [(name, seed) for name in names for seed in range(seeds)]
+    runs = on_all_cores(one_run, jobs, lambda run: run.stack, progress)
     return Outcome((_quantities(runs), _residuals(runs)))
 
 

@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-from tests.benchmarks.outcome import Outcome, Progress
+from tests.benchmarks.table import Outcome, Progress
 
 #: Each part measures its own tables: `tables(progress, quick)`.
 _PARTS = ("design_separation", "design_tracking", "design_linearisation")

@@ -25,7 +25,7 @@ from psa_casadi.online import (
 )
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Progress, TitledTable
+from tests.benchmarks.table import Progress, TitledTable
 
 STACKS = ("P-885.51", "demo")
 FREQUENCY, PERIOD = 5.0, 5e-4

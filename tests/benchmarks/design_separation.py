@@ -41,7 +41,7 @@ from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Progress, TitledTable
+from tests.benchmarks.table import Progress, TitledTable
 from tests.plants.again import play_again
 from tests.plants.excitations import PoorKind
 from tests.plants.make import Truth, make_record

@@ -1,10 +1,15 @@
 """Designed inputs measured: tracking, wrong parameters, quickest moves, time to design."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import expm
+from scipy.optimize import least_squares, linprog
 
+from psa_casadi import reference
 from psa_casadi.design.tracking.inversion import correct, invert
 from psa_casadi.design.tracking.minimum_time import INTERVALS, QuickMove, quickest_move
 from psa_casadi.design.tracking.targets import (
@@ -22,12 +27,171 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.linear_part import linear_part
-from tests.benchmarks.creeping_reference import creeping_displacement
-from tests.benchmarks.linear_bound import bang_bang_bound
-from tests.benchmarks.outcome import Progress, TitledTable
-from tests.benchmarks.own_bang_bang import BangBang
+from tests.benchmarks.table import Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]
+
+_RATIOS = (1.0, 10.0, 100.0)
+
+
+def creeping_displacement(
+    values: Mapping[str, float], time: FloatArray, voltage: FloatArray, *, rtol: float = 1e-7
+) -> FloatArray:
+    """Return the displacement (n,) [m] of a voltage (n,) [V] that starts at 0 from rest."""
+    found = reference.simulate(
+        values, reference.from_samples(time, voltage), time,
+        breakpoints=[float(t) for t in time[1:-1]], rtol=rtol,
+    )  # fmt: skip
+    return crept(values, time, found.displacement)
+
+
+def crept(values: Mapping[str, float], time: FloatArray, x: FloatArray) -> FloatArray:
+    """Return the displacement (n,) [m] with creep behind an x (n,) [m] that began at rest."""
+    gain, first = values.get("creep_gain", 0.0), values.get("creep_time", 1.0)
+    return np.asarray(x + gain * sum(_relaxed(time, x, first * r) for r in _RATIOS))
+
+
+def _relaxed(time: FloatArray, x: FloatArray, constant: float) -> FloatArray:
+    """Solve constant z' = x - z for an x that is linear between samples, from z = x."""
+    z, decays = np.empty_like(x), np.exp(-np.diff(time) / constant)
+    z[0] = x[0]
+    for k, (h, decay) in enumerate(zip(np.diff(time), decays, strict=True)):
+        slope = (x[k + 1] - x[k]) / h
+        z[k + 1] = x[k + 1] - slope * constant + decay * (z[k] - x[k] + slope * constant)
+    return z
+
+
+def bang_bang_bound(
+    p: Mapping[str, float], begin: float, end: float, low: float, high: float, n: int = 300
+) -> float:
+    """Return the least time [s] of the linear part from `begin` to `end` [m], `low` to `high` [V].
+
+    The voltage is held over n intervals, so the bound is that from above, by less than two of them.
+    """
+    a, b = _chain(p)
+    level = -np.linalg.solve(a, b)
+    size = level * (high - low)
+    size[3] = size[2] * np.sqrt(p["k_P"] / p["m_P"])
+    size[5] = size[4] * np.sqrt(p["k_B"] / p["m_B"])
+    a, b, level = a * size / size[:, None], b / size, level / size
+    gain = p["k_L"] * p["G"] * (1.0 / p["k_P"] + 1.0 / p["k_B"])
+    first: FloatArray = np.asarray(level * begin / gain, dtype=float)
+    last: FloatArray = np.asarray(level * end / gain, dtype=float)
+    short, long = 0.0, 100.0 * float(np.max(1.0 / np.abs(np.linalg.eigvals(a))))
+    while long - short > 1e-3 * long:
+        middle = 0.5 * (short + long)
+        if _possible(a, b, (first, last), (low, high), middle / n, n):
+            long = middle
+        else:
+            short = middle
+    return long
+
+
+def _chain(p: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+    """Return x' = a x + b v of u, f, y, y', x, x'."""
+    drive, a = p["R_s"] * p["C_p"], np.zeros((6, 6))
+    a[0, 0] = -1.0 / drive
+    a[1, :2] = p["k_L"] / p["tau"], -1.0 / p["tau"]
+    a[2, 3] = a[4, 5] = 1.0
+    a[3, 1:4] = np.array([1.0, -p["k_P"], -p["c_P"]]) / p["m_P"]
+    a[5, 2:] = np.array([p["k_P"] + p["k_B"], p["c_P"] + p["c_B"], -p["k_B"], -p["c_B"]]) / p["m_B"]
+    return a, np.r_[p["G"] / drive, np.zeros(5)]
+
+
+def _possible(
+    a: FloatArray, b: FloatArray, ends: tuple[FloatArray, FloatArray],
+    limits: tuple[float, float], h: float, n: int,
+) -> bool:  # fmt: skip
+    """Say whether some voltage takes the chain from one end to the other in n intervals h."""
+    k = len(b)
+    block = np.zeros((k + 1, k + 1))
+    block[:k, :k], block[:k, k] = a * h, b * h
+    power = expm(block)
+    step, weights = power[:k, :k], [power[:k, k]]
+    for _ in range(n - 1):
+        weights.append(step @ weights[-1])
+    left = ends[1] - np.linalg.matrix_power(step, n) @ ends[0]
+    rows = np.hstack([np.array(weights[::-1]).T, np.eye(k), -np.eye(k)])
+    bounds = [limits] * n + [(0.0, None)] * (2 * k)
+    answer: Any = linprog(np.r_[np.zeros(n), np.ones(2 * k)], A_eq=rows, b_eq=left, bounds=bounds)
+    return bool(answer.status == 0 and answer.fun < 1e-7)
+
+
+ARCS = 6
+#: Samples of a trajectory, along which creep is summed; lengths of the last arcs at the start of
+#: the search over the whole move; evaluations; residual, over the move, that is a solution.
+_SAMPLES, _TAIL, _EVALUATIONS, _SOLVED = 200, (0.02, 0.002), 200, 1e-6
+
+
+@dataclass(frozen=True)
+class BangBang:
+    """A move between the `limits` [V] from a rest in `initial` states, of which x has crept."""
+
+    values: Mapping[str, float]
+    initial: Mapping[str, float]
+    begin: float
+    end: float
+    limits: tuple[float, float]
+    upward: bool
+
+    def shortest(self, voltage: FloatArray, length: float) -> float | None:
+        """Return the length [s] of the move; None if the search does not settle.
+
+        It starts from the arcs of a `voltage` [V] on equal intervals of a designed move.
+        """
+        arcs = _arcs(voltage, self.limits, length)
+        scale = np.append(np.maximum(arcs / length, 0.01), 0.5)
+        start = np.append(arcs / length, voltage[-1] / self._span)
+        low = np.append(np.zeros(ARCS), self.limits[0] / self._span)
+        high = np.append(np.full(ARCS, np.inf), self.limits[1] / self._span)
+
+        def miss(q: FloatArray) -> FloatArray:
+            return self._miss(q[:-1] * length, float(q[-1]) * self._span)
+
+        found = least_squares(
+            miss, start, bounds=(low, high), x_scale=scale, diff_step=[1e-5],
+            xtol=1e-12, ftol=1e-12, max_nfev=_EVALUATIONS,
+        )  # fmt: skip
+        solved = float(np.max(np.abs(found.fun))) < 100.0 * _SOLVED
+        return float(np.sum(found.x[:-1]) * length) if solved else None
+
+    @property
+    def _span(self) -> float:
+        return self.limits[1] - self.limits[0]
+
+    def _miss(self, arcs: FloatArray, held: float) -> FloatArray:
+        """Return the distances from rest at the end (7,), in percent of the move."""
+        p, move = self.values, abs(self.end - self.begin)
+        ends = np.cumsum(np.maximum(arcs, 1e-12))
+        time = np.unique(np.concatenate([[0.0], ends, np.linspace(0.0, ends[-1], _SAMPLES)]))
+
+        def voltage(t: float) -> float:
+            arc = min(int(np.searchsorted(ends, t, side="right")), ARCS - 1)
+            return self.limits[int((arc % 2 == 0) == self.upward)]
+
+        found = reference.simulate(
+            p, voltage, time, initial=self.initial, breakpoints=ends[:-1].tolist(), rtol=1e-9
+        )
+        s = {n: float(v[-1]) for n, v in found.states.items()}
+        shown = float(crept(p, time, found.displacement)[-1])
+        force = p["k_L"] * p["G"] * held + s["f_H"]
+        y, x = force / p["k_P"], force * (1.0 / p["k_P"] + 1.0 / p["k_B"])
+        w_p, w_b = np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])
+        positions = [s["y"] - y, s["x"] - x, shown - self.end, s["v_y"] / w_p, s["v_x"] / w_b]
+        electric = (s["u"] - p["G"] * held) / self._span
+        mechanic = (s["f_out"] - force) * (1.0 / p["k_P"] + 1.0 / p["k_B"]) / move
+        return 100.0 * np.array([electric, mechanic, *(d / move for d in positions)])
+
+
+def _arcs(voltage: FloatArray, limits: tuple[float, float], length: float) -> FloatArray:
+    """Return the lengths [s] of the first four arcs of a designed voltage, and two short ones."""
+    high = voltage > 0.5 * sum(limits)
+    switches = np.flatnonzero(np.diff(high.astype(int))) + 1
+    edges = np.concatenate([[0], switches, [high.size]]) / high.size
+    seen = np.diff(edges)[: ARCS - len(_TAIL)]
+    rest = np.full(ARCS - len(_TAIL) - len(seen), _TAIL[0])
+    return length * np.concatenate([seen, rest, _TAIL])
+
 
 #: The stack carries a payload [kg], so that it rings at 1.6 kHz, and a loop 10 % of the stroke.
 PAYLOAD, LOOP = 0.5, 0.8

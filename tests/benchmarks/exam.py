@@ -1,13 +1,10 @@
 """The benchmark `exam`: plants of another author (`tests/exam`), their diagnoses and marks."""
 
-import os
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 from psa_casadi.diagnosis.diagnose import diagnose
@@ -16,7 +13,7 @@ from psa_casadi.diagnosis.task import Method
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record as Measured
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
 from tests.exam.marks import Answer, Named, mark
 from tests.exam.play import write
 from tests.exam.record import Record
@@ -43,6 +40,11 @@ class Marked:
     mark: str
     seconds: float
 
+    def __str__(self) -> str:
+        """Return record, answer and mark in a line."""
+        said = f"{self.answer.verdict} {_names(self.answer)}: {self.mark}"
+        return f"{self.record.name}, {self.record.says}: {said} [{self.seconds:.0f} s]"
+
     @property
     def group(self) -> str:
         """The group that it counts in."""
@@ -61,18 +63,7 @@ def sat(
     records: Sequence[Record], progress: Progress, method: Method | None = None
 ) -> list[Marked]:
     """Return the marks of records in their order, worked on side by side on all cores."""
-    found: list[Marked] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        for job in as_completed([pool.submit(marked, record, method) for record in records]):
-            one = job.result()
-            found.append(one)
-            progress(
-                f"{len(found)} of {len(records)}: {one.record.name}, {one.record.says}:"
-                f" {one.answer.verdict} {_names(one.answer)}: {one.mark} [{one.seconds:.0f} s]"
-            )
-    places = {record.name: place for place, record in enumerate(records)}
-    found.sort(key=lambda one: places[one.record.name])
-    return found
+    return on_all_cores(marked, [(record, method) for record in records], str, progress)
 
 
 def marked(record: Record, method: Method | None = None) -> Marked:

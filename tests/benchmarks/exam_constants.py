@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.ablation import moved_constants
 from tests.benchmarks.exam import Marked, sat
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 from tests.exam.marks import ADEQUATE, ALONE, HYSTERESIS_FOUND, NEAREST, RIGHTLY_UNEXPLAINED
 from tests.exam.records import RECORDS
 

@@ -4,12 +4,9 @@ Cut anywhere, at any length, decimated, scaled by powers of ten, with either col
 each must end with a verdict, or be refused in a sentence, and its model must predict the piece.
 """
 
-import os
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from time import process_time
 
 import numpy as np
@@ -19,7 +16,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
 
 #: The seed, which no other benchmark uses; pieces; their samples.
 SEED, PIECES, QUICK_PIECES, LENGTHS = 740501, 200, 6, (300, 2500)
@@ -43,11 +40,8 @@ class Ended:
 def run(progress: Progress, quick: bool) -> Outcome:
     """Diagnose spoilt pieces of the measured records."""
     every = pieces(datasets.micromanipulator(), QUICK_PIECES if quick else PIECES)
-    found = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        for k, ended in enumerate(pool.map(ended_of, every), 1):
-            progress(f"{k} of {len(every)}: {ended.piece}: {ended.how}")
-            found.append(ended)
+    jobs = [(piece,) for piece in every]
+    found = on_all_cores(ended_of, jobs, lambda e: f"{e.piece}: {e.how}", progress)
     return Outcome((table(found),))
 
 

@@ -9,7 +9,7 @@ import typer
 from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.screen import Quiet, show, working
 from psa_casadi.errors import InputError
-from tests.benchmarks.outcome import Outcome, Progress
+from tests.benchmarks.table import Outcome, Progress
 from tests.fuzz.campaign import Amount, Tally
 from tests.fuzz.campaign import run as attack
 from tests.fuzz.replay import replay

@@ -1,21 +1,229 @@
 """The benchmark `diagnose`: hidden causes on independent plants, and what was named."""
 
 import itertools
-import os
+import tempfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import binomtest
 
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.held_out.errors import Gain, gain_of
 from psa_casadi.diagnosis.task import Method
+from psa_casadi.model.compose import Model
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.split import Experiment, judging
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.hidden_cases import Case, Found, run_case, study
-from tests.benchmarks.hidden_figure import BINS, RELIABILITY, in_class, picture
-from tests.benchmarks.hidden_gain import gain_table
-from tests.benchmarks.hidden_limits import limits_table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
-from tests.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN
+from psa_casadi.simulation.simulate import simulate_record
+from tests.benchmarks.hidden_cases import ORDINARY, Case, Found, limits_table, run_case, study
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
+from tests.plants.again import play_again
+from tests.plants.make import Truth, make_record
+from tests.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
+
+_NONE = ("unexplained", "adequate")
+#: Classes of stated probability: above the one, up to the next.
+BINS: tuple[float, ...] = (0.02, 0.2, 0.5, 0.8, 0.95, 1.0)
+#: Kinds of cases of the reliability: the cause is in the table; also where its entry was left out.
+RELIABILITY = (("known", "weak"), ("known", "weak", "left out"))
+_DRAWN = (
+    ("o", "C0", "the cause is in the table"),
+    ("s", "C1", "with the cases whose own entry was left out"),
+)
+
+
+def picture(found: Sequence[Found], known: Sequence[str], foreign: Sequence[str]) -> Figure:
+    """Return hidden against named, and how often a stated probability is right.
+
+    Cases whose plant could not make the effect as visible as was asked for do not count.
+    """
+    figure = Figure(figsize=(11.0, 15.0), layout="constrained")
+    above, below = figure.subplots(2, 1, height_ratios=(3.2, 1.0))
+    _confusion(above, [f for f in found if f.reached], known, foreign)
+    _reliability_hidden_figure(below, found)
+    return figure
+
+
+def in_class(
+    found: Sequence[Found], kinds: Sequence[str], low: float, high: float
+) -> list[tuple[float, bool]]:
+    """Return the probabilities in (low, high] that an effect is the cause, and whether it is.
+
+    Every effect of every case of these kinds in which a cause is named counts, where what is hidden
+    is as visible as was asked for.
+    """
+    return [
+        (p, effect == f.case.right)
+        for f in found
+        if f.named and f.reached and f.case.kind in kinds
+        for effect, p in f.probability.items()
+        if low < p <= high
+    ]
+
+
+def _confusion(
+    axes: Axes, found: Sequence[Found], known: Sequence[str], foreign: Sequence[str]
+) -> None:
+    """Draw the shares of each row; the first cause counts."""
+    rows = (*known, *foreign, "nothing")
+    columns = (*dict.fromkeys(called(name) for name in known), *_NONE)
+    shares = np.zeros((len(rows), len(columns)))
+    for f in found:
+        if f.case.kind in ("known", "weak", "clean", "foreign"):
+            said = f.named[0] if f.named else str(f.verdict)
+            if said in columns:
+                shares[rows.index(f.case.effect or "nothing"), columns.index(said)] += 1.0
+    count = shares.sum(axis=1, keepdims=True)
+    shares = 100.0 * shares / np.where(count > 0, count, 1.0)
+    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=100.0)
+    for i, j in zip(*np.nonzero(shares), strict=True):
+        axes.text(
+            j, i, f"{shares[i, j]:.0f}", ha="center", va="center", fontsize=8,
+            color="white" if shares[i, j] > 55.0 else "black",
+        )  # fmt: skip
+    names = [f"{r.replace('_', ' ')} ({int(n)})" for r, n in zip(rows, count[:, 0], strict=True)]
+    axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90)
+    axes.set_yticks(range(len(rows)), names)
+    axes.tick_params(labelsize=8)
+    axes.axhline(len(known) - 0.5, color="0.5", linewidth=0.8)
+    axes.axvline(len(columns) - len(_NONE) - 0.5, color="0.5", linewidth=0.8)
+    axes.set_xlabel("named first")
+    axes.set_ylabel("hidden in the record (cases)")
+    axes.set_title("What was hidden and what was named, percent of each row's cases")
+
+
+def _reliability_hidden_figure(axes: Axes, found: Sequence[Found]) -> None:
+    """Draw how often effects are the cause against their probability.
+
+    The 95 % intervals take them for independent, which those of one case are not.
+    """
+    axes.plot([0.0, 100.0], [0.0, 100.0], color="0.7", linewidth=0.8, label="right as stated")
+    for side, kinds, (marker, colour, label) in zip((-1, 1), RELIABILITY, _DRAWN, strict=True):
+        for low, high in itertools.pairwise(BINS):
+            own = in_class(found, kinds, low, high)
+            if not own:
+                continue
+            right = sum(true for _, true in own)
+            stated = 100.0 * float(np.mean([p for p, _ in own])) + 0.4 * side
+            share = 100.0 * right / len(own)
+            ends = binomtest(right, len(own)).proportion_ci(method="wilson")
+            reach = [[share - 100.0 * ends.low], [100.0 * ends.high - share]]
+            axes.errorbar(stated, share, reach, fmt=marker, color=colour, capsize=3.0)
+            axes.annotate(
+                f"{right} of {len(own)}", (stated, share), fontsize=8, color=colour,
+                xytext=(8.0 * side, -4.0), textcoords="offset points",
+                ha="left" if side > 0 else "right",
+            )  # fmt: skip
+        axes.plot([], [], marker=marker, color=colour, linestyle="", label=label)
+    axes.set_xlim(-6.0, 112.0)
+    axes.set_ylim(-8.0, 108.0)
+    axes.set_xlabel("stated probability of an effect, mean of its class, %")
+    axes.set_ylabel("it is the cause, % (95 % interval)")
+    axes.set_title("How often a stated probability is right")
+    axes.legend(loc="upper left", fontsize=8)
+
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Further records of a device, and how many of them are held out together.
+PLAYS, HELD_OUT = 96, 12
+
+
+@dataclass(frozen=True)
+class Covered:
+    """Reductions of the error [%] over further records, and the intervals that should hold them.
+
+    `blocks` is the interval from the diagnosed record's own blocks, for the reduction over all
+    further records; `experiments` are those from so many further records, `others` the reductions
+    over the rest of them.
+    """
+
+    effect: str
+    reduction: float
+    blocks: tuple[float, float]
+    experiments: tuple[tuple[float, float], ...]
+    others: tuple[float, ...]
+
+
+def gain_table(known: Sequence[str], first: int, progress: Progress) -> TitledTable:
+    """Diagnose one record with each effect and compare its gain with that of further records."""
+    jobs = [(effect, first + 100 * k) for k, effect in enumerate(known, start=1)]
+    found = on_all_cores(
+        covered, jobs, lambda one: f"gain of {one.effect}" if one else "", progress
+    )
+    return intervals_table([one for one in found if one])
+
+
+def intervals_table(found: Sequence[Covered]) -> TitledTable:
+    """Return how many intervals hold the reduction over records that they do not know."""
+    rows = []
+    for title, pairs in (
+        (
+            "eight blocks of one record's held-out quarter",
+            [(f.blocks, f.reduction) for f in found],
+        ),
+        (
+            f"{HELD_OUT} held-out records",
+            [p for f in found for p in zip(f.experiments, f.others, strict=True)],
+        ),
+    ):
+        held = sum(low <= true <= high for (low, high), true in pairs)
+        width = float(np.median([high - low for (low, high), _ in pairs])) if pairs else np.nan
+        rows.append((title, share(held, len(pairs)), f"{width:.1f} %"))
+    return TitledTable(
+        "Intervals of the gain (95 %)",
+        Table(("interval from", "hold the truth", "median width"), tuple(rows)),
+        f"The truth is the reduction of the rms over those of {PLAYS} further records of the same"
+        " device, with other voltages and fresh noise, that the interval does not know.",
+    )
+
+
+def covered(effect: str, seed: int) -> Covered | None:
+    """Diagnose one record of an effect; None where nothing is named, so that nothing is gained."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "record.csv"
+        truth = make_record(effect, seed, path, visible=ORDINARY)
+        found = diagnose([read_record(path)])
+        if not found.causes:
+            return None
+        models = (found.base_fit.model, found.extended_fit.model)
+        plays = [_play(truth, seed + k, path, models) for k in range(1, PLAYS + 1)]
+    groups = [range(k, k + HELD_OUT) for k in range(0, PLAYS, HELD_OUT)]
+    rests = [[p for k, p in enumerate(plays) if k not in group] for group in groups]
+    return Covered(
+        effect,
+        _gain(plays).holdout_rms_reduction_percent,
+        found.gain.interval,
+        tuple(_gain([plays[k] for k in group]).interval for group in groups),
+        tuple(_gain(rest).holdout_rms_reduction_percent for rest in rests),
+    )
+
+
+_Play = tuple[Experiment, FloatArray, FloatArray]
+
+
+def _play(truth: Truth, seed: int, path: Path, models: tuple[Model, Model]) -> _Play:
+    """Play the device again and predict it with both models, the offset from the first tenth."""
+    play_again(truth, seed, path)
+    record = read_record(path)
+    experiment = judging(record)
+    y = np.asarray(record.displacement)
+    predicted = []
+    for model in models:
+        moved = simulate_record(model, record).displacement
+        predicted.append(moved + float(np.mean((y - moved)[experiment.known])))
+    return experiment, predicted[0], predicted[1]
+
+
+def _gain(plays: Sequence[_Play]) -> Gain:
+    """Return the gain over some further records."""
+    return gain_of([p[0] for p in plays], [p[1] for p in plays], [p[2] for p in plays])
+
 
 #: Seeds for each effect, and the first of them.
 SEEDS, QUICK_SEEDS, FIRST = 5, 1, 971001
@@ -44,18 +252,7 @@ def diagnose_all(
     only: bool = False,
 ) -> list[Found]:
     """Diagnose the cases side by side; with `only`, by a table of the right effect alone."""
-    found: list[Found] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [pool.submit(run_case, case, method, only=only) for case in cases]
-        for job in as_completed(jobs):
-            one = job.result()
-            found.append(one)
-            hidden = " and ".join(one.case.hidden) or "nothing"
-            progress(
-                f"{len(found)} of {len(cases)}: {one.case.kind}, {hidden} ({one.case.seed}), rho"
-                f" {one.rho:.2f}: {one.verdict} {', '.join(one.within)} [{one.seconds:.0f} s]"
-            )
-    return found
+    return on_all_cores(run_case, [(case, method, only) for case in cases], str, progress)
 
 
 def result_tables(found: Sequence[Found]) -> list[TitledTable]:

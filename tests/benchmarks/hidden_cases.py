@@ -8,7 +8,7 @@ the base's parameters cannot absorb, over the rms of the noise.
 import itertools
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -21,6 +21,8 @@ from psa_casadi.diagnosis.task import Method
 from psa_casadi.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
+from psa_casadi.report.words.tables import Table
+from tests.benchmarks.table import TitledTable
 from tests.plants.again import play_again
 from tests.plants.designs import DesignKind
 from tests.plants.excitations import ExcitationKind, PoorKind
@@ -100,6 +102,12 @@ class Found:
     patch: str = ""
     patched: float = 0.0
 
+    def __str__(self) -> str:
+        """Return case and answer in a line."""
+        hidden = " and ".join(self.case.hidden) or "nothing"
+        case = f"{self.case.kind}, {hidden} ({self.case.seed}), rho {self.rho:.2f}"
+        return f"{case}: {self.verdict} {', '.join(self.within)} [{self.seconds:.0f} s]"
+
     @property
     def reached(self) -> bool:
         """Whether what is hidden is as visible as was asked for; true where nothing is hidden."""
@@ -140,7 +148,7 @@ def records_of(case: Case, folder: Path) -> tuple[Truth, list[Record]]:
     return truth, records
 
 
-def run_case(case: Case, method: Method | None = None, *, only: bool = False) -> Found:
+def run_case(case: Case, method: Method | None = None, only: bool = False) -> Found:
     """Make the records of a case, diagnose the files, and compare.
 
     With `only`, the right effect is the only one in the table.
@@ -235,3 +243,29 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
     for _ in range(3 * seeds):
         cases.append(Case("six", str(rng.choice(known)), next(seed), records=6))
     return cases
+
+
+def limits_table(missed: Sequence[Found], known: Sequence[Found]) -> TitledTable:
+    """Return each case that was missed beside what is said where its effect is known."""
+    told = {f.case: f for f in known}
+    rows = tuple(limits_row(f, told[f.case]) for f in missed)
+    return TitledTable(
+        "What the missed records hold",
+        Table(("hidden", "seed", "rho", "said", "known beforehand", "rival"), rows),
+        "Known beforehand: what is said where the right effect is the only one in the table, and"
+        " its evidence [nats]; a cause has a price of 8. Rival: evidence of the strongest other"
+        " effect less that of the right one, in the first step with the whole table.",
+    )
+
+
+def limits_row(f: Found, told: Found) -> tuple[str, ...]:
+    """Return the row of a case that was `f`, and `told` with the right effect alone."""
+    right = str(f.case.right)
+    others = [e for name, e in f.evidence.items() if name != right]
+    known = f"{told.verdict}, {told.evidence.get(right, float('nan')):.1f}"
+    ahead = f"{max(others) - f.evidence[right]:+.1f}" if others and right in f.evidence else "-"
+    return (right, str(f.case.seed), f"{f.rho:.2f}", _said(f), known, ahead)
+
+
+def _said(f: Found) -> str:
+    return f"{f.verdict}: {', '.join(f.within)}" if f.within else f.verdict

@@ -21,7 +21,7 @@ from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.split import Experiment, split
 from psa_casadi.report.plots.narrow_figure import narrow_figure
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 #: What is added to the paper's model, one after the other, and where the gains start.
 ADDED = {"rate_independent_asymmetry": {"delta_r": 0.01}, "sensor_delay": {"sensor_delay": 1e-3}}

@@ -21,7 +21,7 @@ from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.split import divided
 from psa_casadi.report.words.phrases import length_scale, plain
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 from tests.plants.make import make_record
 
 #: What is hidden, how strongly, and the seed.

@@ -21,7 +21,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import load_model
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from psa_casadi.report.words.own_words import with_its_unit
 from psa_casadi.report.words.phrases import number, plain
 from psa_casadi.report.words.tables import Table
 from tests import own_plants as plants
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 from tests.browser import DARK, PHONE, find_browser, on_a_phone
 from tests.own_models import motor, oscillator, pair, tanks
 

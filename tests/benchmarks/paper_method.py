@@ -32,8 +32,8 @@ from psa_casadi.records import Record
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
 from tests.benchmarks.records import loop_voltage, response, slowest, with_noise
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from psa_casadi.posterior.chains import chains_of, prior_draws
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
 from tests.benchmarks.posterior_evidence import evidence_table
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from psa_casadi.posterior.chains import chains_of
 from psa_casadi.posterior.task import Block, Density, Task, task_of
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread
-from tests.benchmarks.outcome import Progress, TitledTable
+from tests.benchmarks.table import Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from scipy.io import loadmat
 from psa_casadi.records import read_record
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 from tests.test_record_kinds import WRITERS
 
 #: Rows of three columns of 8 bytes; of text fewer; a workbook ends at 1,048,576.

@@ -5,13 +5,10 @@ Every named stack, driven by a sine, a triangle, a multisine and steps, without 
 0.1 um/V times the voltage, which a stack without hysteresis shows.
 """
 
-import os
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +22,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -68,20 +65,16 @@ class Said:
     error: float
     failure: str = ""
 
+    def __str__(self) -> str:
+        """Return case and answer in a line."""
+        said = self.failure or f"{self.verdict} {', '.join(self.named)} ({self.error:.1e})"
+        return f"{self.case.stack}, {self.case.voltage}, noise {self.case.noise}: {said}"
+
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Diagnose all cases on all cores."""
     cases = all_cases()[:: 5 if quick else 1]
-    found: list[Said] = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        for one in pool.map(judged, cases):
-            found.append(one)
-            case = one.case
-            said = one.failure or f"{one.verdict} {', '.join(one.named)}"
-            progress(
-                f"{len(found)} of {len(cases)}: {case.stack}, {case.voltage}, noise {case.noise}:"
-                f" {said} ({one.error:.1e})"
-            )
+    found = on_all_cores(judged, [(case,) for case in cases], str, progress)
     wrong = [f for f in found if f.verdict != "adequate"]
     return Outcome((summary(found), *([alarms(wrong)] if wrong else [])))
 

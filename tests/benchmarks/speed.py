@@ -26,7 +26,7 @@ from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -3,12 +3,10 @@
 Cases of the study, the records of the exam, and the measured micromanipulator.
 """
 
-import os
+import itertools
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.exam import read_back
 from tests.benchmarks.hidden_cases import Case, names_of, records_of, study
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable, share
+from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
 from tests.exam.record import Record as ExamRecord
 from tests.exam.records import RECORDS
 from tests.plants.table import FOREIGN, KNOWN
@@ -82,15 +80,9 @@ def run(progress: Progress, quick: bool) -> Outcome:
 
 def repeated(jobs: Sequence[tuple[Given, int]], progress: Progress) -> list[Repeated]:
     """Return what is said of records, and with their data changed so many times."""
-    found = []
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        asked = [(g, [pool.submit(said_of, g, k) for k in range(n + 1)]) for g, n in jobs]
-        for given, own in asked:
-            first, *changed = (job.result() for job in own)
-            found.append(Repeated(given, first, tuple(changed)))
-            alike = f"{found[-1].same_verdict} of {len(changed)} alike"
-            progress(f"{given.kind}, {given.name}: {alike}")
-    return found
+    draws = [(given, k) for given, n in jobs for k in range(n + 1)]
+    said = iter(on_all_cores(said_of, draws, lambda one: f"{one[0]} {', '.join(one[1])}", progress))
+    return [Repeated(g, next(said), tuple(itertools.islice(said, n))) for g, n in jobs]
 
 
 def _study(count: int) -> list[Given]:

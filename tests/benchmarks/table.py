@@ -1,9 +1,81 @@
 """The table of benchmarks: each is loaded when it is run."""
 
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
-from tests.benchmarks.outcome import Bench, Outcome, Progress
+from matplotlib.figure import Figure
+
+from psa_casadi.report.words.tables import Table
+
+T = TypeVar("T")
+#: Tells a step of long work.
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class TitledTable:
+    """A table under a title, with a note on how to read it."""
+
+    title: str
+    table: Table
+    note: str = ""
+
+    def __str__(self) -> str:
+        """Return title, table and note as plain text."""
+        parts = [self.title, str(self.table)]
+        return "\n\n".join([*parts, self.note] if self.note else parts)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The tables of one benchmark, and the picture that shows them, if there is one."""
+
+    tables: tuple[TitledTable, ...]
+    picture: Callable[[], Figure] | None = None
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A benchmark by name: what it shows, how long it takes, and the function that runs it.
+
+    `run(progress, quick)` measures everything again; `quick` does the same on fewer or smaller
+    cases. `run_on(progress, folder)`, where there is one, measures the records of a folder instead,
+    `run_sized(progress, count)` so many cases.
+    """
+
+    name: str
+    description: str
+    run: Callable[[Progress, bool], Outcome]
+    run_on: Callable[[Progress, Path], Outcome] | None = None
+    run_sized: Callable[[Progress, int], Outcome] | None = None
+
+
+def on_all_cores(
+    function: Callable[..., T],
+    jobs: Iterable[tuple[Any, ...]],
+    tell: Callable[[T], str],
+    progress: Progress,
+) -> list[T]:
+    """Return function(*job) of every job, in their order, worked on side by side on all cores.
+
+    `tell` says in words what one has given.
+    """
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        futures = [pool.submit(function, *job) for job in jobs]
+        for k, future in enumerate(as_completed(futures), 1):
+            progress(f"{k} of {len(futures)}: {tell(future.result())}")
+    return [future.result() for future in futures]
+
+
+def share(count: int, of: int) -> str:
+    """Return a count of cases as percent, with both numbers."""
+    return f"{100.0 * count / of:.0f} % ({count} of {of})" if of else "no case"
 
 
 def _later(

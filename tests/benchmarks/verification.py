@@ -5,24 +5,126 @@ steps and one non-periodic response. Here the model is identified from a step an
 judged only on records that the fit has not seen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
-from tests.benchmarks.three_mechanics import NAMES, matches, tables
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 from tests.benchmarks.verification_cases import (
     INSTRUMENT,
     LOOPS,
+    NAMES,
     NOISE,
     OTHER,
     STEPS,
     Comparison,
     instrument,
+    matches,
     synthetic,
+    tables,
 )
-from tests.benchmarks.verification_figure import picture
+
+FloatArray = npt.NDArray[np.float64]
+
+_MEASURED_verification_figure, _PREDICTED, _ERRORS = "#9a9a9a", "#0072b2", ("#d55e00", "#009e73")
+_FONT = 11.0
+_TITLES = {
+    LOOPS: "loops (paper, figures 6 and 8)",
+    STEPS: "normalised step (figures 7 and 9)",
+    OTHER: "non-periodic voltage (figure 10)",
+}
+
+
+def picture(shown: Sequence[Comparison]) -> Figure:
+    """Return a column for every stack; in each, three pairs of curves above their error."""
+    stacks = list(dict.fromkeys(c.stack for c in shown))
+    figure = Figure(figsize=(4.6 * len(stacks) + 0.6, 15.0), layout="constrained")
+    parts = figure.add_gridspec(6, len(stacks), height_ratios=(2.1, 1.0) * 3)
+    panels: dict[str, Callable[[Axes, Axes, list[Comparison]], None]] = {
+        LOOPS: _loops,
+        STEPS: _steps,
+        OTHER: _other,
+    }
+    for column, stack in enumerate(stacks):
+        for row, (kind, draw) in enumerate(panels.items()):
+            of_kind = [c for c in shown if (c.stack, c.kind) == (stack, kind)]
+            if not of_kind:
+                continue
+            upper = figure.add_subplot(parts[2 * row, column])
+            lower = figure.add_subplot(parts[2 * row + 1, column])
+            draw(upper, lower, of_kind)
+            _style(upper, lower, f"{stack}: {_TITLES[kind]}")
+    return figure
+
+
+def _loops(upper: Axes, lower: Axes, of_kind: list[Comparison]) -> None:
+    for k, c in enumerate(of_kind):
+        origin = _origin(c) if k == 0 else None
+        _pair(upper, c.voltage, 1e6 * c.measured, 1e6 * c.predicted, origin)
+        lower.plot(c.voltage, 1e6 * c.error, color=_ERRORS[k % 2], linewidth=0.7, label=c.record)
+    upper.set_ylabel("displacement [um]", fontsize=_FONT)
+    lower.set_ylabel("error [um]", fontsize=_FONT)
+    lower.set_xlabel("voltage [V]", fontsize=_FONT)
+    if len(of_kind) > 1:
+        _legend(lower, of_kind)
+
+
+def _steps(upper: Axes, lower: Axes, of_kind: list[Comparison]) -> None:
+    for c in of_kind:
+        time = 1e3 * c.time
+        _pair(upper, time, c.measured / c.range_m, c.predicted / c.range_m, _origin(c))
+        lower.plot(time, c.error / c.range_m, color=_ERRORS[0], linewidth=0.7)
+    upper.set_ylabel("displacement over its final value", fontsize=_FONT)
+    lower.set_ylabel("error", fontsize=_FONT)
+    lower.set_xlabel("time [ms]", fontsize=_FONT)
+
+
+def _other(upper: Axes, lower: Axes, of_kind: list[Comparison]) -> None:
+    for c in of_kind:
+        _pair(upper, c.time, 1e6 * c.measured, 1e6 * c.predicted, _origin(c))
+        lower.plot(c.time, 1e6 * c.error, color=_ERRORS[0], linewidth=0.7)
+    upper.set_ylabel("displacement [um]", fontsize=_FONT)
+    lower.set_ylabel("error [um]", fontsize=_FONT)
+    lower.set_xlabel("time [s]", fontsize=_FONT)
+
+
+def _origin(c: Comparison) -> str:
+    """Say where the displacement is from."""
+    return "measured" if c.stack == INSTRUMENT else "synthetic, with noise"
+
+
+def _pair(
+    axes: Axes, x: FloatArray, measured: FloatArray, predicted: FloatArray, origin: str | None
+) -> None:
+    """Draw both where something was measured, the prediction thin on top; named by `origin`."""
+    there = np.where(np.isfinite(measured), predicted, np.nan)
+    axes.plot(x, measured, color=_MEASURED_verification_figure, linewidth=3.2, label=origin)
+    axes.plot(x, there, color=_PREDICTED, linewidth=1.0, label="model" if origin else None)
+
+
+def _style(upper: Axes, lower: Axes, title: str) -> None:
+    upper.set_title(title, fontsize=_FONT, loc="left")
+    upper.legend(fontsize=_FONT - 2, loc="lower right", framealpha=0.85)
+    upper.tick_params(labelbottom=False)
+    for axes in (upper, lower):
+        axes.grid(visible=True, color="#dddddd", linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.tick_params(labelsize=_FONT - 2)
+    lower.axhline(0.0, color="black", linewidth=0.7)
+    upper.sharex(lower)
+
+
+def _legend(lower: Axes, of_kind: list[Comparison]) -> None:
+    largest = 1e6 * max(c.largest for c in of_kind)
+    lower.set_ylim(-1.15 * largest, 1.9 * largest)
+    lower.legend(fontsize=_FONT - 3, loc="upper center", ncols=2, framealpha=0.85)
+
 
 STACK_NAMES = ("PTBS200", "WYDS0808020", "P-885.51")
 #: Whose mechanics the three models are compared on: the stack that rings.

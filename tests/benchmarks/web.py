@@ -8,7 +8,9 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.web.module import web_module
@@ -22,12 +24,52 @@ from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval, Provenance
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
-from tests.benchmarks.web_strip import strip
-from tests.browser import Browser, find_browser
+from tests.benchmarks.table import Outcome, Progress, TitledTable
+from tests.browser import DARK, Browser, find_browser, without_policy
 from tests.live_pages import case, run_in_browser
 from tests.report_cases import NOISE
 from tests.steered_browser import Steered, steered
+
+#: What is done to the page before each picture, the caption, and the browser's flags.
+_FRAMES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    ("", "as it was fitted", ()),
+    ("box.psa.set('k_L', 1.06 * start('k_L'));", "a slider dragged", ()),
+    ("box.querySelectorAll('.switch input')[0].click();", "an effect switched off", ()),
+    (
+        "box.psa.set('memory_gain', -0.5 * start('memory_gain'));",
+        "another value, at night",
+        (DARK,),
+    ),
+)
+_WIDTH, _HEIGHT = 1000, 800
+_ACT = """<script>
+document.querySelectorAll('h1, nav, h2, .live ~ *').forEach(function (n) {{ n.hidden = true; }});
+var box = document.querySelector('.live');
+var told = JSON.parse(box.querySelector('script').textContent);
+function start(name) {{
+  return told.parameters.find(function (p) {{ return p.name === name; }}).value;
+}}
+(function begin() {{
+  if (!box.psa) {{ setTimeout(begin, 20); return; }}
+  {act}
+}})();
+</script></body>"""
+
+
+def strip(page: str) -> Figure:
+    """Return pictures of a page with a model that has two effects, two by two."""
+    drawn, axes = plt.subplots(2, 2, figsize=(12.0, 10.0), layout="constrained")
+    with tempfile.TemporaryDirectory() as folder:
+        browser = find_browser(Path(folder))
+        for k, ((act, caption, flags), ax) in enumerate(zip(_FRAMES, axes.flat, strict=True)):
+            path = Path(folder) / f"frame{k}.html"
+            text = _ACT.format(act=act).join(without_policy(page).rsplit("</body>", 1))
+            path.write_text(text, encoding="utf-8")
+            ax.imshow(plt.imread(browser.screenshot(path, _WIDTH, _HEIGHT, *flags)))
+            ax.set_title(f"{k + 1}. {caption}", fontsize=11)
+            ax.set_axis_off()
+    return drawn
+
 
 #: What a redraw of so many samples may take [ms].
 SAMPLES, ALLOWED = 5000, 50.0

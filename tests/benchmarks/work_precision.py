@@ -6,6 +6,7 @@ largest one of the displacement, as a share of its range, against the reference 
 the set-up of the experiment, one call for every communication step.
 """
 
+import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
@@ -13,22 +14,150 @@ from dataclasses import dataclass
 from functools import partial
 from math import inf, log
 from pathlib import Path
+from typing import Protocol
 
+import fmpy
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fixed_step.export import export_c
+from psa_casadi.export.fixed_step.planning import fixed_step
+from psa_casadi.export.fixed_step.probe import VOLTAGES
 from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.fmu.sources import compiled_files
+from psa_casadi.export.fmu.texts import exported_texts
 from psa_casadi.export.importer.fmu import Fmu, FmuError
+from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import multisine, time_grid
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
-from tests.benchmarks.step_cost import cost_table
-from tests.benchmarks.work_precision_figure import picture
+from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 from tests.benchmarks.work_precision_methods import METHODS, OURS, Case, Method
 
 FloatArray = npt.NDArray[np.float64]
+
+#: The step of issue and table [s], and what is asked of it.
+STEP, MOST_NS, MOST_RATIO = 1e-5, 400.0, 1.5
+_SOURCE = Path(__file__).parent.parent / "c_host" / "step_cost.c"
+
+
+def voltage(model: Model) -> FloatArray:
+    """Return 1000 voltages [V]: 200 of each reference voltage."""
+    share = np.linspace(0.0, 1.0, 1001)[1:]
+    parts = [
+        shape(share)[200 * k : 200 * (k + 1)] for k, (_, shape) in enumerate(VOLTAGES.values())
+    ]
+    return np.asarray(model.values["u_rated"] * np.concatenate(parts))
+
+
+def measured(model: Model, repetitions: int, *, fixed: bool) -> FloatArray:
+    """Return the time [ns] of every step, (1000, 2): of the generated code and of an FMU.
+
+    The FMU is the ordinary one, or the one with a `fixed` step.
+    """
+    table = {v.name: k for k, v in enumerate(variable_table(model), start=1)}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        export_c(model, folder, step=STEP, name="stack", substeps=1)
+        step = fixed_step(model, name="stack", step=STEP, substeps=1) if fixed else None
+        token, texts, _ = exported_texts(model, model.name, fixed=step)
+        for file, text in texts.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        sources = compiled_files(texts)
+        headers = Path(fmpy.__file__).parent / "c-code"
+        command = [*compiler_command(), *OPTIMISE, "-I.", f"-I{headers}"]
+        files = [str(_SOURCE), "stack.c", *sources, "-lm", "-o", "step_cost"]
+        run_compiler([*command, *files], folder)
+        given = [str(repetitions), str(table["voltage"]), str(table["displacement"])]
+        done = subprocess.run(
+            [str(folder / "step_cost"), token, *given],
+            input="\n".join(map(repr, voltage(model).tolist())),
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+    return np.array([[float(v) for v in line.split()] for line in done.stdout.splitlines()])
+
+
+def cost_table(progress: Progress, *, quick: bool) -> TitledTable:
+    """Return mean, worst and their ratio for a stack."""
+    progress("cost of a step")
+    model, repetitions = stack_model("P-885.51").plant(), 50 if quick else 400
+    ordinary, fixed = (measured(model, repetitions, fixed=f).T for f in (False, True))
+    ways = {
+        "psa export c": ordinary[0],
+        "psa export fmu --solver fixed": fixed[1],
+        "psa export fmu": ordinary[1],
+    }
+    rows = tuple(
+        (name, f"{c.mean():.0f}", f"{c.max():.0f}", f"{c.max() / c.mean():.2f}")
+        for name, c in ways.items()
+    )
+    return TitledTable(
+        f"cost of a step of {1e6 * STEP:g} us, P-885.51: ramps, holds, tones and jumps",
+        Table(("way", "mean [ns]", "worst [ns]", "worst / mean"), rows),
+        f"Asked of the generated code: at most {MOST_NS:g} ns, worst over mean below"
+        f" {MOST_RATIO:g}. Each step counts with the least time of its repetitions.",
+    )
+
+
+_FONT = 10.5
+_STYLES = (("#0072b2", "o"), ("#d55e00", "s"), ("#009e73", "^"), ("#9a6fb0", "v"))
+
+
+class Measured(Protocol):
+    """What a run must tell to be drawn."""
+
+    @property
+    def case(self) -> str: ...
+    @property
+    def method(self) -> str: ...
+    @property
+    def tolerance(self) -> float: ...
+    @property
+    def error(self) -> float: ...
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def evaluations(self) -> float: ...
+
+
+def picture(runs: Sequence[Measured]) -> Figure:
+    """Return a row for every case: error over CPU time, over right-hand sides, over tolerance."""
+    cases = list(dict.fromkeys(r.case for r in runs))
+    figure = Figure(figsize=(14.0, 4.6 * len(cases)), layout="constrained")
+    grid = figure.subplots(len(cases), 3, squeeze=False)
+    for row, case in zip(grid, cases, strict=True):
+        of_case = [r for r in runs if r.case == case]
+        _curves(row[0], of_case, "seconds", "CPU time [s]")
+        _curves(row[1], of_case, "evaluations", "evaluations of the right-hand side")
+        _curves(row[2], of_case, "tolerance", "tolerance asked for")
+        ends = [min(r.tolerance for r in of_case), max(r.tolerance for r in of_case)]
+        row[2].plot(ends, ends, color="0.6", linewidth=1.0, zorder=0, label="error = tolerance")
+        row[0].set_title(case, loc="left", fontsize=_FONT)
+        row[2].legend(fontsize=_FONT - 2)
+    return figure
+
+
+def _curves(axes: Axes, runs: Sequence[Measured], across: str, label: str) -> None:
+    methods = list(dict.fromkeys(r.method for r in runs))
+    for method, (colour, marker) in zip(methods, _STYLES, strict=False):
+        mine = [r for r in runs if r.method == method]
+        axes.loglog(
+            [getattr(r, across) for r in mine], [r.error for r in mine], color=colour,
+            marker=marker, markersize=5, linewidth=1.4, label=method,
+        )  # fmt: skip
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(label, fontsize=_FONT)
+    axes.set_ylabel("largest error / range", fontsize=_FONT)
+    axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=_FONT - 2)
+
 
 _TRUTH, _CHECK = 1e-12, 1e-11
 _LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from psa_casadi.errors import InputError
 from psa_casadi.report.words.tables import Table
-from tests.benchmarks.outcome import TitledTable
+from tests.benchmarks.table import TitledTable
 from tests.fuzz import (
     archives,
     binaries,

@@ -17,7 +17,7 @@ from psa_casadi.report.words.tables import Table
 from tests.benchmarks.causes import score
 from tests.benchmarks.causes.answers import write_answer
 from tests.benchmarks.causes.write import write
-from tests.benchmarks.outcome import Outcome, Progress, TitledTable
+from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 SEED, CASES, QUICK = 20261126, 60, 10
 #: Who answers, and the module that does.

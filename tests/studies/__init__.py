@@ -1,0 +1,1 @@
+"""Studies: what is run by name and not on every change."""

@@ -1,0 +1,234 @@
+"""The cases: records with known causes, measured ones, models of one's own, and exports."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import psa_casadi as psa
+from tests import own_models as models
+from tests import own_plants as plants
+from tests.exam.marks import Answer, Named, mark
+from tests.exam.play import write
+from tests.exam.record import Record, Stack, Test
+from tests.exam.records import RECORDS
+from tests.plants.make import make_record
+from tests.plants.table import called
+from tests.studies.golden.exports import EXPORTS
+
+Row = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case: its kind and name, what is hidden, and what answers it, in an empty folder."""
+
+    kind: str
+    name: str
+    hidden: str
+    answer: Callable[[Path], Row]
+
+    @property
+    def id(self) -> str:
+        return f"{self.kind}/{self.name}"
+
+
+# --- what a diagnosis says ---------------------------------------------------------------------
+
+
+def diagnosed(asked: Record | None, *given: Any, **words: Any) -> Row:
+    """Return a diagnosis as text, with its mark where the truth is known (`tests.exam.marks`)."""
+    begin = time.process_time()
+    told = psa.diagnose(*given, **words).to_dict()
+    seconds = time.process_time() - begin
+    causes = [
+        Named(c["effect"], c["confidence"], tuple(c["cannot_be_told_from"])) for c in told["causes"]
+    ]
+    base, extended = _errors(told["errors"])
+    budget, patch = told["budget"], told.get("patch") or told.get("correction") or {}
+    return {
+        "mark": "-" if asked is None else mark(asked, Answer(told["verdict"], tuple(causes))),
+        "verdict": told["verdict"],
+        "causes": " + ".join(_named(c) for c in causes) or "-",
+        "unnamed": patch.get("name") or patch.get("port") or "-",
+        "removed": "-" if budget is None else f"{budget['together']['share']:.4f}",
+        "base": _numbers(base),
+        "extended": _numbers(extended),
+        "seconds": f"{seconds:.1f}",
+    }
+
+
+def _errors(errors: Any) -> tuple[list[float], list[float]]:
+    """Return the held-out errors of base and extended model: of a stack [m], or of every output."""
+    if isinstance(errors, list):
+        return [e["base"] for e in errors], [e["extended"] for e in errors]
+    return [errors["base"]["holdout_rms_m"]], [errors["extended"]["holdout_rms_m"]]
+
+
+def _named(cause: Named) -> str:
+    rivals = f" (or {', '.join(cause.rivals)})" if cause.rivals else ""
+    return f"{cause.effect} {cause.probability:.3f}{rivals}"
+
+
+def _numbers(values: list[float]) -> str:
+    return " ".join(f"{v:.6g}" for v in values)
+
+
+def _asked(letter: str, *accepted: str) -> Record:
+    """Return what the marks are given for: of a clean, known, twofold or foreign record."""
+    names = tuple(frozenset({name}) for name in accepted)
+    test = Test("any", 1.0, 1.0, 1, (0.0, 1.0), 0.0)
+    return Record(letter, 0, "", Stack("Bouc-Wen", 1.0), test, accepted=names)
+
+
+# --- exam and study ----------------------------------------------------------------------------
+
+
+def _sat(record: Record, folder: Path) -> Row:
+    path = folder / f"{record.name}.csv"
+    write(record, path)
+    return diagnosed(record, path)
+
+
+#: Range of the effects' rms over the noise's, after the base's parameters are projected out.
+_RANGES = {"strong": (1.0, 3.0), "weak": (0.1, 0.3), "foreign": (0.3, 3.0)}
+_FIRST_SEED = 990001
+#: Kind, hidden causes, and the noise where it is not white, or the voltage where it is not rich.
+_STUDY = """
+strong slow_creep
+strong rate_dependent_hysteresis
+strong hysteresis_memory ar
+strong saturation_of_strain
+strong structural_mode
+strong preload_loss quantised
+strong self_heating
+strong current_limit
+strong sensor_delay drop-outs
+strong temperature
+weak field_dependent_gain
+weak backlash ar
+weak charge_leakage
+weak drive_lag
+weak sensor_nonlinearity
+weak mains_hum quantised
+weak offset_drift
+clean - white
+clean - white
+clean - ar
+clean - ar
+clean - quantised
+clean - drop-outs
+clean - loops
+foreign dry_friction
+foreign floor_vibration
+foreign guide_stiffness
+foreign dead_zone_hysteresis
+foreign cross_axis
+foreign range_switch
+foreign source_power
+two slow_creep+sensor_lag
+two structural_mode+offset_drift
+two rate_independent_asymmetry+drive_lag
+two load_stiffness+mains_hum
+two ageing+voltage_saturation
+three slow_creep+sensor_delay+mains_hum
+three structural_mode+saturation_of_strain+temperature
+three hysteresis_memory+current_limit+encoder_ripple
+three preload_loss+drive_lag+offset_drift
+"""
+
+
+def _studied(kind: str, hidden: tuple[str, ...], how: str, seed: int, folder: Path) -> Row:
+    path = folder / "record.csv"
+    wanted = _RANGES.get(kind, _RANGES["strong"])
+    make_record(
+        hidden[0] if hidden else None,
+        seed,
+        path,
+        noise="white" if how == "loops" else how,  # type: ignore[arg-type]
+        excitation="loops" if how == "loops" else "rich",
+        visible=wanted if hidden else None,
+        more=hidden[1:],
+        more_visible=wanted if hidden[1:] else None,
+    )
+    letter = {"clean": "c", "foreign": "f", "two": "t", "three": "t"}.get(kind, "k")
+    accepted = () if kind == "foreign" else tuple(called(name) for name in hidden)
+    return diagnosed(_asked(letter, *accepted), path)
+
+
+def _study() -> Iterator[Case]:
+    for k, line in enumerate(_STUDY.strip().splitlines()):
+        kind, causes, how = (*line.split(), "white")[:3]
+        hidden = () if causes == "-" else tuple(causes.split("+"))
+        work = partial(_studied, kind, hidden, how, _FIRST_SEED + k)
+        yield Case("study", f"{k + 1:02}-{kind}", f"{causes} {how}", work)
+
+
+# --- measured records, models of one's own -----------------------------------------------------
+
+
+def _measured(fitted: list[int], held_out: list[int], folder: Path) -> Row:
+    records = psa.datasets.micromanipulator()
+    holdout = [records[k] for k in held_out]
+    return diagnosed(None, [records[k] for k in fitted], holdout=holdout)
+
+
+_MEASURED = {"sine": ([0], []), "loops": ([1], []), "both": ([0, 1], []), "on-sine": ([1], [0])}
+_MEMORIES = ["hysteresis", "stop", "curve", "zero", "drift"]
+_OWN: dict[str, tuple[str, Callable[[], psa.Model], Callable[[], Any], dict[str, Any]]] = {
+    "bouc-wen": ("hysteresis_of_x_in_v", models.oscillator, lambda: plants.bouc_wen(1), {}),
+    "bouc-wen-noisy": (
+        "hysteresis_of_x_in_v", models.oscillator, lambda: plants.bouc_wen(2, noise=3e-5), {},
+    ),
+    "breathing": ("foreign", models.oscillator, lambda: plants.breathing(4), {}),
+    "friction": ("friction_in_speed", models.motor, lambda: plants.motor(1), {}),
+    "little-friction": (
+        "friction_in_speed", models.motor, lambda: plants.motor(3, friction=0.003), {},
+    ),
+    "motor": ("", models.motor, lambda: plants.motor(2, friction=0.0), {}),
+    "overflow": ("stop_of_h1_in_h1", models.tanks, lambda: plants.tanks(3, "overflow"), {}),
+    "bent-sensor": ("bend_of_level", models.tanks, lambda: plants.tanks(3, "sensor"), {}),
+    "pair": ("", models.pair, lambda: plants.pair(4), {}),
+    "dead-zone": (
+        "dead_zone_of_u", models.cylinder, lambda: plants.cylinder(20), {"leave_out": _MEMORIES},
+    ),
+    "known-dead-zone": (
+        "", lambda: models.cylinder(dead_zone=0.6), lambda: plants.cylinder(30),
+        {"leave_out": _MEMORIES},
+    ),
+    "oven": ("lag_of_air", models.oven, lambda: plants.oven(40), {"known_start": True}),
+}  # fmt: skip
+
+
+def _own(name: str, folder: Path) -> Row:
+    hidden, model, made, words = _OWN[name]
+    records = made()
+    if isinstance(records, list):
+        *records, last = records
+        words = {**words, "holdout": [last]}
+    letter = {"": "c", "foreign": "f"}.get(hidden, "k")
+    accepted = (hidden,) if letter == "k" else ()
+    return diagnosed(_asked(letter, *accepted), model(), records, **words)
+
+
+def _all() -> Iterator[Case]:
+    for record in RECORDS:
+        yield Case("exam", record.name, record.says, partial(_sat, record))
+    yield from _study()
+    for name, (fitted, held) in _MEASURED.items():
+        yield Case("measured", name, "-", partial(_measured, fitted, held))
+    for name, (hidden, *_) in _OWN.items():
+        yield Case("own", name, hidden or "-", partial(_own, name))
+    for name, work in EXPORTS.items():
+        yield Case("export", name, "-", work)
+
+
+CASES = {case.id: case for case in _all()}
+
+
+def chosen(pattern: str) -> list[Case]:
+    """Return the cases whose kind/name has a pattern."""
+    return [case for case in CASES.values() if re.search(pattern, case.id)]

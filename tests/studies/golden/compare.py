@@ -1,0 +1,153 @@
+"""Kept answers: one file a kind, one line a case; and what differs from them."""
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from tests.studies.golden.cases import CASES, Row
+
+ANSWERS = Path(__file__).parent / "answers"
+SECONDS = "seconds"
+#: Columns that hold numbers: the relative and the absolute difference that rounding may make. All
+#: other columns are exact; the probabilities of the causes differ by less than PROBABILITY.
+_ROUNDING = {
+    "removed": (0.0, 0.01), "base": (0.01, 0.0), "extended": (0.01, 0.0),
+    "numbers": (1e-5, 0.0), "errors": (0.05, 1e-8),
+}  # fmt: skip
+PROBABILITY = 0.02
+#: A change of processor time by this factor, of a case of more than a second, is shown.
+SLOWER = 1.25
+_SURE = re.compile(r" (\d\.\d+)")
+
+
+def kept() -> dict[str, Row]:
+    """Return the kept answers by case."""
+    found: dict[str, Row] = {}
+    for path in sorted(ANSWERS.glob("*.tsv")):
+        head, *lines = path.read_text("utf-8").splitlines()
+        for line in lines:
+            row = dict(zip(head.split("\t"), line.split("\t"), strict=True))
+            found[f"{path.stem}/{row.pop('case')}"] = row
+    return found
+
+
+def keep(rows: Mapping[str, Row]) -> None:
+    """Write answers, those that are not in `rows` as they were; cases that are gone go."""
+    every = {**kept(), **rows}
+    ANSWERS.mkdir(exist_ok=True)
+    for kind in dict.fromkeys(case.kind for case in CASES.values()):
+        own = [c for c in CASES.values() if c.kind == kind and c.id in every]
+        lines = ["\t".join(("case", "hidden", *_head(every[c.id]))) for c in own[:1]]
+        lines += ["\t".join((c.name, c.hidden, *_cells(every[c.id]))) for c in own]
+        if lines:
+            (ANSWERS / f"{kind}.tsv").write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def _head(row: Row) -> list[str]:
+    return [n for n in row if n != "hidden"]
+
+
+def _cells(row: Row) -> list[str]:
+    return [row[n] for n in _head(row)]
+
+
+def changes(before: Row, now: Row) -> list[tuple[str, str, str]]:
+    """Return what differs by more than rounding: column, before, now; the time comes by itself."""
+    return [
+        (name, before.get(name, "none"), now[name])
+        for name in now
+        if name not in (SECONDS, "hidden") and not _same(name, before.get(name, "none"), now[name])
+    ]
+
+
+def slower(before: Row, now: Row) -> tuple[str, str, str] | None:
+    """Return the processor time where it changed by more than a busy machine makes it."""
+    old, new = (float(row.get(SECONDS, "nan")) for row in (before, now))
+    if max(old, new) < 1.0 or 1.0 / SLOWER < new / old < SLOWER:
+        return None
+    return (f"time x{new / old:.2f}", f"{old:.1f} s", f"{new:.1f} s")
+
+
+def _same(column: str, before: str, now: str) -> bool:
+    if column == "causes":
+        (old, new), sure = _parted(before, now), PROBABILITY
+        return old[0] == new[0] and _near(old[1], new[1], 0.0, sure)
+    if column in _ROUNDING and not {"-", "none"} & {before, now}:
+        old_numbers, new_numbers = ([float(x) for x in text.split()] for text in (before, now))
+        return _near(old_numbers, new_numbers, *_ROUNDING[column])
+    return before == now
+
+
+def _parted(*texts: str) -> list[tuple[str, list[float]]]:
+    """Return the names and the probabilities of causes."""
+    return [(_SURE.sub("", text), [float(p) for p in _SURE.findall(text)]) for text in texts]
+
+
+def _near(before: list[float], now: list[float], relative: float, absolute: float) -> bool:
+    return len(before) == len(now) and all(
+        math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
+        for a, b in zip(before, now, strict=True)
+    )
+
+
+def table(
+    before: Mapping[str, Row], now: Mapping[str, Row], *, times: bool = True
+) -> list[tuple[str, str, str, str]]:
+    """Return the lines of what changed: case, what, before, now."""
+    lines = []
+    for case, row in now.items():
+        told = changes(before.get(case, {}), row)
+        time = slower(before[case], row) if times and case in before else None
+        lines += [(case, *change) for change in (*told, *([time] if time else []))]
+    return lines
+
+
+def totals(before: Mapping[str, Row], now: Mapping[str, Row]) -> list[tuple[str, str, str, str]]:
+    """Return right marks by kind, processor time, and held-out errors, of the same cases."""
+    both = [case for case in now if case in before]
+    lines = []
+    for kind in dict.fromkeys(case.split("/")[0] for case in both):
+        own = [c for c in both if c.startswith(kind) and now[c].get("mark", "-") != "-"]
+        if own:
+            old, new = (_right(rows[c] for c in own) for rows in (before, now))
+            lines.append((f"{kind}, {len(own)} cases", "right", old, new))
+    times = (sum(float(rows[c][SECONDS]) for c in both) for rows in (before, now))
+    old, new = (f"{seconds:.0f} s" for seconds in times)
+    lines.append((f"all, {len(both)} cases", "processor time", old, new))
+    errors = [c for c in both if "extended" in now[c] and "extended" in before[c]]
+    if errors:
+        ratios = (_error_ratio(rows[c] for c in errors) for rows in (before, now))
+        old_ratio, new_ratio = (f"{ratio:.4f}" for ratio in ratios)
+        lines.append(
+            (
+                f"all, {len(errors)} cases",
+                "held-out error, extended over base",
+                old_ratio,
+                new_ratio,
+            )
+        )
+    return lines
+
+
+def _right(rows: Iterable[Row]) -> str:
+    return str(sum(row["mark"].startswith("right") for row in rows))
+
+
+def _error_ratio(rows: Iterable[Row]) -> float:
+    """Return the geometric mean of the extended model's held-out errors over the base's."""
+    logs = [
+        math.log(float(extended) / float(base))
+        for row in rows
+        for extended, base in zip(row["extended"].split(), row["base"].split(), strict=True)
+    ]
+    return math.exp(sum(logs) / len(logs))
+
+
+def twelfth(ids: Iterable[str], before: Mapping[str, Row]) -> list[str]:
+    """Return of every twelve cases of a kind, in their order, the one that took the least time."""
+    kinds: dict[str, list[str]] = {}
+    for case in ids:
+        kinds.setdefault(case.split("/")[0], []).append(case)
+    dozens = (own[k : k + 12] for own in kinds.values() for k in range(0, len(own), 12))
+    return [min(dozen, key=lambda c: float(before[c][SECONDS])) for dozen in dozens]
